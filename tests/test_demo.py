@@ -26,6 +26,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 200.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
+    monkeypatch.setattr("orthonav.check.places.FEWEST_TRIALS", 24)
     monkeypatch.setattr("orthonav.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)

@@ -9,6 +9,8 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 import absent
 from orthonav.extras import module_of
 
@@ -35,6 +37,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow  # four processes; a suite that hangs shows it by itself
 def test_a_run_ends_with_the_names_of_the_tests_that_crashed_or_hung(tmp_path):
     """Under the command of `make test` and the project's own options, but for shorter limits."""
     (tmp_path / "test_quick.py").write_text("def test_one(): pass\ndef test_two(): pass\n")

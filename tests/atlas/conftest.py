@@ -52,6 +52,8 @@ def flown(area, made_once):
             errors=Errors(agl_std=0.03),
             seed=3,
         )
-        simulate_flight(request)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
+            simulate_flight(request)
 
     return made_once("searched-flight", make) / "flight"

@@ -43,12 +43,14 @@ def test_the_claim_of_a_filter_is_right_with_what_is_sent(flights, receiver) -> 
     assert 0.7 <= np.mean(ratios) <= 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receiver", INERTIAL, ids=lambda each: each.name)
 def test_with_the_covariance_of_the_fix_it_is_too_confident(flights, receiver) -> None:
     plain = [fuse(receiver, each, each.own_m2).ratio for each in flights]
     assert np.mean(plain) > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receiver", INERTIAL, ids=lambda each: each.name)
 def test_a_filter_of_independent_errors_is_consistent(receiver) -> None:
     """The filter itself is right where its assumption holds."""

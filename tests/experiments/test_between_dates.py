@@ -31,6 +31,7 @@ def test_the_margin_is_what_the_convolutions_take():
     assert model(torch.zeros(1, 1, side, side)).shape == (1, 1, size, size)
 
 
+@pytest.mark.slow  # an experiment
 def test_what_is_learnt_is_what_flies(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(between, "PAIRS", 1)
     monkeypatch.setattr(between, "CROP_PX", 64)

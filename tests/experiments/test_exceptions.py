@@ -13,6 +13,7 @@ from experiments.paper.trajectories import TABLE_1
 SMALL = replace(TABLE_1["B"], length_m=128.0, band_m=64.0)
 
 
+@pytest.mark.slow  # an experiment
 def test_only_views_beyond_the_radius_are_shown(tmp_path, area, monkeypatch):
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 8)
     scene = scenes.Scene("B", area.past, area.past, SMALL)

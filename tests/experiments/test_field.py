@@ -177,6 +177,7 @@ class HereAndNow:
         return type("Done", (), {"result": staticmethod(lambda: made)})
 
 
+@pytest.mark.slow  # an experiment
 def test_every_method_gets_the_same_views(placed):
     place, scene = placed
     made = json.loads(place.result(scene, "field").read_text())
@@ -192,6 +193,7 @@ def test_every_method_gets_the_same_views(placed):
     assert all(np.array_equal(a.grey, b.grey) for a, b in zip(first, again, strict=True))
 
 
+@pytest.mark.slow  # an experiment
 def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
     """Only what is missing is placed, and what was placed by other code."""
     place, scene = placed
@@ -214,6 +216,7 @@ def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
     out.write_text(whole)
 
 
+@pytest.mark.slow  # an experiment
 def test_a_row_of_the_field_is_checked_and_shown(placed):
     place, _ = placed
     (row,) = [each for each in read(place.results) if "field" in each.plain]

@@ -101,6 +101,7 @@ def made(place, scene):
         return runs.run(place, scene, Method("gradient", "gradient", "gradient"))
 
 
+@pytest.mark.slow  # an experiment
 def test_map_covers_the_search_band(place, scene, made):
     localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
     extent = np.ptp(localizer.tiles.centres_en_m, axis=0) + localizer.grid.stride_m
@@ -117,6 +118,7 @@ def test_band_narrower_than_a_tile_is_one_around_the_route(scene):
     assert (east - west, north - south) == pytest.approx((320, 288), abs=1)
 
 
+@pytest.mark.slow  # an experiment
 def test_views_show_the_ground_of_the_map_pixel_by_pixel(place, scene, made):
     localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
     same = replace(scene, present=scene.past)
@@ -135,6 +137,7 @@ def test_views_show_the_ground_of_the_map_pixel_by_pixel(place, scene, made):
         assert np.abs(np.rot90(grey).astype(int) - turned).mean() < 3
 
 
+@pytest.mark.slow  # an experiment
 def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeypatch):
     out = place.result(scene, "gradient-gradient")
     written = json.loads(out.read_text())
@@ -162,6 +165,7 @@ def test_runs_side_by_side_say_what_went_wrong(place, scene, made, tmp_path):
     assert ended["B"] == made["minutes"] and isinstance(ended["none"], MissingFileError)
 
 
+@pytest.mark.slow  # an experiment
 def test_tables_and_plots_are_made_of_the_files_alone(tmp_path, made):
     folder = tmp_path / "reduced"
     folder.mkdir()
@@ -302,6 +306,7 @@ def test_learning_is_reported_without_a_terminal(scene, monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow  # an experiment
 def test_more_epochs_are_another_run_of_the_same_row(place, scene, made, monkeypatch):
     rows = {each.key: each.recipe for each in methods(REDUCED, "B", 900, more_epochs=77)}
     assert "epochs=77" in rows["autoencoder-canny"] and "epochs=77" in rows["triplet-gray"]

@@ -73,8 +73,15 @@ def test_biases_of_a_track_count():
     np.testing.assert_allclose(en_of(found), en_of(same), atol=1e-6)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
-@pytest.mark.parametrize("px", [(320, 240), (20, 30)])
+@pytest.mark.parametrize(
+    ("px", "tilt_deg"),
+    [
+        ((320, 240), 0.0),
+        pytest.param((320, 240), 25.0, marks=pytest.mark.slow),
+        pytest.param((20, 30), 0.0, marks=pytest.mark.slow),
+        ((20, 30), 25.0),
+    ],
+)
 def test_ellipses_cover_what_they_state(px, tilt_deg):
     """The middle of the view is measured, the camera follows from it."""
     rng = np.random.default_rng(4)

@@ -124,7 +124,7 @@ def test_biases_of_heading_height_and_mount_are_estimated(localizer):
     tracker = Tracker(localizer)
     seen = list(
         views(
-            0, where=spots(24), year=lit, every_s=60, heading_off=6.0, tilt=(5.0, -2.0), scale=1.05
+            0, where=spots(18), year=lit, every_s=60, heading_off=6.0, tilt=(5.0, -2.0), scale=1.05
         )
     )
     rows = followed(tracker, localizer, seen)

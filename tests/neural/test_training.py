@@ -127,7 +127,11 @@ def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
     assert found[1] > 0.75  # rounding differs between machines and numbers of threads
 
 
-@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+@pytest.mark.parametrize(
+    "recipe",
+    [AUTO, pytest.param(TRIPLET, marks=pytest.mark.slow)],
+    ids=["autoencoder", "triplet"],
+)
 def test_an_interrupted_training_resumes_with_the_same_result(recipe, tmp_path):
     whole = undisturbed(recipe)
     with pytest.raises(Killed):

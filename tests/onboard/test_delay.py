@@ -55,7 +55,7 @@ class Measured:
         return np.array([each.delay_s - true for each, true in pairs if each.found])
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.12, 8.0])
+@pytest.mark.parametrize("delay_s", [0.0, 0.12, pytest.param(8.0, marks=pytest.mark.slow)])
 def test_a_constant_delay_is_found(delay_s):
     seen = Measured(Flown(45, seed=1), lambda _: delay_s)
     for estimates in (seen.whole, seen.recent):
@@ -138,6 +138,7 @@ def test_clouds_over_a_part_do_no_harm():
     assert len(errors) > 5 and np.abs(errors).max() < 0.15
 
 
+@pytest.mark.slow
 def test_the_same_values_give_the_same_estimates():
     flown = Flown(20, seed=8)
     first, second = (Measured(flown, lambda _: 0.12, seconds=18) for _ in range(2))

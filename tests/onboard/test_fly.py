@@ -51,6 +51,8 @@ from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 AHEAD_NS = -90 * S
+LEAD = 30
+"""Views before a fault."""
 
 
 class BoundedLog:
@@ -171,9 +173,9 @@ def begin(tmp_path):
 
 @pytest.fixture
 def flight(begin, tmp_path):
-    """A flight after six seconds without faults."""
+    """A flight after three seconds without faults."""
     made = begin(map_path=tmp_path)
-    made.views(60)
+    made.views(LEAD)
     made.port.gone.clear()
     return made
 
@@ -222,7 +224,7 @@ def test_a_view_is_logged_with_its_telemetry_before_it_is_located(flight):
     number, frame, grey, telemetry, latency_ms, withheld = flight.log.named("view")[-1]
     assert latency_ms is None and withheld is False
     assert telemetry is flight.locator.seen[-1] and grey.shape == (240, 320)
-    assert (number, frame) == (61, "000061")
+    assert (number, frame) == (LEAD + 1, f"{LEAD + 1:06d}")
     assert flight.log.named("result")[-1][0].frame == frame
 
 

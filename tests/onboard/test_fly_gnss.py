@@ -94,7 +94,7 @@ def begin(tmp_path):
 
 def test_agreement_is_no_reason(begin):
     flight = begin()
-    flight.views(200, wait_s=0.5)
+    flight.views(160, wait_s=0.5)
     north_m = flight.north_at(flight.time.now_ns - 50 * MS)
     health = flight.health()
     assert not [reason for reason in health.reasons if reason.startswith("gnss")]
@@ -110,7 +110,7 @@ def test_agreement_is_no_reason(begin):
 @pytest.mark.parametrize("receiver", ["gps_raw_int", "gps2_raw"])
 def test_a_step_is_reported_everywhere(begin, receiver):
     flight = begin(receiver=receiver)
-    flight.views(150, wait_s=0.5)
+    flight.views(90, wait_s=0.5)
     flight.frames.clear()
     flight.off_m = np.array([40.0, 0.0])
     flight.views(30)

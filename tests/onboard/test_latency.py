@@ -185,7 +185,9 @@ def test_a_stream_that_is_late_from_the_start():
     assert flight.gate.withheld["stale"] > 31
 
 
-@pytest.mark.parametrize(("late_s", "stamps"), [(0.7, False), (8.0, True)])
+@pytest.mark.parametrize(
+    ("late_s", "stamps"), [(0.7, False), pytest.param(8.0, True, marks=pytest.mark.slow)]
+)
 def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     delay = {"s": 0.12}
     flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
@@ -214,7 +216,7 @@ def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
     straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12))
     flight.stamps = True
-    flight.fly(20)
+    flight.fly(12)
     flight.stalled = True
     flight.fly(2.0)
     flight.stalled = False
@@ -224,7 +226,7 @@ def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
 def test_a_stall_without_timestamps_needs_a_manoeuvre():
     straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12))
-    flight.fly(20)
+    flight.fly(12)
     flight.stalled = True
     flight.fly(2.0)
     flight.stalled = False
@@ -232,6 +234,7 @@ def test_a_stall_without_timestamps_needs_a_manoeuvre():
     assert "no image for 2" in flight.monitor.plain()["latency"]
 
 
+@pytest.mark.slow
 def test_a_drifting_latency_is_followed():
     flight = LateFlight(Flown(90, seed=5), 0.1, lambda now_s: 0.1 + 0.012 * now_s)
     flight.fly(20)
@@ -255,7 +258,7 @@ def test_mirrored_and_rotated_images_give_no_latency(change):
 
 def test_a_camera_that_freezes_with_noise_is_noticed():
     flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
-    flight.fly(20)
+    flight.fly(12)
     rng, still = np.random.default_rng(0), flight.flown.picture(flight.now_s, CAMERA)
     flight.stream.change = lambda _: np.uint8(
         np.clip(still + rng.normal(0, 3, still.shape), 0, 255)

@@ -95,7 +95,6 @@ def random_points(west_m, south_m, east_m, north_m, count=2000):
 
 
 REQUESTS = {
-    "plain": WITH_LAYER,
     "gray": {"edges": "gray"},
     "canny": {"edges": "canny:low=50,high=120"},
     "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
@@ -352,7 +351,7 @@ def test_an_interrupt_leaves_nothing(ortho, tmp_path, names_in, stage):
     assert names_in(tmp_path) == []
 
 
-def own_views(localizer, path, mirrored=False, count=30):
+def own_views(localizer, path, mirrored=False, count=20):
     """Fixes of views cut from the imagery of a map, mirrored or not, with their true places."""
     grid, rng = localizer.grid, np.random.default_rng(3)
     width_m, height_m = grid.width_px * grid.gsd_m, grid.height_px * grid.gsd_m
@@ -386,7 +385,7 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     places = [localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) for fix in fixes]
     errors_m = np.abs(np.array(places) - truth).max(axis=1)
     own = np.array([fix.confidence for fix in fixes])
-    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True, 15)[0]])
+    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True, 10)[0]])
     assert (errors_m <= localizer.grid.stride_m).mean() >= 0.95
     assert np.median(own) > 0.8 and np.median(false) < 0.4
     assert (false[:, None] < own).mean() > 0.97  # nearly every pair is separated

@@ -46,7 +46,13 @@ def built(area, tmp_path_factory):
     return build
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(each, marks=pytest.mark.slow if each.startswith("caevl") else ())
+        for each in METHODS
+    ],
+)
 def test_a_map_of_any_method_flies(built, flight_path, method):
     path = built(method)
     localizer = Localizer(open_map(path), registration=False)

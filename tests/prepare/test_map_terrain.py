@@ -140,13 +140,14 @@ def flown(area, frame, dem, tmp_path_factory):
     corners = np.array([[-350.0, -250.0], [350.0, -250.0], [350.0, 250.0]])
     lat, lon = frame.latlon_from_en(corners)
     out = tmp_path_factory.mktemp("flown") / "flight"
-    simulate_flight(
-        SimulateRequest(
-            [area.present], out, route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
-            agl_m=250.0, spacing_m=70.0, camera=area.camera, errors=Errors(yaw_std_deg=3.0),
-            terrain=open_dem(dem, "msl"), seed=1,
-        )
+    request = SimulateRequest(
+        [area.present], out, route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+        agl_m=250.0, spacing_m=70.0, camera=area.camera, errors=Errors(yaw_std_deg=3.0),
+        terrain=open_dem(dem, "msl"), seed=1,
     )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
+        simulate_flight(request)
     return out
 
 
@@ -264,7 +265,8 @@ def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
     assert done.code == 1 and "the terrain lies outside the map" in done.err
 
 
-def test_random_views_report_heights_above_sea_only(run, area, dem, tmp_path):
+def test_random_views_report_heights_above_sea_only(run, area, dem, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
     done = run(
         "simulate", "--ortho", area.present, "--random", 3, "--agl-m", 250, "--dem", dem,
         "--dem-datum", "msl", "--out", tmp_path / "flight",

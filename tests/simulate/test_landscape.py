@@ -58,8 +58,8 @@ def test_other_seed_other_land(pair):
     ("gsd_m", "date", "corner_m"),
     [
         (1.0, AUTUMN, (WEST_M, NORTH_M)),
-        (0.3, SUMMER, (WEST_M + 700.1, NORTH_M + 0.25)),
-        (0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7)),
+        pytest.param(0.3, SUMMER, (WEST_M + 700.1, NORTH_M + 0.25), marks=pytest.mark.slow),
+        pytest.param(0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7), marks=pytest.mark.slow),
         (3.0, SPRING, (WEST_M - 500.0, NORTH_M + 300.0)),
     ],
 )
@@ -87,6 +87,7 @@ def test_large_window_is_the_same_as_a_small_one(pair):
     assert share < 1e-3
 
 
+@pytest.mark.slow  # how the generated ground looks
 def test_coarse_picture_shows_the_same_ground(pair):
     coarse = Landscape(1).render(SUMMER, WEST_M, NORTH_M, 100, 90, 4.0)
     shrunk = cv2.resize(pair[0], (100, 90), interpolation=cv2.INTER_AREA)
@@ -138,6 +139,7 @@ def test_more_years_more_change():
     assert 0.0 < np.mean((born > 2016.5) & (born < 2021.8)) < 0.1
 
 
+@pytest.mark.slow  # how the generated ground looks
 def test_warp_never_folds():
     network = Network(5)
     grid = np.stack(np.meshgrid(np.arange(0, 6000.0, 15.0), np.arange(0, 6000.0, 15.0)), axis=2)

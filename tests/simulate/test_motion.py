@@ -57,6 +57,7 @@ def test_heading_and_speed_are_those_of_the_wind_triangle(from_deg, crab_deg, gr
     assert speed.std() > 0.5
 
 
+@pytest.mark.slow
 def test_gusts_are_as_strong_and_as_slow_as_documented():
     across = AIRSPEED * np.sin(np.radians(off_course_deg(flown(NORTH, Wind(8.0, 0.0)))))
     assert across.std() == pytest.approx(GUST_STD * 8, rel=0.15)

@@ -83,6 +83,7 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
         from matplotlib.figure import Figure
     except ImportError as error:
         raise missing_extra("drawing figures", "report", "matplotlib", error) from error
@@ -95,7 +96,9 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         png = _png(np.asarray(canvas.buffer_rgba()))
         figure.set_layout_engine("none")  # PNG and SVG share one layout
         _limit_points(figure)
-        figure.savefig(svg, format="svg", dpi=DPI, metadata=_NO_METADATA)
+        # As `savefig`, which draws once more before, for a layout.
+        page: Any = FigureCanvasSVG(figure)
+        page.print_svg(svg, metadata=_NO_METADATA)
     return Drawing(png, _NOT_XML.sub("\ufffd", svg.getvalue()), size_in)
 
 
