@@ -99,6 +99,8 @@ REGISTRATION = (
     "src/orthonav/localizer/*.py",
     "src/orthonav/register/*.py",
 )
+TRACKED = ("src/orthonav/localizer/odometry.py", "src/orthonav/localizer/tracker.py")
+"""Files among those that place no single view, and so decide no row."""
 
 
 def code(family: str, edges: str, *, registration: bool, generated: bool) -> dict[str, str]:
@@ -106,6 +108,7 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
     patterns = [*PROTOCOL, *FAMILY[family], *(REGISTRATION if registration else TILES)]
     patterns += EDGES[edges.partition(":")[0]] if edges else ()
     paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
+    paths -= {ROOT / path for path in TRACKED}
     found = {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
     return found | ({GENERATED: _drawn()} if generated else {})
 
