@@ -13,6 +13,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.paper.methods import (
     CANNY,
     DEFAULT,
@@ -40,13 +42,14 @@ DIGITS = 5
 
 PROTOCOL = ("experiments/paper/views.py", "experiments/paper/runs.py")
 GENERATED = "generated landscape"
-"""In place of the files that draw generated scenes: mean grey levels of ground that they draw."""
+"""In place of the files that draw generated scenes: grey levels of ground that they draw."""
 DRAWN_PX, DRAWN_GSD_M, DRAWN_FROM_M = 256, (0.2, 1.0, 2.0), (300.0, 900.0)
 """Side and ground resolutions of that ground, and how far it lies from the landscape's origin."""
 SAME_GREY = 0.2
-"""Difference in mean grey levels up to which drawn ground is the same.
+"""Difference up to which means and standard deviations of drawn ground are the same.
 
-Processors round single pixels differently; a change of the generator moves means by far more.
+Processors round single pixels differently. A change of the generator moves houses or texture, and
+with them the figures of some quarter.
 """
 TILES = (
     "src/orthonav/localizer/match.py",
@@ -115,7 +118,8 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
 
 @lru_cache
 def _drawn() -> str:
-    """Mean grey levels of the quarters of some generated ground at every date and resolution."""
+    """Means and standard deviations of the grey levels of the quarters of some generated ground,
+    at every date and resolution."""
     from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
     made, levels = Landscape(SEED), []
@@ -124,8 +128,9 @@ def _drawn() -> str:
     for gsd_m in DRAWN_GSD_M:
         for date in DEFAULT_DATES:
             picture = made.render(date, west_m, north_m, DRAWN_PX, DRAWN_PX, gsd_m)
-            quarters = picture.reshape(2, half, 2, half, -1).mean(axis=(1, 3, 4))
-            levels += [f"{level:.2f}" for level in quarters.ravel()]
+            quarters = picture.reshape(2, half, 2, half, -1)
+            for figure in (np.mean, np.std):
+                levels += [f"{each:.2f}" for each in figure(quarters, axis=(1, 3, 4)).ravel()]
     return " ".join(levels)
 
 

@@ -228,6 +228,13 @@ def test_a_background_beside_the_flight_or_far_larger_does_no_harm(extent: tuple
     decoded(plots.map_picture(made_flight(5).comparison, 15.0, background))
 
 
+def test_the_same_flight_gives_the_same_picture() -> None:
+    flight = made_flight(20)
+    assert plots.over_time_picture(flight.comparison, 15.0) == plots.over_time_picture(
+        flight.comparison, 15.0
+    )
+
+
 def test_without_matplotlib_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):

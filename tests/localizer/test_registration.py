@@ -309,7 +309,7 @@ def test_candidates_from_tiles_lie_within_the_prior(localizer, plain, from_tiles
     )
 
 
-@pytest.mark.parametrize("confidence, further", [(0.995, False), (0.95, True)])
+@pytest.mark.parametrize("confidence, further", [(0.995, False), (0.95, True), (0.005, True)])
 def test_the_search_ends_with_tiles_only_where_the_place_is_confident(
     localizer, plain, monkeypatch, confidence, further
 ):

@@ -218,7 +218,7 @@ def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
 
 def looking(opened, relief, **changes):
     """A localizer to which every further search is dear."""
-    plan = replace(DEFAULT_PLAN, **{"cheap_ms": 0.0, "look_ms": 0.0} | changes)
+    plan = replace(DEFAULT_PLAN, **{"cheap_ms": 0.0, "terrain_trial_ms": 0.0} | changes)
     localizer = Localizer(opened, plan=plan)
     localizer.registration.relief = Relief(Terrain(relief), localizer.grid)
     return localizer
@@ -232,7 +232,7 @@ def test_a_place_that_stands_out_on_the_terrain_ends_the_search(opened, grey, re
     early = looking(opened, relief).locate(view)
     whole, doubtful, limited = (
         looking(opened, relief, **changes).locate(view)
-        for changes in ({"look_ms": math.inf}, {"doubt": 0.0}, {"budget_ms": 1e6})
+        for changes in ({"terrain_trial_ms": math.inf}, {"doubt": 0.0}, {"budget_ms": 1e6})
     )
     assert early.evidence["candidates"] < whole.evidence["candidates"]
     assert error_m(looking(opened, relief), early, place) < 1.0 and early.confidence > 0.99

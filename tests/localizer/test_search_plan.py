@@ -72,7 +72,7 @@ def test_nothing_is_begun_after_the_budget_is_spent(clock):
 def test_more_tiles_give_more_candidates_within_bounds():
     least, most = DEFAULT_PLAN.tile_candidates
     counts = [DEFAULT_PLAN.candidates_from(tiles, True) for tiles in (1, 8_000, 10**6)]
-    assert counts == [least, 8_000 // DEFAULT_PLAN.tiles_a_candidate, most]
+    assert counts == [least, 8_000 // DEFAULT_PLAN.tiles_per_candidate, most]
     assert DEFAULT_PLAN.candidates_from(10**6, False) == DEFAULT_PLAN.tile_candidates_any_heading
 
 

@@ -61,8 +61,8 @@ class GroundSeen:
 class ViewOnLevelGround:
     """One view on level ground."""
 
-    level = True
-    """Whether a view is registered as it is found; else again on the ground below it."""
+    is_level = True
+    """Whether candidates stay as they were found; else they are placed again on the terrain."""
 
     def __init__(self, registrar: Registrar, view: PreparedView) -> None:
         self.registrar, self.view = registrar, view
@@ -73,7 +73,7 @@ class ViewOnLevelGround:
         return self.registrar.at_final(self.view.templates, self.view.levels, judged)
 
     def looked_again(self, judged: list[Placed], at_most: int | None = None) -> list[Placed]:
-        """Judged candidates, `at_most` so many of them looked at again, where none stands out."""
+        """Judged candidates, at most `at_most` of them placed again, where none stands out."""
         return judged
 
     def templates_of(self, placed: Placed) -> ViewTemplates:
@@ -106,7 +106,7 @@ class ViewOnLevelGround:
 class ViewOverRelief(ViewOnLevelGround):
     """One view on the ground of a sheet. Not to be shared between threads."""
 
-    level = False
+    is_level = False
 
     def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
         super().__init__(registrar, view)

@@ -3,7 +3,7 @@
 A view is judged at one level of the map, where it is some 72 px across (`Levels.look`). There are
 three sources of candidates:
 
-- the *judged level* by FFT: the only one that misses nothing, and the dearest on a large area;
+- the *judged level* by FFT: the only one that misses nothing, and the slowest on a large area;
 - the *coarse level*, one above it, by FFT: a quarter of the pixels;
 - the *tiles* whose embeddings are most similar to the view.
 
@@ -103,7 +103,7 @@ class SearchPlan:
     """Least and largest number of candidates from tiles."""
     tile_candidates_any_heading: int = 400
     """Largest number of them where the heading is unknown; docs/decisions/registration.md, 12."""
-    tiles_a_candidate: int = 200
+    tiles_per_candidate: int = 200
     """Between these, one candidate for so many tiles: the right one ranks lower among more."""
     tile_reach_strides: float = 1.1
     """The place of a candidate from tiles is sought within so many strides of the tile grid."""
@@ -135,11 +135,11 @@ class SearchPlan:
     max_search_px: int = 8_000_000
     """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
     tiles, or with a prior."""
-    look_ms: float = 20.0
-    """Before a search dearer than this the best candidates so far are placed on the terrain, which
-    costs about as much for each; `python -m benchmarks.over_terrain --only oblique`."""
-    looks: int = 3
-    """So many of them."""
+    terrain_trials: int = 3
+    """Before an expensive search so many of the best candidates are placed on the terrain;
+    `python -m benchmarks.over_terrain --only oblique`."""
+    terrain_trial_ms: float = 7.0
+    """Estimated cost of one of them: a search that costs more than all of them is expensive."""
     budget_ms: float = math.inf
     """No search after the first one is begun that would end later than this after the first one
     began, ms; the best place so far is the answer."""
@@ -175,7 +175,7 @@ class SearchPlan:
         least, most = self.tile_candidates
         if not heading_known:
             most = self.tile_candidates_any_heading
-        return max(least, min(most, round(tiles / self.tiles_a_candidate)))
+        return max(least, min(most, round(tiles / self.tiles_per_candidate)))
 
     def enough(self, run: Search, levels: Levels) -> ClearMargin:
         """The margin that ends the search after `run`."""

@@ -199,10 +199,8 @@ class RegistrationLocalizer:
             lambda: self._tiles(view, rows()),
         )
         for each in takewhile(lambda each: budget.allows(each.cost_ms), searches):
-            if each.cost_ms > self.plan.look_ms and (
-                best := self._found_early(view, ground, judged, enough, finished)
-            ):
-                return best
+            if early := self._found_early(view, ground, judged, each.cost_ms, enough, finished):
+                return early
             if each.from_tiles and self.propose is not None:
                 found = self._from_tiles(view, prior, each, rows(), self.propose)
             else:
@@ -219,7 +217,7 @@ class RegistrationLocalizer:
             if judged and self._seems_clear(view, judged, enough):
                 best = finished(judged)
                 # Candidates from tiles are not all places: their rivals alone prove too little.
-                proven = not each.from_tiles or not self._is_doubtful(best)
+                proven = not each.from_tiles or self._is_proven(best)
                 if proven and self._is_clear(best, enough):
                     return best
         if not judged:
@@ -234,22 +232,25 @@ class RegistrationLocalizer:
         view: PreparedView,
         ground: ViewOnLevelGround,
         judged: list[Placed],
+        cost_ms: float,
         enough: ClearMargin,
         finished: Callable[[list[Placed]], Registered],
     ) -> Registered | None:
-        """The best place so far, if it stands out on the ground as it is and is not doubtful.
+        """The best place so far, if it stands out on the terrain and no search could change that.
 
-        None on level ground, where it would have ended the search before, and with a budget of
-        time, which does not know the cost of this.
+        `cost_ms`: that of the next search. None where trials on the terrain cost more, on level
+        ground, where the place would have ended the search before, and with a budget of time,
+        which does not know the cost of this.
         """
-        if ground.level or not judged or math.isfinite(self.plan.budget_ms):
+        cheap = cost_ms <= self.plan.terrain_trials * self.plan.terrain_trial_ms
+        if cheap or ground.is_level or not judged or math.isfinite(self.plan.budget_ms):
             return None
-        looked = ground.looked_again(judged, self.plan.looks)
-        best, rival = self.registrar.standing(view.templates, looked, view.prior)
+        on_terrain = ground.looked_again(judged, self.plan.terrain_trials)
+        best, rival = self.registrar.standing(view.templates, on_terrain, view.prior)
         if best <= max(enough.look_ratio * rival, self._chances.look):
             return None
-        found = finished(looked)
-        return found if self._is_clear(found, enough) and not self._is_doubtful(found) else None
+        found = finished(on_terrain)
+        return found if self._is_clear(found, enough) and self._is_proven(found) else None
 
     def _deepened(
         self, view: PreparedView, ground: ViewOnLevelGround, best: Registered
@@ -287,6 +288,12 @@ class RegistrationLocalizer:
             return True
         doubt = self.plan.doubt
         return doubt <= self.confidence(best.evidence()) <= 1 - doubt
+
+    def _is_proven(self, best: Registered) -> bool:
+        """Whether a place is so confident that no further search could change the verdict."""
+        if self.confidence is None:
+            return False
+        return self.confidence(best.evidence()) > 1 - self.plan.doubt
 
     @property
     def _chances(self) -> Chances:

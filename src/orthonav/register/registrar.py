@@ -258,6 +258,8 @@ class Registrar:
         whole = None
         if math.prod(self.reference.shape(levels.coarse)) <= WHOLE_WINDOW_PX:
             whole = self.whole_window(levels.coarse, recipe, side_px)
+            _ = whole.channels
+        _ = template.interleaved  # made, like the channels, before threads ask for them
 
         def moved(found: Candidate) -> Candidate:
             place = found.pose.x_px, found.pose.y_px

@@ -101,15 +101,18 @@ class SearchWindow:
     @cached_property
     def channels(self) -> Array:
         """The evidence (H, W, 3) divided by its local energy."""
-        groups = (self._made[..., group] for group in GROUPS)
-        even = [_even(group, self._made[..., 3], self._view_px) for group in groups]
-        return np.concatenate(even, axis=2)
+        return self._even()
 
     @cached_property
     def spectra(self) -> NDArray[np.complex64]:
-        """Spectra (3, h, w) of the channels, padded to `size`."""
-        planes = np.moveaxis(self.channels, 2, 0)
+        """Spectra (3, h, w) of the channels, padded to `size`; the channels are not kept."""
+        planes = np.moveaxis(self._even(), 2, 0)
         return np.asarray(rfft2(planes, s=self.size), np.complex64)
+
+    def _even(self) -> Array:
+        groups = (self._made[..., group] for group in GROUPS)
+        even = [_even(group, self._made[..., 3], self._view_px) for group in groups]
+        return np.concatenate(even, axis=2)
 
 
 def _even(channels: Array, counts: Array, view_px: int) -> Array:
@@ -136,7 +139,7 @@ def search(
     """
     share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
     parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
-    _ = template.interleaved  # made before threads ask for it
+    _ = template.interleaved, window.spectra  # made before threads ask for them
     surfaces = (pool.map if pool else map)(
         lambda part: _best_of(template, window, poses, part, scales), parts
     )
