@@ -5,44 +5,85 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.localizer.odometry import ViewDisplacement, over_terrain
+from orthonav.localizer.odometry import Terrain, ViewDisplacement, over_terrain
 from orthonav.track import CameraDisplacement
 
-AGL_M = 200.0
+AGL_M, HALF_M = 200.0, 100.0
+BELOW = np.zeros(2)
 
 
-def as_measured(moved_m, slope):
-    """What registration of one view on the other measures: the similarity (turn, log scale) between
-    both as rectified for level ground at height `AGL_M`."""
-    at = np.stack(np.meshgrid(*[np.linspace(-100, 100, 21)] * 2), -1).reshape(-1, 2)
-    places = np.array([[0.0, 0.0], moved_m])
-    # Depth of the ground below the camera, which flies at a constant altitude.
-    points = at + np.array(moved_m) / 2
-    depth = AGL_M - points @ slope
-    before, now = ((points - place) * (AGL_M / depth)[:, None] for place in places)
+def similarity(before, now):
+    """Displacement of the origin, clockwise turn and log scale from one picture (N, 2) to the
+    other, by least squares."""
     x, y = (now - now.mean(axis=0)).T
     rows = np.concatenate([np.stack([x, y], -1), np.stack([y, -x], -1)])  # clockwise turns
     target = (before - before.mean(axis=0)).T.reshape(-1)
     (c, s), *_ = np.linalg.lstsq(rows, target, rcond=None)
-    return math.atan2(s, c), math.log(math.hypot(c, s))
+    moved_m = before.mean(axis=0) - np.array([[c, s], [-s, c]]) @ now.mean(axis=0)
+    return moved_m, math.atan2(s, c), math.log(math.hypot(c, s))
+
+
+def as_measured(moved_m, slope, ahead_m=BELOW):
+    """What registration of one view on the other measures: the similarity between what both see,
+    `ahead_m` of the camera, as rectified for level ground at height `AGL_M`."""
+    square = np.stack(np.meshgrid(*[np.linspace(-HALF_M, HALF_M, 21)] * 2), -1).reshape(-1, 2)
+    before = square + ahead_m
+    # The camera flies at a constant altitude, `AGL_M` above the ground below it before.
+    points = before / (1 + before @ slope / AGL_M)[:, None]
+    depth = AGL_M - points @ slope
+    now = (points - moved_m) * (AGL_M / depth)[:, None]
+    seen = (np.abs(now - ahead_m) <= HALF_M).all(axis=1)
+    return similarity(before[seen], now[seen])
+
+
+def terrain_of(slope, ahead_m=BELOW):
+    """A plane through the ground below the camera, as seen `ahead_m` of it."""
+    rise = float(ahead_m @ slope) / AGL_M
+    return Terrain(slope, slope, rise / (1 + rise))
 
 
 @pytest.mark.parametrize("slope", [(0.2, 0.0), (0.0, 0.2), (-0.15, 0.1)])
 def test_parallax_of_a_slope_is_no_turn_and_no_climb(slope):
     moved_m, slope = np.array([30.0, 20.0]), np.array(slope)
-    turned, scaled = as_measured(moved_m, slope)
+    _, turned, scaled = as_measured(moved_m, slope)
     seen = CameraDisplacement(moved_m, np.eye(2), 100.0, turned, scaled)
-    there = AGL_M - float(moved_m @ slope)
-    known = over_terrain(ViewDisplacement(seen, 0.8), (AGL_M, AGL_M), slope).displacement
+    there, heights_m = AGL_M - float(moved_m @ slope), (AGL_M, AGL_M)
+    terrain, measured = terrain_of(slope), ViewDisplacement(seen, 0.8)
+    known = over_terrain(measured, heights_m, terrain, BELOW).displacement
     # The reported height is the same at both, so the bias takes what the ground rises.
     assert known.scaled == pytest.approx(math.log(there / AGL_M), abs=0.006)
     assert abs(known.turned_rad) < 0.15 * abs(turned) + 0.001
+    # A camera that looks straight down is above what it sees.
+    np.testing.assert_array_equal(known.moved_en_m, moved_m)
+    np.testing.assert_array_equal(known.covariance, seen.covariance)
     # Reported heights that follow the ground leave the bias as it is.
     follows = CameraDisplacement(
         moved_m, np.eye(2), 100.0, turned, scaled - math.log(there / AGL_M)
     )
-    left = over_terrain(ViewDisplacement(follows, 0.8), (AGL_M, there), slope).displacement
+    left = over_terrain(ViewDisplacement(follows, 0.8), (AGL_M, there), terrain, BELOW).displacement
     assert left.scaled == pytest.approx(0.0, abs=0.006)
-    unknown = over_terrain(ViewDisplacement(seen, 0.8), (AGL_M, AGL_M), None).displacement
+    unknown = over_terrain(measured, heights_m, None, BELOW).displacement
     assert (unknown.turned_rad, unknown.scaled) == pytest.approx((turned, scaled))
     assert unknown.scaled_std > known.scaled_std > seen.scaled_std
+
+
+@pytest.mark.parametrize("off_nadir_deg", [30, 45, 60])
+@pytest.mark.parametrize("slope", [(0.15, 0.0), (0.0, 0.15), (-0.1, 0.1), (-0.05, -0.1)])
+def test_slope_seen_ahead_does_not_displace_the_camera(off_nadir_deg, slope):
+    moved_m, slope = np.array([5.0, 8.75]), np.array(slope)
+    ahead_m = AGL_M * math.tan(math.radians(off_nadir_deg)) * np.array([0.6, 0.8])
+    measured_m, turned, scaled = as_measured(moved_m, slope, ahead_m)
+    seen = CameraDisplacement(measured_m, np.eye(2), 100.0, turned, scaled)
+    terrain, measured = terrain_of(slope, ahead_m), ViewDisplacement(seen, 0.8)
+    known = over_terrain(measured, (AGL_M, AGL_M), terrain, ahead_m).displacement
+    off_m, left_m = (np.hypot(*(m - moved_m)) for m in (measured_m, known.moved_en_m))
+    assert off_m > 0.035 * np.hypot(*moved_m)
+    assert left_m < off_m / 4
+    assert known.turned_rad == pytest.approx(0.0, abs=0.0006)
+    there = AGL_M - float(moved_m @ slope)
+    assert known.scaled == pytest.approx(math.log(there / AGL_M), abs=0.0006)
+    unknown = over_terrain(measured, (AGL_M, AGL_M), None, ahead_m).displacement
+    np.testing.assert_array_equal(unknown.moved_en_m, measured_m)
+    # The farther ahead, the less a displacement over unknown ground counts.
+    least = seen.covariance[0, 0]
+    assert unknown.covariance[0, 0] > known.covariance[0, 0] > least

@@ -51,7 +51,7 @@ rectified again. Heading has no limit: views are rectified with their heading up
 UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
 """Usual slope of ground whose slope is unknown, and the share of it that a terrain leaves."""
 LEAST_SCALED = 0.5
-"""Least height over that of the view before: the rest is an error."""
+"""Least height or distance over the one expected: the rest is an error."""
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
 
@@ -129,6 +129,11 @@ class OdometryView:
         cos, sin = math.cos(heading), math.sin(heading)
         metres = self.pixel_m * math.exp(-self.bias[1])
         return np.array([[cos, -sin], [-sin, -cos]]) * metres
+
+    @property
+    def ahead_en_m(self) -> Array:
+        """Middle of the view (2,), metres east and north of the camera, by the same."""
+        return np.asarray(self.en_from_px @ -self.camera_px)
 
     @classmethod
     def of(
@@ -216,30 +221,57 @@ def displacement(
     return ViewDisplacement(seen, min(max(placed.overlap, 0.0), 1.0))
 
 
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """Ground that is not level.
+
+    `below`, `seen` (2,): its rise per metre east and north below the camera, and at the middle of
+    what the camera sees. `rise`: of the ground there over that below, as a share of the height.
+    """
+
+    below: Array
+    seen: Array
+    rise: float
+
+
 def over_terrain(
-    measured: ViewDisplacement, agl_m: tuple[float, float], slope: Array | None
+    measured: ViewDisplacement,
+    agl_m: tuple[float, float],
+    terrain: Terrain | None,
+    ahead_en_m: Array,
 ) -> ViewDisplacement:
     """A displacement over ground that is not level.
 
-    `agl_m`: heights reported with both views. `slope` (2,): rise of the ground per metre east and
-    north; None where it is unknown. Level ground is assumed by the measurement: by parallax, a
-    slope along the way looks like a change of scale, one across it like a turn, each by half. And
-    the height above the ground below changes by what this rises (docs/decisions/terrain.md).
+    `agl_m`: heights reported with both views. `terrain`: None where it is unknown. `ahead_en_m`
+    (2,): middle of what both views see, from the camera. Level ground is assumed by the
+    measurement: by parallax, a slope along the way looks like a change of scale, one across it like
+    a turn, each by half, about the middle of the views. They displace the camera, which is not
+    there. The displacement is seen at the distance of the ground there, and the height above the
+    ground below changes by what this rises (docs/decisions/terrain.md).
     """
     seen = measured.displacement
-    share_en = seen.moved_en_m / agl_m[0]
-    reported = math.log(agl_m[1] / agl_m[0])
-    rise, across = 0.0, 0.0
+    moved_en_m, near, below = seen.moved_en_m, 1.0, 0.0
+    along, across = 0.0, 0.0
     unknown = UNKNOWN_SLOPE
-    if slope is not None:
-        rise = float(share_en @ slope)
-        across = float(share_en[1] * slope[0] - share_en[0] * slope[1])
+    if terrain is not None:
+        near = max(1 - terrain.rise, LEAST_SCALED)
+        steep = max(1 + float(terrain.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
+        share_en = moved_en_m / (agl_m[0] * steep)
+        along = float(share_en @ terrain.seen) / 2
+        across = float(share_en[1] * terrain.seen[0] - share_en[0] * terrain.seen[1]) / 2
+        parallax = np.array([[along, -across], [across, along]])
+        moved_en_m = near * (moved_en_m + parallax @ ahead_en_m)
+        below = float(moved_en_m @ terrain.below) / agl_m[0]
         unknown *= LEFT_OF_SLOPE
-    unknown *= float(np.hypot(*share_en))
-    left = math.exp(seen.scaled + reported) - 1.5 * rise
+    unknown *= float(np.hypot(*moved_en_m)) / agl_m[0]
+    aside_m = float(np.hypot(*ahead_en_m)) * unknown / 2
+    reported = math.log(agl_m[1] / agl_m[0])
+    left = near * (math.exp(seen.scaled + reported) - along) + 1 - near - below
     over = replace(
         seen,
-        turned_rad=seen.turned_rad + across / 2,
+        moved_en_m=moved_en_m,
+        covariance=seen.covariance + np.eye(2) * aside_m**2,
+        turned_rad=seen.turned_rad + across,
         turned_std_rad=math.hypot(seen.turned_std_rad, unknown / 2),
         scaled=math.log(max(left, LEAST_SCALED)) - reported,
         scaled_std=math.hypot(seen.scaled_std, 1.5 * unknown),

@@ -18,6 +18,7 @@ from orthonav.localizer.checks import check_view
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import (
     OdometryView,
+    Terrain,
     ViewDisplacement,
     corrected_by,
     displacement,
@@ -28,6 +29,7 @@ from orthonav.localizer.prepared import PreparedView
 from orthonav.localizer.relief import Relief
 from orthonav.localizer.tilt import with_tilt
 from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
+from orthonav.register.pose import rotation
 from orthonav.register.registrar import Registered
 from orthonav.track import (
     Estimate,
@@ -68,7 +70,10 @@ RADIUS_SHARE = 0.025
 KNOWN_MPS = 5.0
 """An estimated velocity with less uncertainty than this predicts the next displacement."""
 KNOWN_PLACE_M = 50.0
-"""The slope of the ground below is known where the position is known better than this."""
+"""The ground below and ahead is known where the position is known better than this."""
+SIGHT_STEPS = 4
+"""Steps along the line of sight to the ground that a view shows. Each leaves a share of the error:
+the slope of the ground over that of the line."""
 Array = NDArray[np.float64]
 
 
@@ -338,15 +343,27 @@ class Tracker:
         if made is None or self._registration.relief is None:
             return made
         heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
-        return over_terrain(made, heights_m, self._slope(self._registration.relief))
+        ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
+        terrain = self._terrain(self._registration.relief, heights_m[0], ahead_en_m)
+        return over_terrain(made, heights_m, terrain, ahead_en_m)
 
-    def _slope(self, relief: Relief) -> Array | None:
-        """Rise of the ground below (2,) per metre east and north; None where it is unknown."""
+    def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
+        """The ground below, and that which a camera sees `ahead_en_m` (2,) of it on level ground
+        by the reported heading and height `agl_m`; None where it is unknown."""
         best = self.mixture.likeliest
         if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
             return None
-        slope = relief.slopes(best.mean[None, POSITION])[0]
-        return slope if np.isfinite(slope).all() else None
+        place, scale = best.mean[POSITION], math.exp(best.mean[SCALE])
+        ahead_m = rotation(-best.mean[HEADING], scale) @ ahead_en_m
+        seen, rise = place, 0.0
+        for _ in range(SIGHT_STEPS):
+            seen = place + (1 - rise) * ahead_m
+            ground_m = relief.terrain.at_en_m(np.stack([place, seen]))
+            rise = float(ground_m[1] - ground_m[0]) / (agl_m * scale)
+        slopes = relief.slopes(np.stack([place, seen]))
+        if not (np.isfinite(slopes).all() and math.isfinite(rise)):
+            return None
+        return Terrain(slopes[0], slopes[1], rise)
 
     def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
