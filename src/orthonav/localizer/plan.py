@@ -95,8 +95,8 @@ class SearchPlan:
     """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
     candidates: int = 24
     """Candidates of a search by FFT at the coarse level."""
-    stage_candidates: int = 8
-    """Candidates of one stage at the judged level."""
+    stage_candidates: int = 24
+    """Candidates of one stage at the judged level; docs/decisions/registration.md, 13."""
     final_candidates: int = 2
     """Candidates of a search at the final level: each is finished."""
     tile_candidates: tuple[int, int] = (20, 80)
@@ -125,8 +125,8 @@ class SearchPlan:
     tiles, where the place is confident as well: there can be more of them than places at the judged
     level that could be searched."""
     doubt: float = 0.01
-    """Views with a confidence from this to one minus this are judged one level finer too;
-    docs/decisions/registration.md, 2."""
+    """A place with a confidence above one minus this is proven. For others many more candidates are
+    finished and compared one level finer; docs/decisions/registration.md, 13."""
     cheap_ms: float = 14.0
     """Up to this cost the judged level is searched at once, and nothing else."""
     last_ms: float = 900.0
@@ -135,6 +135,8 @@ class SearchPlan:
     max_search_px: int = 8_000_000
     """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
     tiles, or with a prior."""
+    terrain_candidates: int = 48
+    """At most so many candidates are placed on the terrain, the best that lie apart."""
     terrain_trials: int = 3
     """Before an expensive search so many of the best candidates are placed on the terrain;
     `python -m benchmarks.over_terrain --only oblique`."""

@@ -35,6 +35,7 @@ from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
 from orthonav.register.search import Candidate, search
+from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
 
 
@@ -186,10 +187,11 @@ class RegistrationLocalizer:
         candidates = 0
         enough = self.plan.clear
 
-        def finished(judged: list[Placed]) -> Registered:
-            return self.registrar.finished(
-                view.templates, view.levels, judged, view.prior, candidates, ground.finish, direct
-            )
+        def finished(
+            judged: list[Placed], finer: Callable[[Placed], ViewTemplates] | None = None
+        ) -> Registered:
+            of_view = view.templates, view.levels, judged, view.prior, candidates
+            return self.registrar.finished(*of_view, ground.finish, direct, finer)
 
         rows = functools.cache(lambda: self._rows_near(view, prior))
         searches = self.plan.searches(
@@ -223,9 +225,11 @@ class RegistrationLocalizer:
         if not judged:
             return None
         if best is None or self.relief is not None:
-            judged = ground.looked_again(judged) if budget.allows(0.0) else judged
+            judged = ground.looked_again(judged, self.plan.terrain_candidates) if budget.allows(0.0) else judged
             best = finished(judged)
-        return replace(self._deepened(view, ground, best), cut_short=budget.cut_short)
+        if view.levels.final > 0 and not self._is_proven(best):
+            best = finished(judged, ground.finer)
+        return replace(best, cut_short=budget.cut_short)
 
     def _found_early(
         self,
@@ -252,16 +256,6 @@ class RegistrationLocalizer:
         found = finished(on_terrain)
         return found if self._is_clear(found, enough) and self._is_proven(found) else None
 
-    def _deepened(
-        self, view: PreparedView, ground: ViewOnLevelGround, best: Registered
-    ) -> Registered:
-        """A place judged one level finer too, where it is doubtful."""
-        if view.levels.final == 0 or not self._is_doubtful(best):
-            return best
-        return self.registrar.deepened(
-            ground.templates_of, ground.finer, view.levels, best, view.prior
-        )
-
     def on_ground(self, view: PreparedView) -> ViewOnLevelGround:
         """A view on the terrain of the map, where it has one."""
         if self.relief is not None:
@@ -281,13 +275,6 @@ class RegistrationLocalizer:
         if best.score <= enough.strength * self._chances.total:
             return False
         return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio
-
-    def _is_doubtful(self, best: Registered) -> bool:
-        """Whether one finer level could change the verdict on a place."""
-        if self.confidence is None:
-            return True
-        doubt = self.plan.doubt
-        return doubt <= self.confidence(best.evidence()) <= 1 - doubt
 
     def _is_proven(self, best: Registered) -> bool:
         """Whether a place is so confident that no further search could change the verdict."""

@@ -9,7 +9,7 @@ import math
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +31,11 @@ KEPT_TO_LOOK = 24
 (docs/decisions/registration.md, 12)."""
 KEPT_TO_FINISH = 3
 """Places that are finished: the best and its rivals."""
+KEPT_IF_IN_DOUBT = 48
+"""The same where the best of these is in doubt: matches by chance lose more in detail, so that the
+right place may be far down the list of the judged level (docs/decisions/registration.md, 13)."""
+KEPT_TO_FINEST = 12
+"""The best of these are compared one level finer."""
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
 """Candidates below these shares of the best score are dropped, after one step and after all steps
@@ -134,6 +139,21 @@ class Finished(NamedTuple):
     look: float | None = None
 
 
+class _Finalist(NamedTuple):
+    """A finished candidate: `score`, its total less the cost of its prior; `fine`: the same with
+    one finer level added, NaN where it was not compared there."""
+
+    score: float
+    made: Finished
+    fine: float = math.nan
+
+    def weight(self, best: "_Finalist") -> float:
+        """Its score, at most as far below that of the best one as with the finer level."""
+        if math.isnan(self.fine) or best.fine <= 0:
+            return self.score
+        return min(self.score, best.score * self.fine / best.fine)
+
+
 @dataclass(frozen=True, eq=False)
 class Registered:
     """The best place of a view, with its rivals.
@@ -142,7 +162,7 @@ class Registered:
     it was judged and finished at, `rival` is the best such score at another place; `look_score` and
     `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
-    `finalists` are the places that were finished, with their scores, best first. `own`: what the
+    `finalists` are the best places that were finished, with their scores, best first. `own`: what the
     place says of itself, without rivals. `cut_short`: whether searches were left out for want of
     time.
     """
@@ -348,79 +368,61 @@ class Registrar:
         candidates: int,
         finish: Callable[[Placed], Finished] | None = None,
         direct: Sequence[Placed] = (),
+        finer: Callable[[Placed], ViewTemplates] | None = None,
     ) -> Registered:
         """The best of the judged candidates, of one or more searches of `candidates` in all.
 
         The best of them are refined at the final level, their rivals too, and all `direct` ones,
-        which were found there; each by `finish` (None: `at_final`). `judged` must not be empty.
+        which were found there; each by `finish` (None: `at_final`). With `finer`, the templates of
+        a finalist one level finer, many more are, and the best of those are compared at that level
+        as well. `judged` must not be empty.
         """
         judged = _ranked(judged, prior)
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
-        finalists = _hopeful(_distinct(judged, KEPT_TO_FINISH, exclusion), prior, HOPE, 2)
+        kept = KEPT_IF_IN_DOUBT if finer else KEPT_TO_FINISH
+        finalists = _hopeful(_distinct(judged, kept, exclusion), prior, HOPE, 2)
         totals = []
         for each in (*finalists, *direct):
             made = finish(each) if finish else self.at_final(templates, levels, each)
-            totals.append((made.total - prior.cost(made.placed.pose), made))
-        totals.sort(key=lambda pair: -pair[0])
-        (score, first), best = totals[0], totals[0][1].placed
-        rivals = [pair for pair in totals if apart_px(pair[1].placed, best) > exclusion]
+            totals.append(_Finalist(made.total - prior.cost(made.placed.pose), made))
+        totals.sort(key=lambda each: -each.score)
+        if finer:
+            totals = self._compared_finer(totals[:KEPT_TO_FINEST], finer)
+        first = totals[0]
+        best = first.made.placed
+        rivals = [each for each in totals if apart_px(each.made.placed, best) > exclusion]
         judged = [*judged, *direct]
         nearest = min(judged, key=lambda each: apart_px(each, best))
         others = [each for each in judged if apart_px(each, best) > exclusion]
         looks = [(each.score, each) for each in others]
-        looks += [(made.look, made.placed) for _, made in rivals if made.look is not None]
-        cost = prior.cost(nearest.pose) if first.look is None else prior.cost(best.pose)
+        looks += [(each.made.look, each.made.placed) for each in rivals if each.made.look]
+        look = first.made.look
+        cost = prior.cost(nearest.pose) if look is None else prior.cost(best.pose)
         return Registered(
-            placed=self.with_covariance(first.templates, levels, best),
-            score=score,
-            rival=max((total for total, _ in rivals), default=0.0),
-            look_score=(nearest.score if first.look is None else first.look) - cost,
-            look_rival=max((look - prior.cost(each.pose) for look, each in looks), default=0.0),
+            placed=self.with_covariance(first.made.templates, levels, best),
+            score=first.score,
+            rival=max((each.score for each in rivals), default=0.0),
+            look_score=(nearest.score if look is None else look) - cost,
+            look_rival=max((score - prior.cost(each.pose) for score, each in looks), default=0.0),
+            fine_score=first.fine,
+            fine_rival=max((each.fine for each in rivals), default=0.0) if finer else math.nan,
             candidates=candidates,
-            finalists=tuple((total, made.placed) for total, made in totals),
-            own=self._own_ratios(first.templates, levels, score + prior.cost(best.pose), best),
+            finalists=tuple((each.weight(first), each.made.placed) for each in totals),
+            own=self._own_ratios(
+                first.made.templates, levels, first.score + prior.cost(best.pose), best
+            ),
         )
 
-    def deepened(
-        self,
-        templates: Callable[[Placed], ViewTemplates],
-        finer: Callable[[Placed], ViewTemplates],
-        levels: Levels,
-        found: Registered,
-        prior: PosePrior,
-    ) -> Registered:
-        """`found` judged again with one level finer than the final one.
-
-        `templates` and `finer`: those of a finalist at the final level and at the finer one. The
-        best may become another of the finalists.
-        """
-        totals = []
-        for score, each in found.finalists:
-            made = finer(each)
-            refiner = Refiner(made.at(made.finest), self.reference)
-            totals.append((score + refiner.place(each.pose, 2).score, score, each))
-        totals.sort(key=lambda entry: -entry[0])
-        fine_score, score, best = totals[0]
-        exclusion = EXCLUSION_SHARE * view_side_px(templates(best))
-        rivals = [entry for entry in totals if apart_px(entry[2], best) > exclusion]
-        changed = best is not found.finalists[0][1]
-        deep = replace(
-            found,
-            fine_score=fine_score,
-            fine_rival=max((entry[0] for entry in rivals), default=0.0),
-        )
-        if not changed:
-            return deep
-        near = apart_px(best, found.placed) <= exclusion
-        return replace(
-            deep,
-            placed=self.with_covariance(templates(best), levels, best),
-            score=score,
-            rival=max((entry[1] for entry in rivals), default=0.0),
-            look_score=found.look_score if near else found.look_rival,
-            look_rival=found.look_rival if near else found.look_score,
-            own=self._own_ratios(templates(best), levels, score + prior.cost(best.pose), best),
-        )
+    def _compared_finer(
+        self, totals: Sequence["_Finalist"], finer: Callable[[Placed], ViewTemplates]
+    ) -> list["_Finalist"]:
+        """Finalists with their score at one level more, best first."""
+        found = []
+        for each in totals:
+            made = finer(each.made.placed)
+            score = Refiner(made.at(made.finest), self.reference).place(each.made.placed.pose, 2)
+            found.append(each._replace(fine=each.score + score.score))
+        return sorted(found, key=lambda each: -each.fine)
 
     def with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
         """A placed view once more, at the final level, with its covariance."""
