@@ -99,7 +99,6 @@ def _watched(account: _Account) -> Iterator[_Account]:
         (locate, "_searched", lambda *a, **k: f"search, level {a[3].level}"),
         (registrar.Registrar, "judged", lambda *a, **k: VERIFY),
         (registrar.Registrar, "finished", lambda *a, **k: VERIFY),
-        (registrar.Registrar, "deepened", lambda *a, **k: VERIFY),
         (propose.TileProposer, "candidates", lambda *a, **k: "search, tiles"),
         (refiner, "place", lambda self, *a, **k: f"refine, level {self.template.level}"),
     ]

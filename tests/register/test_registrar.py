@@ -70,10 +70,11 @@ def searched(registrar, templates, prior, level, count=24):
     return search(templates.at(level, recipe), window, around, count)
 
 
-def verified(registrar, templates, levels, candidates, level, prior):
-    """One search from candidates to the place."""
+def verified(registrar, templates, levels, candidates, level, prior, finer=None):
+    """One search from candidates to the place; `finer`: templates one level finer."""
     judged = registrar.judged(templates, levels, candidates, level, prior)
-    return registrar.finished(templates, levels, judged, prior, len(candidates))
+    made = None if finer is None else lambda _: finer
+    return registrar.finished(templates, levels, judged, prior, len(candidates), finer=made)
 
 
 def registered(registrar, templates, prior, level=LEVELS.look):
@@ -439,10 +440,15 @@ def test_threads_may_share_it():
 
 
 class FineTwin:
-    """Two places that only fine detail tells apart: the right half has another one."""
+    """Two places that only fine detail tells apart: the right half has another one.
 
-    def __init__(self):
+    `changed`: amplitude of what changed at the place itself and not at its twin, coarsely.
+    """
+
+    def __init__(self, changed=0.0):
+        self.changed = changed
         self.coarse = Ground(seed=1, px=(24, 80), contrast=22.0)
+        self.other = Ground(seed=4, px=(24, 80), contrast=22.0)
         self.here, self.there = (
             Ground(seed=seed, px=(6, 9), contrast=14.0, waves=200) for seed in (2, 3)
         )
@@ -452,32 +458,42 @@ class FineTwin:
 
     def __call__(self, x, y):
         x, y = np.broadcast_arrays(x, y)
+        here = self.view(x, y) + self.changed * (self.other(x, y) - 128)
         again = self.coarse(x - 384, y) + self.there(x, y) - 128
-        return np.where(x < 384, self.view(x, y), again)
+        return np.where(x < 384, here, again)
 
 
-def test_one_finer_level_tells_what_coarser_ones_cannot():
-    ground = FineTwin()
-    registrar = Registrar(reference_of(ground, (384, 768), levels=4))
+def twins(changed):
+    """What `verified` needs of a view of `FineTwin`, its pose, and its finer templates."""
+    registrar = Registrar(reference_of(FineTwin(changed), (384, 768), levels=4))
     pose, twin = Pose(190.0, 190.0, 0.2, 0.0), Pose(190.0 + 384, 190.0, 0.2, 0.0)
     shape = (192, 224)
-    grey = as_grey(seen(ground.view, pose, shape))
+    grey = as_grey(seen(FineTwin().view, pose, shape))
     finer = ViewTemplates(grey, np.ones(shape, bool), 0)
     halves = grey.reshape(96, 2, 112, 2).mean(axis=(1, 3))
     templates = ViewTemplates(as_grey(halves), np.ones((96, 112), bool), 1)
     levels = Levels.of(math.sqrt(192 * 224), 4)
     assert levels.final == 1
     candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
-    found = verified(registrar, templates, levels, candidates, levels.look, prior_of(pose))
-    deep = registrar.deepened(lambda _: templates, lambda _: finer, levels, found, prior_of(pose))
+    return (registrar, templates, levels, candidates, levels.look, prior_of(pose)), pose, finer
+
+
+def test_one_finer_level_tells_what_coarser_ones_cannot():
+    view, pose, finer = twins(changed=0.0)
+    found, deep = verified(*view), verified(*view, finer)
     assert apart_px(deep.placed.pose, pose) < 0.3 and deep.placed.covariance is not None
-    assert deep.fine_score > deep.score and deep.fine_rival > 0
+    assert math.isnan(found.fine_score) and deep.fine_score > deep.score and deep.fine_rival > 0
     assert deep.fine_score / deep.fine_rival > found.peak_ratio + 0.1
-    # Told the wrong one of both, the finer level sets it right.
-    both = verified(registrar, templates, levels, candidates[:2], levels.look, prior_of(pose))
-    turned = replace(both, finalists=both.finalists[::-1])
-    again = registrar.deepened(lambda _: templates, lambda _: finer, levels, turned, prior_of(pose))
-    assert apart_px(again.placed.pose, pose) < 0.3 and again.fine_score > again.fine_rival
+
+
+def test_the_finer_level_sets_right_what_coarser_ones_take_for_its_twin():
+    view, pose, finer = twins(changed=0.9)
+    assert apart_px(verified(*view).placed.pose, pose) > 300
+    deep = verified(*view, finer)
+    assert apart_px(deep.placed.pose, pose) < 0.5 and deep.fine_score > deep.fine_rival
+    # It does not hide that the coarser levels speak for another place, nor do its alternatives.
+    assert deep.peak_ratio < 1 and deep.look_ratio < 1
+    assert all(score <= deep.score for score, _ in deep.finalists)
 
 
 def test_sheets_of_one_level():

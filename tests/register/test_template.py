@@ -80,7 +80,7 @@ def test_a_posed_view_is_what_the_map_shows(reference, turn_deg, log_scale):
     shown = np.moveaxis(reference.window(0, row, col, 2 * half, 2 * half), -1, 0)[:3]
     inside = np.abs(posed).max(axis=0) > 0
     for group, weight in zip(GROUPS, template.weights, strict=True):
-        assert energy_of(posed[group]) == pytest.approx(weight**2, rel=1e-4)
+        assert energy_of(posed[group]) == pytest.approx(weight**2 * math.exp(-log_scale), rel=1e-4)
         assert alike(posed[group], shown[group] * inside) > 0.93
     turned_wrongly = posed_channels(template, -pose.turn_rad, pose.log_scale)[0:2]
     if 20 < abs(turn_deg) % 180 < 160:

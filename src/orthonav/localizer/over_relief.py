@@ -72,7 +72,7 @@ class ViewOnLevelGround:
         """A judged candidate at the final level."""
         return self.registrar.at_final(self.view.templates, self.view.levels, judged)
 
-    def looked_again(self, judged: list[Placed], at_most: int | None = None) -> list[Placed]:
+    def placed_on_terrain(self, judged: list[Placed], at_most: int) -> list[Placed]:
         """Judged candidates, at most `at_most` of them placed again, where none stands out."""
         return judged
 
@@ -116,14 +116,14 @@ class ViewOverRelief(ViewOnLevelGround):
         self._best_look = 0.0
         self._level_scores: dict[Pose, float] = {}
         # Candidates of level ground on the terrain, and after a search around them.
-        self._looked: dict[Pose, tuple[ViewTemplates, Placed] | None] = {}
+        self._judged: dict[Pose, tuple[ViewTemplates, Placed] | None] = {}
         self._searched: dict[Pose, Placed] = {}
 
     def finish(self, judged: Placed) -> Finished:
         """A judged candidate at the final level: on the terrain, or on level ground where that is
         as good, or where less than half of the ground is known."""
         known = judged.pose in self._level_scores
-        first = self._looked_at(judged.pose) if known else self._settled(judged.pose)
+        first = self._judged_on_terrain(judged.pose) if known else self._settled(judged.pose)
         if first is None:
             return self._on_level_ground(judged)
         if first.score < RIVAL_SHARE * self._best_look:
@@ -145,26 +145,25 @@ class ViewOverRelief(ViewOnLevelGround):
         self._found[made.placed.pose] = None
         return made
 
-    def looked_again(self, judged: list[Placed], at_most: int | None = None) -> list[Placed]:
-        """Judged candidates on the terrain, at the judged level, and the surroundings of the best
-        of them: where relief displaces much, the right one may be far down the list of those on
-        level ground, and off by more than refinement follows.
+    def placed_on_terrain(self, judged: list[Placed], at_most: int) -> list[Placed]:
+        """The best judged candidates that lie apart, at most `at_most`, on the terrain at the
+        judged level, and the others as they were.
 
-        `at_most`: only so many, the best that lie apart.
+        The surroundings of the first `SETTLED` are searched: where relief displaces much, the right
+        one may be far down the list of those on level ground, and off by more than refinement
+        follows.
         """
-        if at_most is not None:
-            best = self._best_apart(judged)[:at_most]
-            others = [each for number, each in enumerate(judged) if number not in best]
-            return self.looked_again([judged[number] for number in best]) + others
-        placed = [self._looked_at(each.pose) or each for each in judged]
+        numbers = self._best_apart(judged)[:at_most]
+        before = [judged[number] for number in numbers]
+        placed = [self._judged_on_terrain(each.pose) or each for each in before]
         for number in self._best_apart(placed)[:SETTLED]:
-            placed[number] = self._settled(judged[number].pose) or judged[number]
-        for number, (before, after) in enumerate(zip(judged, placed, strict=True)):
-            if after.score > before.score:
-                self._level_scores[after.pose] = before.score
-            else:
-                placed[number] = before
-        return placed
+            placed[number] = self._settled(before[number].pose) or before[number]
+        found = list(judged)
+        for number, on_level, after in zip(numbers, before, placed, strict=True):
+            if after.score > on_level.score:
+                self._level_scores[after.pose] = on_level.score
+                found[number] = after
+        return found
 
     def _best_apart(self, placed: list[Placed]) -> list[int]:
         """Numbers of the best places that lie apart."""
@@ -178,14 +177,14 @@ class ViewOverRelief(ViewOnLevelGround):
                 chosen.append(number)
         return chosen
 
-    def _looked_at(self, pose: Pose) -> Placed | None:
+    def _judged_on_terrain(self, pose: Pose) -> Placed | None:
         """A pose refined on the terrain at the judged level; None where level ground is as good."""
-        if pose not in self._looked:
+        if pose not in self._judged:
             made = None
             if not self.seen.is_level(pose):
                 made = self.seen.templates_at(pose, self.view.levels.look)
-            self._looked[pose] = None if made is None else (made, self._refined(pose, made))
-        found = self._looked[pose]
+            self._judged[pose] = None if made is None else (made, self._refined(pose, made))
+        found = self._judged[pose]
         return None if found is None else found[1]
 
     def _refined(self, pose: Pose, made: ViewTemplates) -> Placed:
@@ -196,9 +195,9 @@ class ViewOverRelief(ViewOnLevelGround):
         )
 
     def _settled(self, pose: Pose) -> Placed | None:
-        """`_looked_at`, or a better place by a search around it at the coarse level: far off nadir,
-        relief displaces a view by more than refinement follows."""
-        best, found = self._looked_at(pose), self._looked[pose]
+        """`_judged_on_terrain`, or a better place by a search around it at the coarse level: far
+        off nadir, relief displaces a view by more than refinement follows."""
+        best, found = self._judged_on_terrain(pose), self._judged[pose]
         if best is None or found is None or pose in self._searched:
             return self._searched.get(pose)
         made, levels, side_px = found[0], self.view.levels, self.view.side_px

@@ -127,6 +127,8 @@ class SearchPlan:
     doubt: float = 0.01
     """A place with a confidence above one minus this is proven. For others many more candidates are
     finished and compared one level finer; docs/decisions/registration.md, 13."""
+    finer_ms: float = 90.0
+    """Estimated cost of that."""
     cheap_ms: float = 14.0
     """Up to this cost the judged level is searched at once, and nothing else."""
     last_ms: float = 900.0

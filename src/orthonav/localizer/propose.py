@@ -78,12 +78,12 @@ class TileProposer:
             east, north = self.centres_en_m[tile] + np.array(shift) * self.grid.stride_m
             x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
             y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
-            pose = Pose(x_px, y_px, *_peak_pose(tried, similar))
+            pose = Pose(x_px, y_px, *peak_pose(tried, similar))
             found.append(Candidate(float(scores[place]), pose))
         return found
 
 
-def _peak_pose(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> tuple[float, float]:
+def peak_pose(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> tuple[float, float]:
     """Heading and log scale where the scores (Q,) of poses (Q, 2) on a grid have their peak.
 
     By a parabola along each, or those of the best pose where one of its neighbours is missing.

@@ -222,12 +222,27 @@ class RegistrationLocalizer:
                 proven = not each.from_tiles or self._is_proven(best)
                 if proven and self._is_clear(best, enough):
                     return best
-        if not judged:
-            return None
+        return self._concluded(view, ground, judged, best, budget, finished) if judged else None
+
+    def _concluded(
+        self,
+        view: PreparedView,
+        ground: ViewOnLevelGround,
+        judged: list[Placed],
+        best: Registered | None,
+        budget: Budget,
+        finished: Callable[..., Registered],
+    ) -> Registered:
+        """The best place after all searches, none of which ended with one that stands out.
+
+        `best`: what is known of it; None: not finished yet.
+        """
         if best is None or self.relief is not None:
-            judged = ground.looked_again(judged, self.plan.terrain_candidates) if budget.allows(0.0) else judged
+            if budget.allows(0.0):
+                judged = ground.placed_on_terrain(judged, self.plan.terrain_candidates)
             best = finished(judged)
-        if view.levels.final > 0 and not self._is_proven(best):
+        doubted = view.levels.final > 0 and not self._is_proven(best)
+        if doubted and budget.allows(self.plan.finer_ms):
             best = finished(judged, ground.finer)
         return replace(best, cut_short=budget.cut_short)
 
@@ -238,7 +253,7 @@ class RegistrationLocalizer:
         judged: list[Placed],
         cost_ms: float,
         enough: ClearMargin,
-        finished: Callable[[list[Placed]], Registered],
+        finished: Callable[..., Registered],
     ) -> Registered | None:
         """The best place so far, if it stands out on the terrain and no search could change that.
 
@@ -249,7 +264,7 @@ class RegistrationLocalizer:
         cheap = cost_ms <= self.plan.terrain_trials * self.plan.terrain_trial_ms
         if cheap or ground.is_level or not judged or math.isfinite(self.plan.budget_ms):
             return None
-        on_terrain = ground.looked_again(judged, self.plan.terrain_trials)
+        on_terrain = ground.placed_on_terrain(judged, self.plan.terrain_trials)
         best, rival = self.registrar.standing(view.templates, on_terrain, view.prior)
         if best <= max(enough.look_ratio * rival, self._chances.look):
             return None

@@ -7,10 +7,10 @@ its score over that of the strongest rival is the evidence.
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -61,6 +61,8 @@ WHOLE_WINDOW_PX = 2_000_000
 whole sheet (12 bytes each); of larger sheets a window is made for each."""
 MAX_RATIO = 10.0
 """Limit of the ratios in the evidence."""
+Given = TypeVar("Given")
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ class Registered:
     it was judged and finished at, `rival` is the best such score at another place; `look_score` and
     `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
-    `finalists` are the best places that were finished, with their scores, best first. `own`: what the
+    `finalists` are the best of the finished places, with their scores, best first. `own`: what the
     place says of itself, without rivals. `cut_short`: whether searches were left out for want of
     time.
     """
@@ -222,7 +224,7 @@ class Registrar:
     def __init__(self, reference: Reference, pool: Executor | None = None) -> None:
         """`pool`: threads that share the candidates; None: the caller's alone."""
         self.reference = reference
-        self._map: Callable[..., Iterable[Any]] = pool.map if pool else map
+        self._pool = pool
         self._windows: dict[tuple[int, EvidenceRecipe, int], SearchWindow] = {}
         self._lock = threading.Lock()
 
@@ -289,7 +291,7 @@ class Registrar:
 
         kept: list[Candidate] = []
         same_px = side_px * SAME_PLACE_SHARE
-        for each in sorted(self._map(moved, candidates), key=lambda each: -each.score):
+        for each in sorted(self._shared(moved, candidates), key=lambda each: -each.score):
             if all(each.pose.distance_px(other.pose) > same_px for other in kept):
                 kept.append(each)
         return kept
@@ -357,7 +359,11 @@ class Registrar:
     def _placed(self, refiner: Refiner, found: Sequence[Placed], steps: int) -> list[Placed]:
         """Candidates after so many steps at most, in their order."""
         refiner.prepare()
-        return list(self._map(lambda each: refiner.place(each.pose, steps, ROUGH_STEP_PX), found))
+        return self._shared(lambda each: refiner.place(each.pose, steps, ROUGH_STEP_PX), found)
+
+    def _shared(self, function: Callable[[Given], Made], given: Sequence[Given]) -> list[Made]:
+        """What a function makes of each, in order; by all threads, where there are some."""
+        return list((self._pool.map if self._pool else map)(function, given))
 
     def finished(
         self,

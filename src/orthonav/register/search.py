@@ -101,21 +101,21 @@ class SearchWindow:
     @cached_property
     def channels(self) -> Array:
         """The evidence (H, W, 3) divided by its local energy."""
-        return self._even()
+        return self._normalized()
 
     @cached_property
     def spectra(self) -> NDArray[np.complex64]:
         """Spectra (3, h, w) of the channels, padded to `size`; the channels are not kept."""
-        planes = np.moveaxis(self._even(), 2, 0)
+        planes = np.moveaxis(self._normalized(), 2, 0)
         return np.asarray(rfft2(planes, s=self.size), np.complex64)
 
-    def _even(self) -> Array:
+    def _normalized(self) -> Array:
         groups = (self._made[..., group] for group in GROUPS)
-        even = [_even(group, self._made[..., 3], self._view_px) for group in groups]
-        return np.concatenate(even, axis=2)
+        made = [_by_local_energy(group, self._made[..., 3], self._view_px) for group in groups]
+        return np.concatenate(made, axis=2)
 
 
-def _even(channels: Array, counts: Array, view_px: int) -> Array:
+def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
     """Channels (H, W, C) divided by the root of their mean energy in windows as large as views."""
     energy = np.einsum("ijc,ijc->ij", channels, channels)
     side = min(max(3, view_px // 2), 2 * min(energy.shape) - 1)
@@ -173,7 +173,6 @@ def best_near(template: Template, window: SearchWindow, pose: Pose, reach_px: fl
     row = round(pose.y_px / unit) - window.row - reach
     col = round(pose.x_px / unit) - window.col - reach
     posed = posed_channels(template, pose.turn_rad, pose.log_scale)
-    posed *= np.float32(even_scale(-pose.log_scale))
     around = cut(window.channels, row - half, col - half, *2 * [2 * (half + reach)])
     surface = np.asarray(
         cv2.matchTemplate(around, np.ascontiguousarray(np.moveaxis(posed, 0, 2)), cv2.TM_CCORR),
@@ -238,7 +237,6 @@ class _Scratch:
         # Turned by half a turn, for a product of spectra to be a correlation; the middle goes to
         # the first pixel, what lies before it wraps to the end.
         posed = posed_channels(template, turn, log_scale)[:, ::-1, ::-1]
-        posed *= np.float32(even_scale(-log_scale))
         strip = np.zeros((3, 2 * half, cols), np.float32)
         strip[:, :, : half + 1] = posed[:, :, half - 1 :]
         strip[:, :, cols - half + 1 :] = posed[:, :, : half - 1]
@@ -263,7 +261,8 @@ def posed_half_px(template: Template, log_scale: float) -> int:
 def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     """Channels (3, P, P) of a template as the map would show them, its middle in theirs.
 
-    Each kind of evidence has the norm of its weight.
+    Each kind of evidence has the norm of its weight over `even_scale`, so that scores of all scales
+    compare.
     """
     height, width = template.mask.shape
     half = posed_half_px(template, log_scale)
@@ -278,7 +277,8 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     turn_planes(warped, turn, posed, scratch)
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = energy_of(posed[group])
-        posed[group] *= np.float32(weight / math.sqrt(energy) if energy > 0 else 0.0)
+        even = even_scale(-log_scale)
+        posed[group] *= np.float32(even * weight / math.sqrt(energy) if energy > 0 else 0.0)
     return posed
 
 
