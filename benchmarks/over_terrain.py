@@ -5,6 +5,7 @@ drapes imagery of another date over generated hills, renders true perspective vi
 (`orthonav.simulate.perspective`), and prints what of them is placed without and with the terrain,
 by wrong terrains, and far off nadir. Imagery is generated; with optional real imagery beside the
 checkout its rows use that. `--on`, `--off-nadir` and `--slopes` choose parts of the rows.
+`--mirrored` shows what views of no place of the map are taken for.
 """
 
 import argparse
@@ -289,12 +290,17 @@ class Placed:
         )
 
 
-def placed(locate: Callable[[View], Fix | NoFix], seen: list[Seen], frame: LocalFrame) -> Placed:
-    """Place views one by one."""
+def placed(
+    locate: Callable[[View], Fix | NoFix], seen: list[Seen], frame: LocalFrame, *, mirrored: bool
+) -> Placed:
+    """Place views one by one, as they are or mirrored: then they are nowhere on the map."""
     rows = []
     for each in seen:
+        view = each.view
+        if mirrored:
+            view = replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1]))
         start = time.process_time()
-        fix = locate(each.view)
+        fix = locate(view)
         took_ms = 1e3 * (time.process_time() - start)
         range_m = float(np.linalg.norm(each.middle_m - each.position_m))
         if isinstance(fix, NoFix):
@@ -381,6 +387,9 @@ def main() -> None:
         "--slopes", type=float, nargs="+", default=[0.0, 0.15], help="of the oblique views"
     )
     parser.add_argument("--generated", action="store_true", help="generated imagery only")
+    parser.add_argument(
+        "--mirrored", action="store_true", help="mirror the views: all positions are wrong then"
+    )
     parser.add_argument("--verbose", action="store_true", help="log every view")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO if options.verbose else logging.ERROR)
@@ -393,10 +402,10 @@ def main() -> None:
         benches = [Bench(work, options.views, options.seed, area) for area in options.areas]
         for row in rows_of(options):
             if row.group in options.only:
-                _print(benches, row, options.on)
+                _print(benches, row, options.on, mirrored=options.mirrored)
 
 
-def _print(benches: list[Bench], row: Row, on: Sequence[str]) -> None:
+def _print(benches: list[Bench], row: Row, on: Sequence[str], *, mirrored: bool) -> None:
     """The lines of a row, of the views over all areas together; real imagery is one area."""
     found: dict[str, list[Placed]] = {}
     for bench in benches if row.imagery == "generated" else benches[:1]:
@@ -405,13 +414,14 @@ def _print(benches: list[Bench], row: Row, on: Sequence[str]) -> None:
         frame = ground.opened.manifest.sheets[0].frame
         for way, locate in ways(ground, layer_of(row, ground, hills), hills):
             if way in on and not (way == "level" and row.wrong):
-                found.setdefault(way, []).append(placed(locate, seen, frame))
+                made = placed(locate, seen, frame, mirrored=mirrored)
+                found.setdefault(way, []).append(made)
         bench.ground.cache_clear()
     height = "measured" if row.measured else "above sea"
     for way, parts in found.items():
         whole = Placed(*(np.concatenate(each) for each in zip(*map(astuple, parts), strict=True)))
         name = f"{len(whole.errors_m)} of {ground.gsd_m:.3g} m, {row.view_px} px, height {height}"
-        shown = f"{way} {row.wrong}".strip()
+        shown = f"{way} {row.wrong}".strip() + (", mirrored" if mirrored else "")
         cells = whole.cells(row)
         print(f"| {name} | {row.slope:g} | {row.tilt_deg:.0f} | {shown} | {cells} |", flush=True)
 

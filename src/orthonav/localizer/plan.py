@@ -125,10 +125,11 @@ class SearchPlan:
     tiles, where the place is confident as well: there can be more of them than places at the judged
     level that could be searched."""
     doubt: float = 0.01
-    """A place with a confidence above one minus this is proven. For others many more candidates are
-    finished and compared one level finer; docs/decisions/registration.md, 13."""
-    finer_ms: float = 90.0
-    """Estimated cost of that."""
+    """A place with a confidence above one minus this is proven."""
+    finer: tuple[tuple[int, float], ...] = ((3, 25.0), (48, 90.0))
+    """Until it is, so many candidates are finished and the best of them compared one level finer,
+    with the estimated cost (ms): matches by chance lose more in detail, so that the right place may
+    be far down the list of the judged level; docs/decisions/registration.md, 13."""
     cheap_ms: float = 14.0
     """Up to this cost the judged level is searched at once, and nothing else."""
     last_ms: float = 900.0

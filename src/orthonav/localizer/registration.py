@@ -35,7 +35,6 @@ from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
 from orthonav.register.search import Candidate, search
-from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
 
 
@@ -187,11 +186,11 @@ class RegistrationLocalizer:
         candidates = 0
         enough = self.plan.clear
 
-        def finished(
-            judged: list[Placed], finer: Callable[[Placed], ViewTemplates] | None = None
-        ) -> Registered:
-            of_view = view.templates, view.levels, judged, view.prior, candidates
-            return self.registrar.finished(*of_view, ground.finish, direct, finer)
+        def finished(judged: list[Placed], finer: int = 0) -> Registered:
+            made = view.templates, view.levels, judged, view.prior, candidates, ground.finish
+            if not finer:
+                return self.registrar.finished(*made, direct)
+            return self.registrar.finished(*made, direct, ground.finer, finer)
 
         rows = functools.cache(lambda: self._rows_near(view, prior))
         searches = self.plan.searches(
@@ -241,9 +240,10 @@ class RegistrationLocalizer:
             if budget.allows(0.0):
                 judged = ground.placed_on_terrain(judged, self.plan.terrain_candidates)
             best = finished(judged)
-        doubted = view.levels.final > 0 and not self._is_proven(best)
-        if doubted and budget.allows(self.plan.finer_ms):
-            best = finished(judged, ground.finer)
+        for kept, cost_ms in self.plan.finer if view.levels.final > 0 else ():
+            if self._is_proven(best) or not budget.allows(cost_ms):
+                break
+            best = finished(judged, kept)
         return replace(best, cut_short=budget.cut_short)
 
     def _found_early(

@@ -31,11 +31,8 @@ KEPT_TO_LOOK = 24
 (docs/decisions/registration.md, 12)."""
 KEPT_TO_FINISH = 3
 """Places that are finished: the best and its rivals."""
-KEPT_IF_IN_DOUBT = 48
-"""The same where the best of these is in doubt: matches by chance lose more in detail, so that the
-right place may be far down the list of the judged level (docs/decisions/registration.md, 13)."""
 KEPT_TO_FINEST = 12
-"""The best of these are compared one level finer."""
+"""So many of them are compared one level finer, at most, where they are in doubt."""
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
 """Candidates below these shares of the best score are dropped, after one step and after all steps
@@ -375,17 +372,17 @@ class Registrar:
         finish: Callable[[Placed], Finished] | None = None,
         direct: Sequence[Placed] = (),
         finer: Callable[[Placed], ViewTemplates] | None = None,
+        kept: int = KEPT_TO_FINISH,
     ) -> Registered:
         """The best of the judged candidates, of one or more searches of `candidates` in all.
 
-        The best of them are refined at the final level, their rivals too, and all `direct` ones,
-        which were found there; each by `finish` (None: `at_final`). With `finer`, the templates of
-        a finalist one level finer, many more are, and the best of those are compared at that level
-        as well. `judged` must not be empty.
+        The best `kept` of them are refined at the final level, and all `direct` ones, which were
+        found there; each by `finish` (None: `at_final`). With `finer`, the templates of a finalist
+        one level finer, the best of those are compared at that level as well. `judged` must not be
+        empty.
         """
         judged = _ranked(judged, prior)
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
-        kept = KEPT_IF_IN_DOUBT if finer else KEPT_TO_FINISH
         finalists = _hopeful(_distinct(judged, kept, exclusion), prior, HOPE, 2)
         totals = []
         for each in (*finalists, *direct):
