@@ -173,7 +173,7 @@ def test_localize(run, map_path, flight_path, short_flight, out, names_in):
     done = run("localize", map_path, short_flight, "--out", out / "fixes.jsonl", "--json")
     assert (done.code, done.err) == (0, "") and names_in(out) == ["fixes.jsonl"]
     plain = json.loads(done.out)
-    assert plain["views"] == plain["n_confident"] + plain["n_unsure"] == 8
+    assert plain["views"] == plain["n_confident"] + plain["n_low_confidence"] == 8
     assert plain["n_confident"] > 5 and plain["median_latency_ms"] > 0 and not plain["advice"]
     lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == [f"{n:04d}.jpg" for n in range(1, 9)]
@@ -320,8 +320,8 @@ def test_a_wrong_heading_is_no_success(run, map_path, flight_path, out):
     (few / "telemetry.csv").write_text("\n".join([lines[0], *turned]) + "\n")
     done = run("localize", map_path, few, *to)
     assert done.code == 0 and "5 views: 0 confident" in done.out
-    assert "unsure views are confident with any heading, " in done.out
-    assert "unsure positions are best guesses" in done.out
+    assert "views of low confidence become confident with any heading, " in done.out
+    assert "positions of low confidence are best guesses" in done.out
     radians = [
         _with(line, 2, str(math.radians(yaw))) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""Confidence of registered views: surer with better evidence, and never sure of one place alone."""
+"""Confidence of registered views: higher with better evidence, and limited for one place alone."""
 
 import json
 import math

@@ -202,7 +202,7 @@ def test_the_map_shows_right_and_wrong_and_the_background(monkeypatch) -> None:
     plain = decoded(plots.map_picture(flight.comparison, 15.0))
     over = decoded(plots.map_picture(flight.comparison, 15.0, noisy_background()))
     for image in (plain, over):
-        for colour in (plots.RIGHT, plots.UNSURE, plots.WRONG):
+        for colour in (plots.RIGHT, plots.LOW_CONFIDENCE, plots.WRONG):
             assert has_colour(image, colour)
     assert np.ptp(over, axis=2).mean() < 40
     assert over.mean() < plain.mean() - 20

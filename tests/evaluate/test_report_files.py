@@ -137,15 +137,15 @@ def test_errors_are_over_time_where_it_is_known(times_ns, axis, coarse) -> None:
 
 
 def test_the_legend_names_only_visible_marks(coarse) -> None:
-    sure = flown("one").comparison
-    unsure = replace(sure, confident=np.zeros(12, dtype=bool))
-    wrong = replace(sure, errors_m=sure.errors_m + 50.0)
+    confident = flown("one").comparison
+    doubtful = replace(confident, confident=np.zeros(12, dtype=bool))
+    wrong = replace(confident, errors_m=confident.errors_m + 50.0)
     for comparison, radius_m, there in (
-        (sure, 15.0, "confident"),
-        (sure, 0.5, "confident, off by more than 0.5 m"),
+        (confident, 15.0, "confident"),
+        (confident, 0.5, "confident, off by more than 0.5 m"),
         (wrong, 0.5, "confident and wrong"),
-        (unsure, 15.0, "unsure"),
-        (unsure, 0.5, "unsure, off by more than 0.5 m"),
+        (doubtful, 15.0, "low confidence"),
+        (doubtful, 0.5, "low confidence, off by more than 0.5 m"),
     ):
         svg = map_picture(comparison, radius_m).svg
         names = [label for label, *_ in fix_classes(comparison, radius_m)]

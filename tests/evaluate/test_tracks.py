@@ -69,7 +69,7 @@ def flown(
     if displacement_en_m is None:
         displacement_en_m = np.stack([10.0 * np.arange(n), np.zeros(n)], axis=1)
     times_ns = [10**9 * i for i in range(n)] if times_ns is None else times_ns
-    sure, radii_m = np.broadcast_to(confidence, n), np.broadcast_to(own_radius_m, n)
+    confident, radii_m = np.broadcast_to(confidence, n), np.broadcast_to(own_radius_m, n)
     truth, results = {}, []
     for i, (error, at) in enumerate(zip(errors_en_m, displacement_en_m, strict=True)):
         lat, lon = local.latlon_from_en(np.array(at, dtype=float))
@@ -79,7 +79,7 @@ def flown(
         if error is not None:
             fix_lat, fix_lon = local.latlon_from_en(np.add(at, error))
             where = float(fix_lat), float(fix_lon), cov_en_m2
-            outcome = Fix(*where, float(sure[i]), float(radii_m[i]), 90.0, 100.0, LEARNT)
+            outcome = Fix(*where, float(confident[i]), float(radii_m[i]), 90.0, 100.0, LEARNT)
         results.append(ViewResult(f"{i:04d}.jpg", times_ns[i], outcome, 10.0, states[i]))
     return compare(truth, results, local), results
 
@@ -194,7 +194,7 @@ def test_states_by_view_and_by_the_time_until_the_next() -> None:
 
 def test_longest_without_a_confident_fix() -> None:
     track = by_hand()
-    # views 4 to 6: tracking but unsure, then lost, until view 7
+    # views 4 to 6: tracking with low confidence, then lost, until view 7
     assert (track.low_confidence.seconds_s, track.low_confidence.path_m) == (
         12.0,
         pytest.approx(30.0, abs=0.01),
@@ -207,7 +207,7 @@ def test_longest_without_a_confident_fix() -> None:
 
 def test_false_locks_are_stretches_that_are_confident_or_tracking_and_wrong() -> None:
     track = by_hand()
-    # view 1 sure; view 4 tracking; views 7 and 8 both; view 5 and 9 are neither
+    # view 1 confident; view 4 tracking; views 7 and 8 both; view 5 and 9 are neither
     assert (track.far_m, track.n_confident_wrong, track.n_false_locks) == (35.0, 4, 3)
     assert track.false_lock_longest_s == 3.0  # 17 s to 20 s
     wide = by_hand(radius_m=65.0)

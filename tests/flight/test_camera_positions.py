@@ -26,7 +26,7 @@ def hill(lat_deg, lon_deg):
 
 RESULTS = [
     result("a.jpg", 48.5, -2.25),
-    result("unsure.jpg", 48.5, -2.25, confidence=0.5),
+    result("doubtful.jpg", 48.5, -2.25, confidence=0.5),
     ViewResult("none.jpg", 0, NoFix("blank", ""), 1.0),
     result("b.jpg", -33.0, 18.0, heading_deg=math.nan),
 ]

@@ -139,7 +139,7 @@ def test_a_velocity_moves_the_last_place():
         (NoFix("blank", "nothing to see"), None),
     ],
 )
-def test_unsure_positions_say_nothing_about_the_ground(outcome, state):
+def test_doubtful_positions_say_nothing_about_the_ground(outcome, state):
     heights = flown()
     heights.observe(0, outcome, state)
     assert heights.corrected(reported(amsl_m=700.0)).agl_m == pytest.approx(400, abs=0.1)

@@ -12,7 +12,7 @@ from orthonav.geo.camera import Camera
 from orthonav.geo.headings import seem_radians
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.setups import SAMPLE, Setup, Tried, UnsureViews, mirrored_camera, try_setups
+from orthonav.onboard.setups import SAMPLE, DoubtedViews, Setup, Tried, mirrored_camera, try_setups
 from orthonav.records import Fix, NoFix, Prior, View, ViewResult
 
 ACCEPTS = Acceptance("confidence", 0.9).accepts
@@ -47,7 +47,9 @@ def test_a_wrong_heading_is_found(registering, views):
     assert found.setup.name == "any heading" and found.explains
     assert abs(abs(found.heading_off_deg) - 180) < 12 and found.heading_std_deg < 20
     (said,) = setup_text([found], on_map=True)
-    assert f"{found.confident} of 2 unsure views are confident with any heading" in said
+    assert (
+        f"{found.confident} of 2 views of low confidence become confident with any heading" in said
+    )
     assert "check the heading column and the mounting of the camera" in said
 
 
@@ -88,7 +90,8 @@ def test_a_map_of_another_area_is_not_explained(views):
     assert len(tried(Elsewhere(), many, heading_known=False, use_prior=False)) == 5
     (said,) = setup_text(found, on_map=False)
     assert (
-        "at most 0 of 8 unsure views" in said and "check first that the map shows the area" in said
+        "at most 0 of 8 views of low confidence" in said
+        and "check first that the map shows the area" in said
     )
     assert "the recorded positions lie on the map" in setup_text(found, on_map=True)[0]
 
@@ -108,18 +111,18 @@ def test_headings_that_look_like_radians():
     assert not seem_radians([])
 
 
-def test_a_sample_of_the_unsure_views_is_kept(views):
+def test_a_sample_of_the_doubted_views_is_kept(views):
     class Recorded:
         def __init__(self, number):
             self.telemetry = replace(views[0].telemetry, time_ns=number)
             self.grey = lambda: views[0].grey
 
-    unsure = UnsureViews(views[0].camera, lambda telemetry: telemetry)
+    doubted = DoubtedViews(views[0].camera, lambda telemetry: telemetry)
     place = Fix(46.0, 3.0, np.eye(2), 0.4, 35.0, 0.0, 100.0)
-    for number, _ in enumerate(unsure.watching(map(Recorded, range(100)))):
+    for number, _ in enumerate(doubted.watching(map(Recorded, range(100)))):
         outcome = NoFix("blank", "") if number % 2 else replace(place, confidence=number / 100)
-        unsure.take(ViewResult("a", number, outcome, 1.0))
-    times = [view.telemetry.time_ns for view in unsure.views]
+        doubted.take(ViewResult("a", number, outcome, 1.0))
+    times = [view.telemetry.time_ns for view in doubted.views]
     assert SAMPLE // 2 <= len(times) <= SAMPLE and max(times) < 90  # those above are confident
     assert len(set(np.diff(times))) == 1
 

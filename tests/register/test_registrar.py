@@ -1,4 +1,4 @@
-"""The best place of a view, and its rivals: sure where there are none, unsure of one of two."""
+"""The best place of a view, and its rivals: confident where there are none, else less so."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -163,7 +163,7 @@ def test_a_place_that_is_there_twice_is_not_sure():
     assert found.placed.weighted > 0.9  # however well it fits
 
 
-def test_a_place_that_is_there_almost_twice_is_less_sure():
+def test_a_place_that_is_there_almost_twice_lowers_the_confidence():
     ratios = []
     for share in (0.0, 0.5, 1.0):
         twin = Twin(other=Ground(seed=7), share=share)
@@ -268,7 +268,7 @@ def test_blank_views_and_blank_maps_are_no_crash(registrar, grey):
 
 
 def test_two_searches_know_of_each_others_rivals():
-    """Each search found one of the twins: together they are not sure."""
+    """Each search found one of the twins: together neither is confident."""
     registrar = Registrar(reference_of(Twin(), SHAPE))
     templates, prior = templates_of(GROUND, ONE), prior_of(ONE)
     searches = [

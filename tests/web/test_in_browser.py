@@ -84,14 +84,14 @@ def test_the_run_is_drawn_where_it_is(page, columns):
     picture = page.picture()
     for i in (WRONG, COUNT - 1):
         place = page.on_screen((columns["x"][i], columns["y"][i]), CHUNK_PX)
-        assert painted(picture, page.colour("sure"), place) > 15, i
+        assert painted(picture, page.colour("confident"), place) > 15, i
         assert (painted(picture, page.colour("wrong"), place, 9) > 15) == (i == WRONG), i
     truth = np.stack([columns["tx"], columns["ty"]], axis=1)
     for between in (truth[2:] + truth[1:-1]) / 2:
         assert painted(picture, page.colour("truth"), page.on_screen(between, CHUNK_PX), 2) >= 2
     course = page.locator("#chart").bounding_box()
     part = page.picture(clip=course)
-    assert painted(part, page.colour("sure")) > 2000  # the band of states
+    assert painted(part, page.colour("confident")) > 2000  # the band of states
     assert painted(part, page.colour("wrong")) > 500  # the radius
     assert page.locator("#legend").inner_text().split("\n") == [
         "●confident",
@@ -100,7 +100,7 @@ def test_the_run_is_drawn_where_it_is(page, columns):
         "◯confident and wrong",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")
-    assert figures.startswith("views 6 confident 83.3 % unsure 0.0 % no fix 16.7 % within")
+    assert figures.startswith("views 6 confident 83.3 % low confidence 0.0 % no fix 16.7 % within")
     assert figures.endswith("confident and wrong 1")
 
 
@@ -351,7 +351,7 @@ def test_a_chosen_view_comes_into_sight_with_its_truth(page, columns):
 
 
 def test_guesses_have_a_colour_of_their_own(visit, small, tmp_path):
-    """Single fixes of low confidence, or below the criterion of the run, are unsure."""
+    """Single fixes of low confidence, or below the criterion of the run, are shown as such."""
     results = [result(i, None) for i in range(COUNT)]
     results[0] = replace(results[0], outcome=replace(results[0].outcome, confidence=0.4))
     results[1] = replace(results[1], accepted=False)
@@ -361,15 +361,18 @@ def test_guesses_have_a_colour_of_their_own(visit, small, tmp_path):
     with serving(run) as server:
         page = visit(server)
         page.chosen(0, COUNT)
-        expect(page.locator("#sentence")).to_contain_text("unsure, error")
-        assert page.locator("#legend").inner_text().split("\n")[:2] == ["●confident", "●unsure"]
+        expect(page.locator("#sentence")).to_contain_text("low confidence, error")
+        assert page.locator("#legend").inner_text().split("\n")[:2] == [
+            "●confident",
+            "●low confidence",
+        ]
         mark = page.locator("#list button").first.locator(".mark")
-        expect(mark).to_have_attribute("aria-label", "unsure")
+        expect(mark).to_have_attribute("aria-label", "low confidence")
         page.select_option("#which", "doubt")
         expect(page.locator("#shown-count")).to_have_text(f"2 of {COUNT} views")
         page.settled()
         place = page.on_screen(((PLACES_EN_M[1][0] + 180) / GSD_M, (160 - 25) / GSD_M), CHUNK_PX)
-        assert painted(page.picture(), page.colour("unsure"), place) > 15
+        assert painted(page.picture(), page.colour("low"), place) > 15
 
 
 def test_in_the_dark(visit, server, columns):
@@ -377,13 +380,13 @@ def test_in_the_dark(visit, server, columns):
     page = visit(server, color_scheme="dark")
     page.chosen(0, COUNT)
     page.settled()
-    dark, picture = page.colour("sure"), page.picture()
+    dark, picture = page.colour("confident"), page.picture()
     assert picture[760, 100].max() < 60
     place = page.on_screen((columns["x"][5], columns["y"][5]), CHUNK_PX)
     assert painted(picture, dark, place) > 15
     page.emulate_media(color_scheme="light")
     page.wait_for_timeout(200)
-    light, picture = page.colour("sure"), page.picture()
+    light, picture = page.colour("confident"), page.picture()
     assert picture[760, 100].min() > 200 and np.abs(light - dark).max() > 40
     assert painted(picture, light, place) > 15
 
@@ -467,7 +470,7 @@ def test_ten_thousand_views(visit, small, tmp_path):
         page = visit(server)
         page.chosen(0, MANY)
         page.settled()
-        inked = painted(page.picture(), page.colour("sure"))
+        inked = painted(page.picture(), page.colour("confident"))
         assert inked > 5000
         for key, i in (("ArrowRight", 1), ("PageDown", 501), ("End", MANY - 1), ("PageUp", 9499)):
             page.keyboard.press(key)

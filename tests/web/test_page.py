@@ -183,7 +183,7 @@ def test_views_are_filtered_and_ordered(tmp_path, opened):
         said.worst = store.listed;
         store.show({{ which: "wrong", order: "time" }});
         said.wrong = store.listed;
-        store.show({{ which: "sure" }});
+        store.show({{ which: "confident" }});
         store.select(3); store.step(1); said.after = store.selected;
         store.step(1); store.step(1); said.last = store.selected;
         store.step(-1); said.before = store.selected;
@@ -196,7 +196,7 @@ def test_views_are_filtered_and_ordered(tmp_path, opened):
     """
     said = json.loads(node(script, tmp_path))
     assert said["stats"] == {
-        **{"fixes": 5, "sure": 5, "wrong": 1, "right": 4, "withTruth": 6},
+        **{"fixes": 5, "confident": 5, "wrong": 1, "right": 4, "withTruth": 6},
         **{"withGnss": 0, "gnssAlarms": 0},
     }
     assert said["first"] == 0 and said["worst"] == [3, 0, 1, 2, 5, 4]

@@ -309,7 +309,7 @@ def _print_summary(
         "fixes": str(options.out),
         "views": counts.views,
         "n_confident": counts.confident,
-        "n_unsure": counts.unsure,
+        "n_low_confidence": counts.low,
         "n_none": counts.none,
         "accept": options.accept,
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
@@ -322,14 +322,14 @@ def _print_summary(
         return
     least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
     print(
-        f"{counts.views} views: {counts.confident} confident ({least}), {counts.unsure} unsure, "
-        f"{counts.none} without a position; median {median_ms or 0:.1f} ms per view"
+        f"{counts.views} views: {counts.confident} confident ({least}), {counts.low} of low "
+        f"confidence, {counts.none} without a position; median {median_ms or 0:.1f} ms per view"
     )
     for line in advice:
         print(f"! {line}")
     for each in options.export:
         print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
-    guesses = "; unsure positions are best guesses, marked as such" * bool(counts.unsure)
+    guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
     print(f"written to {options.out}{guesses}")
     for line in changes_text(options, changed):
         print(line)

@@ -33,7 +33,7 @@ class Counts:
 
     views: int
     confident: int
-    unsure: int
+    low: int
     none: int
 
     @classmethod
@@ -64,7 +64,7 @@ class Doubts:
         mount: Any,
         heights: "FlownHeights | None",
     ) -> None:
-        from orthonav.onboard.setups import UnsureViews
+        from orthonav.onboard.setups import DoubtedViews
 
         self._options, self._flight, self._localizer = options, flight, localizer
 
@@ -72,13 +72,13 @@ class Doubts:
             made = telemetry if heights is None else heights.corrected(telemetry)
             return mount.corrected(made) if mount else made
 
-        self._unsure = UnsureViews(flight.camera, corrected)
+        self._doubted = DoubtedViews(flight.camera, corrected)
         self._nearest: tuple[float, str] | None = None
         self._yaw_deg: list[float] = []
 
     def watching(self) -> "Iterator[SourceView]":
         """The views of the flight."""
-        for view in self._unsure.watching(self._flight.views):
+        for view in self._doubted.watching(self._flight.views):
             found = far_from_map(view, self._localizer)
             if found is not None and (self._nearest is None or found < self._nearest):
                 self._nearest = found
@@ -87,7 +87,7 @@ class Doubts:
 
     def take(self, result: "ViewResult") -> None:
         """The result of the newest view."""
-        self._unsure.take(result)
+        self._doubted.take(result)
 
     def advice(
         self, results: "Sequence[ViewResult]", accept: "Acceptance", shown: "Progress"
@@ -103,13 +103,13 @@ class Doubts:
             return lines, []
         if self._nearest is not None and self._nearest[0] > FAR_M:
             return [*lines, far_text("the recorded positions are", *self._nearest)], []
-        if counts.unsure and not any(_states(result, accept) for result in results):
+        if counts.low and not any(_states(result, accept) for result in results):
             return [*lines, _SILENT.format(criterion=accept.criterion)], []
-        if not self._unsure.views:
+        if not self._doubted.views:
             return lines, []
         tried = try_setups(
             self._localizer,
-            self._unsure.views,
+            self._doubted.views,
             accept.accepts,
             use_prior=options.prior == "telemetry",
             heading_known=known,
@@ -145,9 +145,10 @@ def setup_text(tried: "Sequence[Tried]", *, on_map: bool) -> list[str]:
             else "no position was recorded, so check first that the map shows the area, then the "
             "camera and the ground"
         )
-        tested = f"{names}: at most {most} of {last.views} unsure views are confident"
+        tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
         return [f"no other set-up explains it ({tested}); {where}"]
-    lines = [f"{last.confident} of {last.views} unsure views are confident {_explanation(last)}"]
+    found = f"{last.confident} of {last.views} views of low confidence become confident"
+    lines = [f"{found} {_explanation(last)}"]
     return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
 
 

@@ -25,7 +25,7 @@ _COLUMNS = (
     "views",
     "confident",
     "wrong",
-    "unsure",
+    "low confidence",
     "coverage",
     "right",  # named after the radius
     "of fixes",
@@ -101,7 +101,7 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "n_views": metrics.n_views,
         "n_fixes": metrics.n_fixes,
         "n_confident": metrics.n_confident,
-        "n_unsure": metrics.n_fixes - metrics.n_confident,
+        "n_low_confidence": metrics.n_fixes - metrics.n_confident,
         "n_confident_wrong": metrics.n_confident_wrong,
         "wrong_above_m": metrics.wrong_above_m,
         "confident_error_median_m": or_none(metrics.confident_median_m),
@@ -170,8 +170,8 @@ def verdict(metrics: Metrics) -> str:
     confident, wrong = metrics.n_confident, metrics.n_confident_wrong
     above = f"{metrics.wrong_above_m:g} m and the radius that it states"
     if not confident:
-        unsure = metrics.n_fixes
-        return f"No fix is confident: no position may be relied on ({unsure} are best guesses)."
+        guesses = metrics.n_fixes
+        return f"No fix is confident: no position may be relied on ({guesses} are best guesses)."
     errors = (
         f"median error {measure_text(metrics.confident_median_m, ' m')}, largest "
         f"{measure_text(metrics.confident_max_m, ' m')}"

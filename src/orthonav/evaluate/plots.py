@@ -14,11 +14,11 @@ from orthonav.evaluate.track import seconds_since_first
 from orthonav.report.canvas import (
     BACKING,
     GREY,
+    LOW_CONFIDENCE,
     OFFSET,
     RIGHT,
     SOFT,
     TRUTH,
-    UNSURE,
     WRONG,
     Drawing,
     draw_axes,
@@ -48,15 +48,15 @@ def fix_classes(
     comparison: Comparison, radius_m: float
 ) -> list[tuple[str, BoolArray, str, str, float]]:
     """Label, mask (N,), colour, mark and size of each kind of fix, the worst last."""
-    errors_m, sure = comparison.errors_m, comparison.confident
+    errors_m, confident = comparison.errors_m, comparison.confident
     wrong = comparison.confident_wrong(max(FAR_M, radius_m))
     near, off = errors_m <= radius_m, errors_m > radius_m
     beyond = f"off by more than {radius_m:g} m"
     return [
-        ("unsure", near & ~sure, UNSURE, "o", 4.5),
-        (f"unsure, {beyond}", off & ~sure, UNSURE, "x", 5.5),
-        ("confident", near & sure, RIGHT, "o", 5.0),
-        (f"confident, {beyond}", off & sure & ~wrong, RIGHT, "x", 5.5),
+        ("low confidence", near & ~confident, LOW_CONFIDENCE, "o", 4.5),
+        (f"low confidence, {beyond}", off & ~confident, LOW_CONFIDENCE, "x", 5.5),
+        ("confident", near & confident, RIGHT, "o", 5.0),
+        (f"confident, {beyond}", off & confident & ~wrong, RIGHT, "x", 5.5),
         ("confident and wrong", wrong, WRONG, "X", 7.5),
     ]
 

@@ -181,7 +181,7 @@ def _drawn(flight: FlightReport) -> _Drawn:
         Figure(
             "error-over-time",
             f"Error of each view over time; {percent_text(metrics.coverage)} have a fix",
-            "Error over time, confident and unsure; shaded where there is no fix.",
+            "Error over time, confident and of low confidence; shaded where there is no fix.",
             plots.over_time_picture(comparison, radius_m),
         ),
         *_figures(comparison, metrics),
@@ -252,7 +252,7 @@ def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
                 f"{east_m:+.1f}",
                 f"{north_m:+.1f}",
                 plain_text(comparison.criteria["confidence"][i])
-                + ("" if comparison.confident[i] else ", unsure"),
+                + ("" if comparison.confident[i] else ", low confidence"),
                 plain_text(comparison.criteria["peak_ratio"][i]),
             )
         )

@@ -1,8 +1,8 @@
 """Other set-ups, tried on views that are not confident: which value of the telemetry is wrong?
 
-A wrong heading, height, focal length or a mirrored image makes every view unsure, and so does a map
-of another area. A few of the unsure views are placed again with one value changed at a time. The
-change that makes them confident names the value to check.
+A wrong heading, height, focal length or a mirrored image lowers the confidence of every view, and
+so does a map of another area. A few of the views of low confidence are placed again with one value
+changed at a time. The change that makes them confident names the value to check.
 """
 
 import math
@@ -99,7 +99,7 @@ class Tried:
         return self.confident >= FEW * self.views and self.confident > 0
 
 
-class UnsureViews:
+class DoubtedViews:
     """Some of the views of a flight that are not confident, spread evenly over them."""
 
     def __init__(self, camera: Camera, corrected: Callable[[Telemetry], Telemetry]) -> None:
@@ -116,7 +116,7 @@ class UnsureViews:
             yield view
 
     def take(self, result: ViewResult) -> None:
-        """Keep the view of this result if it is unsure, and its turn."""
+        """Keep the view of this result if its confidence is low, and its turn."""
         outcome = result.outcome
         retried = isinstance(outcome, Fix) or outcome.reason in _RETRIED
         if self._current is None or result.is_confident or not retried:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 RIGHT, WRONG, TRUTH, GREY, INK = "#0072B2", "#D55E00", "#1A1A1A", "#8C8C8C", "#222222"
 SOFT = "#555555"
-UNSURE = "#E69F00"
+LOW_CONFIDENCE = "#E69F00"
 """Of best guesses, as confident fixes have the colour `RIGHT`."""
 DPI = 220
 """Resolution of the PNG: twice that of a screen, and enough for a paper."""

@@ -40,7 +40,7 @@ def columns_of(
     counter-clockwise from east.
     `head`, `agl`: heading (deg) and height (m).
     `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
-    `sure`: 1 if confident, 0 for a best guess or no fix.
+    `confident`: 1 if confident, 0 for a best guess or no fix.
     `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
     """
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
@@ -81,7 +81,7 @@ def columns_of(
         "ms": _rounded(np.array([r.latency_ms for r in results], dtype=np.float64), 1),
         "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
         "reason": [_reason(r) for r in results],
-        "sure": [int(r.is_confident) for r in results],
+        "confident": [int(r.is_confident) for r in results],
         "wrong": [int(each) for each in wrong],
     }
 

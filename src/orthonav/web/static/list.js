@@ -49,12 +49,12 @@ export class List {
     const { store } = this;
     const many = (rule) => { let n = 0; for (let i = 0; i < store.count; i++) n += rule(i) ? 1 : 0; return n; };
     const c = store.columns;
-    const choices = [["all", "all views", store.count], ["sure", "confident", store.stats.sure]];
+    const choices = [["all", "all views", store.count], ["confident", "confident", store.stats.confident]];
     if (store.stats.withTruth) {
       choices.push(["wrong", "confident and wrong", store.stats.wrong]);
       choices.push(["far", `error above ${metres(store.run.radius_m)}`, many((i) => c.err[i] > store.run.radius_m)]);
     }
-    choices.push(["doubt", "unsure: best guesses", store.stats.fixes - store.stats.sure]);
+    choices.push(["doubt", "low confidence: best guesses", store.stats.fixes - store.stats.confident]);
     for (const state of store.run.states) {
       choices.push([`state:${state}`, state, many((i) => store.state(i) === state)]);
     }

@@ -1,6 +1,6 @@
 // Colours and marks, the same on map, course and list.
 
-const COLOURS = ["sure", "unsure", "none", "truth", "wrong", "ink", "soft", "line",
+const COLOURS = ["confident", "low", "none", "truth", "wrong", "ink", "soft", "line",
   "paper", "shade", "strong", "good", "warn", "bad", "gnss"];
 let colours = {};
 
@@ -24,7 +24,7 @@ export const NAMES = {
   tracking: "tracking", coasting: "coasting", alone: "fix", searching: "searching", lost: "lost", none: "no fix",
 };
 
-export const TRUST = { sure: "confident", unsure: "unsure", none: "no fix" };
+export const TRUST = { confident: "confident", low: "low confidence", none: "no fix" };
 
 /** State and confidence of a view in words. */
 export function described(store, i) {

@@ -177,8 +177,8 @@ function drawFigures(store) {
   const { stats, count, run } = store;
   const errors = (store.columns.err ?? []).filter((v) => v >= 0).sort((p, q) => p - q);
   const quantile = (part) => errors[Math.min(errors.length - 1, Math.floor(part * errors.length))];
-  const rows = [["views", count], ["confident", ratio(stats.sure, count)]];
-  rows.push(["unsure", ratio(stats.fixes - stats.sure, count)], ["no fix", ratio(count - stats.fixes, count)]);
+  const rows = [["views", count], ["confident", ratio(stats.confident, count)]];
+  rows.push(["low confidence", ratio(stats.fixes - stats.confident, count)], ["no fix", ratio(count - stats.fixes, count)]);
   if (stats.withTruth) {
     rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
     rows.push(["CEP50", metres(quantile(0.5) ?? NaN)], ["CEP95", metres(quantile(0.95) ?? NaN)]);
@@ -199,7 +199,7 @@ function drawLegend(store) {
     states.add(store.state(i));
     trusts.add(store.trust(i));
   }
-  const rows = ["sure", "unsure"].filter((trust) => trusts.has(trust))
+  const rows = ["confident", "low"].filter((trust) => trusts.has(trust))
     .map((trust) => ["●", TRUST[trust], `var(--${trust})`]);
   for (const state of store.run.states) {
     if (states.has(state)) rows.push([MARKS[state], NAMES[state], "var(--ink)"]);

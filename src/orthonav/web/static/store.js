@@ -26,7 +26,7 @@ export class Store extends EventTarget {
     this.listed = []; // the same in the order of the list
     this.isShown = [];
     this.rising = true;
-    this.stats = { fixes: 0, sure: 0, wrong: 0, right: 0, withTruth: 0, withGnss: 0, gnssAlarms: 0 };
+    this.stats = { fixes: 0, confident: 0, wrong: 0, right: 0, withTruth: 0, withGnss: 0, gnssAlarms: 0 };
   }
 
   /** Takes a response of api/news. */
@@ -57,7 +57,7 @@ export class Store extends EventTarget {
     const c = this.columns;
     if (c.reason[i]) this.reasons.set(c.reason[i], (this.reasons.get(c.reason[i]) ?? 0) + 1);
     else this.stats.fixes += 1;
-    this.stats.sure += c.sure[i];
+    this.stats.confident += c.confident[i];
     this.stats.wrong += c.wrong[i];
     this.stats.right += c.err[i] <= this.run.radius_m ? 1 : 0;
     this.stats.withTruth += Number.isNaN(c.tx[i]) ? 0 : 1;
@@ -78,10 +78,10 @@ export class Store extends EventTarget {
     return state < 0 ? "alone" : this.run.states[state];
   }
 
-  /** What its colour tells of a view: sure (confident), unsure (a best guess) or none (no fix). */
+  /** What its colour tells of a view: `confident`, `low` (a best guess) or `none` (no fix). */
   trust(i) {
     if (this.columns.reason[i]) return "none";
-    return this.columns.sure[i] ? "sure" : "unsure";
+    return this.columns.confident[i] ? "confident" : "low";
   }
 
   select(i, by = "") {
@@ -134,8 +134,8 @@ export class Store extends EventTarget {
       none: (i) => Boolean(c.reason[i]),
       wrong: (i) => c.wrong[i] === 1,
       far: (i) => c.err[i] > this.run.radius_m,
-      sure: (i) => c.sure[i] === 1,
-      doubt: (i) => this.trust(i) === "unsure",
+      confident: (i) => c.confident[i] === 1,
+      doubt: (i) => this.trust(i) === "low",
       state: (i) => this.state(i) === value,
       reason: (i) => c.reason[i] === value,
     };
