@@ -67,6 +67,27 @@ def test_parallax_of_a_slope_is_no_turn_and_no_climb(slope):
     assert unknown.scaled_std > known.scaled_std > seen.scaled_std
 
 
+@pytest.mark.parametrize("slope", [(0.15, 0.0), (0.0, 0.15), (-0.1, 0.1), (-0.05, -0.1)])
+@pytest.mark.parametrize("ahead_m", [0.0, 115.0])
+def test_long_displacements_are_those_over_the_ground_of_both_views(ahead_m, slope):
+    moved_m, slope, ahead_m = (
+        np.array([24.0, 32.0]),
+        np.array(slope),
+        ahead_m * np.array([0.6, 0.8]),
+    )
+    measured_m, turned, scaled = as_measured(moved_m, slope, ahead_m)
+    seen = CameraDisplacement(measured_m, np.eye(2), 100.0, turned, scaled)
+    between, at_the_first = (
+        over_terrain(ViewDisplacement(seen, 0.8), (AGL_M, AGL_M), terrain_of(slope, at_m), ahead_m)
+        for at_m in (ahead_m + measured_m / 2, ahead_m)
+    )
+    left_m, more_m = (
+        np.hypot(*(each.displacement.moved_en_m - moved_m)) for each in (between, at_the_first)
+    )
+    assert left_m < 0.012 * np.hypot(*moved_m)
+    assert left_m < more_m
+
+
 @pytest.mark.parametrize("off_nadir_deg", [30, 45, 60])
 @pytest.mark.parametrize("slope", [(0.15, 0.0), (0.0, 0.15), (-0.1, 0.1), (-0.05, -0.1)])
 def test_slope_seen_ahead_does_not_displace_the_camera(off_nadir_deg, slope):
@@ -74,7 +95,8 @@ def test_slope_seen_ahead_does_not_displace_the_camera(off_nadir_deg, slope):
     ahead_m = AGL_M * math.tan(math.radians(off_nadir_deg)) * np.array([0.6, 0.8])
     measured_m, turned, scaled = as_measured(moved_m, slope, ahead_m)
     seen = CameraDisplacement(measured_m, np.eye(2), 100.0, turned, scaled)
-    terrain, measured = terrain_of(slope, ahead_m), ViewDisplacement(seen, 0.8)
+    terrain = terrain_of(slope, ahead_m + measured_m / 2)
+    measured = ViewDisplacement(seen, 0.8)
     known = over_terrain(measured, (AGL_M, AGL_M), terrain, ahead_m).displacement
     off_m, left_m = (np.hypot(*(m - moved_m)) for m in (measured_m, known.moved_en_m))
     assert off_m > 0.035 * np.hypot(*moved_m)

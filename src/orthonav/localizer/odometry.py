@@ -226,7 +226,7 @@ class Terrain:
     """Ground that is not level.
 
     `below`, `seen` (2,): its rise per metre east and north below the camera, and at the middle of
-    what the camera sees. `rise`: of the ground there over that below, as a share of the height.
+    what both views show. `rise`: of the ground there over that below, as a share of the height.
     """
 
     below: Array
@@ -243,7 +243,7 @@ def over_terrain(
     """A displacement over ground that is not level.
 
     `agl_m`: heights reported with both views. `terrain`: None where it is unknown. `ahead_en_m`
-    (2,): middle of what both views see, from the camera. Level ground is assumed by the
+    (2,): middle of a view, from the camera. Level ground is assumed by the
     measurement: by parallax, a slope along the way looks like a change of scale, one across it like
     a turn, each by half, about the middle of the views. They displace the camera, which is not
     there. The displacement is seen at the distance of the ground there, and the height above the

@@ -344,7 +344,9 @@ class Tracker:
             return made
         heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
         ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
-        terrain = self._terrain(self._registration.relief, heights_m[0], ahead_en_m)
+        # What both views show lies half a displacement ahead of what the earlier one shows.
+        common_en_m = ahead_en_m + made.displacement.moved_en_m / 2
+        terrain = self._terrain(self._registration.relief, heights_m[0], common_en_m)
         return over_terrain(made, heights_m, terrain, ahead_en_m)
 
     def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
