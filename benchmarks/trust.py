@@ -42,6 +42,8 @@ from orthonav.records import CONFIDENT
 
 RIDGE = 1e-5
 """Weight of the ridge of the fit: only against weights without bound."""
+LEAST = 1e-9
+"""Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
 Array = NDArray[np.float64]
 
 
@@ -104,9 +106,11 @@ def fit_judge(
         weights = parameters[2:]
         fits = 1 / (1 + np.exp(-(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])))
         alone = 1 / (1 + np.exp(-(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])))
-        both = np.clip(fits * alone, 1e-9, 1 - 1e-9)
+        product = fits * alone
+        both = np.clip(product, LEAST, 1 - LEAST)
         value = -np.log(np.where(right, both, 1 - both)).mean()
-        slope = np.where(right, -1.0, both / (1 - both)) / len(right)
+        # A limited loss has no slope: with one, searches along a line would fail.
+        slope = np.where(right, -1.0, both / (1 - both)) * (both == product) / len(right)
         first, second = slope * (1 - fits), slope * (1 - alone)
         slopes = scaled[:, :-ALONE].T @ first, scaled[:, -ALONE:].T @ second
         gradient = np.concatenate([[first.sum(), second.sum()], *slopes])
