@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit
 
 from benchmarks.inputs import file_of
 from benchmarks.record import Table, provenance
@@ -104,8 +105,8 @@ def fit_judge(
 
     def loss(parameters: Array) -> tuple[float, Array]:
         weights = parameters[2:]
-        fits = 1 / (1 + np.exp(-(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])))
-        alone = 1 / (1 + np.exp(-(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])))
+        fits = expit(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])
+        alone = expit(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])
         product = fits * alone
         both = np.clip(product, LEAST, 1 - LEAST)
         value = -np.log(np.where(right, both, 1 - both)).mean()
