@@ -127,10 +127,11 @@ def rows(opened: MapFile, folder: Path, wrong: str) -> Iterator[tuple[str, ...]]
         locator: Locator = SingleViews(localizer)
         if method == "tracked":
             locator = Tracker(localizer)
-        named = Named()
-        logging.getLogger("orthonav").addHandler(named)
+        named, log = Named(), logging.getLogger("orthonav")
+        log.addHandler(named)
+        log.setLevel(min(log.getEffectiveLevel(), logging.WARNING))
         results = list(localize_flight(locator, flight, heights=map_heights(opened, terrain)))
-        logging.getLogger("orthonav").removeHandler(named)
+        log.removeHandler(named)
         errors, confident, biases = [], [], [math.nan]
         for result in results:
             fix, off_m, sure_of = result.outcome, math.inf, False
