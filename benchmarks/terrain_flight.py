@@ -134,15 +134,15 @@ def rows(opened: MapFile, folder: Path, wrong: str) -> Iterator[tuple[str, ...]]
         log.removeHandler(named)
         errors, confident, biases = [], [], [math.nan]
         for result in results:
-            fix, off_m, sure_of = result.outcome, math.inf, False
+            fix, off_m, is_confident = result.outcome, math.inf, False
             if isinstance(fix, Fix):
                 frame = localizer.sheet.frame
                 there = frame.en_from_latlon(*truth[result.frame])
                 here = frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-                off_m, sure_of = float(np.hypot(*(there - here))), fix.confidence >= CONFIDENT
+                off_m, is_confident = float(np.hypot(*(there - here))), fix.confidence >= CONFIDENT
                 biases.append(fix.evidence.get("log_scale_bias", math.nan))
             errors.append(off_m)
-            confident.append(sure_of)
+            confident.append(is_confident)
             logging.info("%s %.1f %s", result.frame, errors[-1], fix)
         off, accepted = np.array(errors), np.array(confident)
         right = off <= RIGHT_M

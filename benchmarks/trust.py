@@ -219,8 +219,8 @@ def _scenes_table(judged: Judged) -> Table:
     notes = (
         f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px, with a prior "
         "within 20 px; heading sd 10 deg, height sd 10 %, tracked: 2 deg and 3 %",
-        "by a fit to the other scenes; shipped: by the weights of the program, which are fitted to "
-        "all of these views",
+        "by a fit to the other scenes; shipped: by the weights of the program, fitted to views of "
+        "these scenes",
     )
     return Table("Confidence on scenes left out", header, rows, notes)
 

@@ -102,7 +102,7 @@ REGISTRATION = (
     "src/orthonav/localizer/*.py",
     "src/orthonav/register/*.py",
 )
-TRACKED = ("src/orthonav/localizer/odometry.py", "src/orthonav/localizer/tracker.py")
+TRACKED = tuple(f"src/orthonav/localizer/{name}.py" for name in ("odometry", "places", "tracker"))
 """Files among those that place no single view, and so decide no row."""
 
 

@@ -1,10 +1,12 @@
 """Odometry over a plane that is not level, against its exact geometry."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from orthonav.localizer import tracker
 from orthonav.localizer.odometry import Terrain, ViewDisplacement, over_terrain
 from orthonav.track import CameraDisplacement
 
@@ -109,3 +111,26 @@ def test_slope_seen_ahead_does_not_displace_the_camera(off_nadir_deg, slope):
     # The farther ahead, the less a displacement over unknown ground counts.
     least = seen.covariance[0, 0]
     assert unknown.covariance[0, 0] > known.covariance[0, 0] > least
+
+
+def test_the_tracker_takes_the_ground_between_both_views(monkeypatch):
+    moved_m, ahead_m, asked = np.array([40.0, 0.0]), np.array([0.0, 115.0]), []
+    seen = CameraDisplacement(moved_m, np.eye(2), 100.0, 0.0, 0.0)
+    monkeypatch.setattr(tracker, "displacement", lambda *_: ViewDisplacement(seen, 0.8))
+    telemetry = SimpleNamespace(agl_m=AGL_M)
+    view = SimpleNamespace(
+        pixel_m=1.0, ahead_en_m=ahead_m, view=SimpleNamespace(telemetry=telemetry), telemetry=None
+    )
+
+    def terrain(relief, agl_m, at_en_m):
+        asked.append(at_en_m)
+        return terrain_of(np.array([0.15, 0.0]), at_en_m)
+
+    following = SimpleNamespace(
+        _tilt_noise=lambda _: 0.0,
+        _registration=SimpleNamespace(relief="a terrain"),
+        _terrain=terrain,
+    )
+    found = tracker.Tracker._displacement(following, view, view, np.zeros(2), None)
+    np.testing.assert_array_equal(asked, [ahead_m + moved_m / 2])
+    assert found.displacement.moved_en_m[0] < 40.0  # uphill ground is nearer

@@ -50,6 +50,8 @@ def places_of(
                 evidence[name] = max(evidence[name], value)
         alone = confidence(evidence)
         log_odds = min(there, logit(alone, LEAST))
+        if out:  # the best place may have won in detail, against stronger scores elsewhere
+            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
         if not out or log_odds > WORTH_LOG_ODDS:
             out.append((log_odds, alone, placed))
     return out
