@@ -32,6 +32,7 @@ from benchmarks.verdicts import percent
 from orthonav.confidence.registered import (
     ALONE,
     FEATURES,
+    LEAST,
     USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
@@ -43,8 +44,6 @@ from orthonav.records import CONFIDENT
 
 RIDGE = 1e-5
 """Weight of the ridge of the fit: only against weights without bound."""
-LEAST = 1e-9
-"""Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
 Array = NDArray[np.float64]
 
 

@@ -78,7 +78,7 @@ export class Store extends EventTarget {
     return state < 0 ? "alone" : this.run.states[state];
   }
 
-  /** What its colour tells of a view: `confident`, `low` (a best guess) or `none` (no fix). */
+  /** The class of a view that its colour shows: `confident`, `low` (a best guess) or `none` (no fix). */
   trust(i) {
     if (this.columns.reason[i]) return "none";
     return this.columns.confident[i] ? "confident" : "low";
