@@ -16,7 +16,7 @@ from benchmarks.flights import Flight
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace
 from benchmarks.machine import reading_gb_per_s, seconds
 from benchmarks.record import Section, Table, number
-from orthonav.localizer import Localizer, propose, registration
+from orthonav.localizer import Localizer, candidates, plan, registration
 from orthonav.mapfile import open_map
 from orthonav.register import refine, registrar
 from orthonav.register.search import search
@@ -96,18 +96,21 @@ def _watched(account: _Account) -> Iterator[_Account]:
 
     clocked = [
         (locate, "prepared", lambda *a, **k: "rectify"),
-        (locate, "_searched", lambda *a, **k: f"search, level {a[3].level}"),
+        (candidates.ViewCandidates, "found", lambda _, run: "search, " + _kind(run)),
         (registrar.Registrar, "judged", lambda *a, **k: VERIFY),
         (registrar.Registrar, "finished", lambda *a, **k: VERIFY),
-        (propose.TileProposer, "candidates", lambda *a, **k: "search, tiles"),
         (refiner, "place", lambda self, *a, **k: f"refine, level {self.template.level}"),
     ]
     with ExitStack() as stack:
         for owner, name, stage in clocked:
             timed = account.around(stage, getattr(owner, name))
             stack.enter_context(patch.object(owner, name, timed))
-        stack.enter_context(patch.object(registration, "search", searched))
+        stack.enter_context(patch.object(candidates, "search", searched))
         yield account
+
+
+def _kind(run: plan.Search) -> str:
+    return "tiles" if run.from_tiles else f"level {run.level}"
 
 
 def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:

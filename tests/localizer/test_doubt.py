@@ -1,69 +1,119 @@
 """Views in doubt are compared with more candidates, one level finer."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
 
-from orthonav.confidence.registered import USUAL_CONFIDENCE
+from orthonav.confidence.registered import USUAL_CHANCES, USUAL_CONFIDENCE
 from orthonav.localizer.places import places_of
-from orthonav.localizer.plan import DEFAULT_PLAN, Budget
-from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.localizer.plan import DEFAULT_PLAN, Search, SearchPlan
+from orthonav.localizer.view_search import ViewSearch
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Placed
-from orthonav.register.registrar import OwnRatios, Registered
+from orthonav.register.registrar import Levels, OwnRatios, PosePrior, Registered
 from orthonav.register.sharpness import Sharpness
+
+LOOK = 2
+"""The judged level of all views here."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A place with a confidence."""
+    """A place with a confidence, which never stands out."""
 
     confidence: float
     cut_short: bool = False
+    score: float = 0.0
 
     def evidence(self):
         return {"confidence": self.confidence}
 
 
-def concluded(confidences, final=1, budget_ms=math.inf):
-    """How many candidates were finished and compared one level finer, and the place found, where
-    one finishing after the other has these confidences."""
-    localizer = RegistrationLocalizer.__new__(RegistrationLocalizer)
-    localizer.plan, localizer.relief = DEFAULT_PLAN, None
-    localizer.confidence = lambda evidence: evidence["confidence"]
-    ground = SimpleNamespace(placed_on_terrain=lambda judged, at_most: judged)
-    view = SimpleNamespace(levels=SimpleNamespace(final=final))
-    kept, left = [], iter(confidences)
+class Registrar:
+    """Finishes candidates with given confidences, one time after the other, and notes `kept`."""
 
-    def finished(judged, finer=0):
-        kept.append(finer)
-        return Found(next(left))
+    def __init__(self, confidences):
+        self.kept, self._left = [], iter(confidences)
 
-    budget = Budget(budget_ms)
-    assert budget.allows(0.0)
-    found = localizer._concluded(view, ground, ["a place"], None, budget, finished)
-    return kept, found
+    def judged(self, *_):
+        return ["a place"]
+
+    def standing(self, *_):
+        return 30.0, 29.0
+
+    def finished(self, *_, finer, kept, **__):
+        self.kept.append((kept, finer is not None))
+        return Found(next(self._left))
+
+
+class Confidence:
+    """What the places say, with usual scores of chance."""
+
+    chances = USUAL_CHANCES
+
+    def __call__(self, evidence):
+        return evidence["confidence"]
+
+
+def searched(monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math.inf):
+    """Searches that were run, candidates finished and whether they were compared one level finer,
+    and the place found, where one finishing after the other has these confidences."""
+    registrar, ran = Registrar(confidences), []
+    searches = [Search(LOOK, [(0.0, 0.0)], False, 8, cost_ms) for cost_ms in costs_ms]
+    monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
+    view = SimpleNamespace(
+        levels=Levels(LOOK + 1, LOOK, final), prior=PosePrior(0.0, 0.1, 0.1), templates=None
+    )
+    candidates = SimpleNamespace(
+        view=view, registrar=registrar, plan=replace(DEFAULT_PLAN, budget_ms=budget_ms),
+        fft_ms=None, tiles=None, found=lambda run: ran.append(run.cost_ms) or ["a candidate"],
+    )  # fmt: skip
+    ground = SimpleNamespace(
+        is_level=True, finish=None, finer_score=lambda finalist: 0.0,
+        placed_on_terrain=lambda judged, at_most: judged,
+    )  # fmt: skip
+    found = ViewSearch(candidates, ground, Confidence()).best()
+    return ran, registrar.kept, found
 
 
 @pytest.mark.parametrize(
     ("confidences", "kept"),
-    [([0.995], [0]), ([0.95, 0.995], [0, 3]), ([0.0, 0.0, 0.7], [0, 3, 48])],
+    [
+        ([0.995], [(3, False)]),
+        ([0.95, 0.995], [(3, False), (3, True)]),
+        ([0.0, 0.0, 0.7], [(3, False), (3, True), (48, True)]),
+    ],
 )
-def test_more_candidates_are_compared_until_a_place_is_proven(confidences, kept):
-    finished, found = concluded(confidences)
-    assert finished == kept
+def test_more_candidates_are_compared_until_a_place_is_proven(monkeypatch, confidences, kept):
+    ran, finished, found = searched(monkeypatch, confidences)
+    assert len(ran) == 1 and finished == kept
     assert found == Found(confidences[-1])
 
 
-def test_views_judged_at_the_finest_level_are_not_compared_finer():
-    assert concluded([0.5], final=0)[0] == [0]
+def test_views_judged_at_the_finest_level_are_not_compared_finer(monkeypatch):
+    assert searched(monkeypatch, [0.5], final=0)[1] == [(3, False)]
 
 
-def test_a_budget_leaves_it_out():
-    finished, found = concluded([0.5], budget_ms=1e-9)
-    assert finished == [0] and found.cut_short
+def test_a_budget_leaves_it_out(monkeypatch):
+    _, finished, found = searched(monkeypatch, [0.5], budget_ms=1e-9)
+    assert finished == [(3, False)] and found.cut_short
+
+
+def test_a_trial_before_an_expensive_search_can_make_it_needless(monkeypatch):
+    ran, finished, found = searched(monkeypatch, [0.995], costs_ms=(50.0, 300.0))
+    assert (ran, finished, found) == ([50.0], [(3, True)], Found(0.995))
+
+
+def test_where_it_proves_nothing_the_search_goes_on(monkeypatch):
+    ran, finished, _ = searched(monkeypatch, [0.95, 0.995], costs_ms=(50.0, 300.0))
+    assert (ran, finished) == ([50.0, 300.0], [(3, True), (3, False)])
+
+
+def test_before_a_cheap_search_there_is_no_trial(monkeypatch):
+    ran, finished, _ = searched(monkeypatch, [0.995], costs_ms=(50.0, 10.0))
+    assert (ran, finished) == ([50.0, 10.0], [(3, False)])
 
 
 def test_other_places_are_less_confident_than_the_one_that_won_in_detail():

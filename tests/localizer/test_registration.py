@@ -21,6 +21,7 @@ from blots import (
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
+from orthonav.localizer.candidates import ViewCandidates
 from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
 from orthonav.mapfile import GreyLayer, open_map
 from orthonav.mapfile.layer import part_names
@@ -324,13 +325,13 @@ def test_the_search_ends_with_tiles_only_where_the_place_is_confident(
     monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
     monkeypatch.setattr(registration, "plan", plan)
     monkeypatch.setattr(RegisteredConfidence, "__call__", lambda *_: confidence)
-    asked, searched = [], registration._searched
+    asked, found = [], ViewCandidates.found
     monkeypatch.setattr(
-        registration, "_searched", lambda *taken: asked.append(taken[2].level) or searched(*taken)
+        ViewCandidates, "found", lambda self, run: asked.append(run.level) or found(self, run)
     )
     fix = localizer.locate(View(grey, CAMERA, reported))
     assert error_m(localizer, fix, place) < 0.5
-    assert bool(asked) == further
+    assert asked == [levels.coarse, levels.look][: 1 + further]
 
 
 def test_a_fix_lies_near_its_prior(localizer, plain):

@@ -21,6 +21,7 @@ from scenes import (
 from orthonav.register.evidence import COARSE, FINE
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
+from orthonav.register.refine import Refiner
 from orthonav.register.registrar import (
     EXCLUSION_SHARE,
     KEPT_TO_LOOK,
@@ -71,10 +72,9 @@ def searched(registrar, templates, prior, level, count=24):
 
 
 def verified(registrar, templates, levels, candidates, level, prior, finer=None):
-    """One search from candidates to the place; `finer`: templates one level finer."""
+    """One search from candidates to the place; `finer`: score one level finer."""
     judged = registrar.judged(templates, levels, candidates, level, prior)
-    made = None if finer is None else lambda _: finer
-    return registrar.finished(templates, levels, judged, prior, len(candidates), finer=made)
+    return registrar.finished(templates, levels, judged, prior, len(candidates), finer=finer)
 
 
 def registered(registrar, templates, prior, level=LEVELS.look):
@@ -464,18 +464,19 @@ class FineTwin:
 
 
 def twins(changed):
-    """What `verified` needs of a view of `FineTwin`, its pose, and its finer templates."""
+    """What `verified` needs of a view of `FineTwin`, its pose, and scores one level finer."""
     registrar = Registrar(reference_of(FineTwin(changed), (384, 768), levels=4))
     pose, twin = Pose(190.0, 190.0, 0.2, 0.0), Pose(190.0 + 384, 190.0, 0.2, 0.0)
     shape = (192, 224)
     grey = as_grey(seen(FineTwin().view, pose, shape))
-    finer = ViewTemplates(grey, np.ones(shape, bool), 0)
+    refiner = Refiner(ViewTemplates(grey, np.ones(shape, bool), 0).at(0), registrar.reference)
     halves = grey.reshape(96, 2, 112, 2).mean(axis=(1, 3))
     templates = ViewTemplates(as_grey(halves), np.ones((96, 112), bool), 1)
     levels = Levels.of(math.sqrt(192 * 224), 4)
     assert levels.final == 1
     candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
-    return (registrar, templates, levels, candidates, levels.look, prior_of(pose)), pose, finer
+    view = registrar, templates, levels, candidates, levels.look, prior_of(pose)
+    return view, pose, lambda finalist: refiner.place(finalist.pose, 2).score
 
 
 def test_one_finer_level_tells_what_coarser_ones_cannot():

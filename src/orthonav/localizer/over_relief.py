@@ -6,13 +6,14 @@ it stays where it is.
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from orthonav.localizer.prepared import PreparedView
 from orthonav.localizer.relief import LevelTerrain, Relief
 from orthonav.localizer.relief_camera import CameraFound, camera_found
 from orthonav.localizer.relief_view import ReliefView
 from orthonav.register.pose import Pose
-from orthonav.register.refine import Placed
+from orthonav.register.refine import Placed, Refiner
 from orthonav.register.registrar import (
     EXCLUSION_SHARE,
     FULL_STEPS,
@@ -32,21 +33,14 @@ AGAIN_PX = 1.0
 """A window that moved by more (pixels of the level, at its rim) is orthorectified again."""
 ROUNDS = 3
 """At most so many times at the final level."""
+FINER_STEPS = 2
+"""Steps of refinement of a finalist one level finer."""
 SETTLED = 6
 """Places whose surroundings are searched on the terrain, where no place stands out."""
 NEAR_REACH = 0.2
 """They are searched so far, as a share of the view's side,"""
 NEAR_TURNS_RAD, NEAR_SCALES = (-0.1, 0.0, 0.1), (-0.09, 0.0, 0.09)
 """and under these headings and log scales around those of level ground."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """A candidate on the terrain: its `templates`, and the score at the judged level over that on
-    level ground."""
-
-    made: Finished
-    gain: float
 
 
 @dataclass(frozen=True)
@@ -66,27 +60,26 @@ class ViewOnLevelGround:
 
     def __init__(self, registrar: Registrar, view: PreparedView) -> None:
         self.registrar, self.view = registrar, view
-        self._finer: ViewTemplates | None = None
+        self._finished: dict[Placed, Finished] = {}
+        self._finer_scores: dict[Placed, float] = {}
 
     def finish(self, judged: Placed) -> Finished:
-        """A judged candidate at the final level."""
-        return self.registrar.at_final(self.view.templates, self.view.levels, judged)
+        """A judged candidate at the final level, made once."""
+        if judged not in self._finished:
+            self._finished[judged] = self._finish(judged)
+        return self._finished[judged]
+
+    def finer_score(self, finalist: Placed) -> float:
+        """Score of a finalist one level finer than the final one, made once."""
+        if finalist not in self._finer_scores:
+            made = self._finer_templates(finalist)
+            refiner = Refiner(made.at(made.finest), self.registrar.reference)
+            self._finer_scores[finalist] = refiner.place(finalist.pose, FINER_STEPS).score
+        return self._finer_scores[finalist]
 
     def placed_on_terrain(self, judged: list[Placed], at_most: int) -> list[Placed]:
         """Judged candidates, at most `at_most` of them placed again, where none stands out."""
         return judged
-
-    def templates_of(self, placed: Placed) -> ViewTemplates:
-        """The templates by which a finalist was placed."""
-        return self.view.templates
-
-    def finer(self, placed: Placed) -> ViewTemplates:
-        """The templates of a finalist one level finer than the final one."""
-        if self._finer is None:
-            level = self.view.levels.final - 1
-            made = self.view.rectified_at(level)
-            self._finer = ViewTemplates(made.grey, made.valid, level)
-        return self._finer
 
     def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
         """The places found, as poses of the view on level ground below the camera."""
@@ -102,6 +95,19 @@ class ViewOnLevelGround:
         refiner = self.registrar.refiner(self.view.templates, levels, levels.final)
         return refiner.place(pose, steps, small_step_px).score
 
+    def _finish(self, judged: Placed) -> Finished:
+        return self.registrar.at_final(self.view.templates, self.view.levels, judged)
+
+    def _finer_templates(self, finalist: Placed) -> ViewTemplates:
+        """The templates of a finalist one level finer than the final one."""
+        return self._finer_on_level
+
+    @cached_property
+    def _finer_on_level(self) -> ViewTemplates:
+        level = self.view.levels.final - 1
+        made = self.view.rectified_at(level)
+        return ViewTemplates(made.grey, made.valid, level)
+
 
 class ViewOverRelief(ViewOnLevelGround):
     """One view on the ground of a sheet. Not to be shared between threads."""
@@ -111,15 +117,16 @@ class ViewOverRelief(ViewOnLevelGround):
     def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
         super().__init__(registrar, view)
         self.seen = ReliefView(relief, view)
-        # Finalists by their pose; None: finished on level ground.
-        self._found: dict[Pose, _Placed | None] = {}
+        # By the pose of a finalist: score on the terrain at the judged level over that on level
+        # ground; None: finished on level ground.
+        self._gains: dict[Pose, float | None] = {}
         self._best_look = 0.0
         self._level_scores: dict[Pose, float] = {}
         # Candidates of level ground on the terrain, and after a search around them.
         self._judged: dict[Pose, tuple[ViewTemplates, Placed] | None] = {}
         self._searched: dict[Pose, Placed] = {}
 
-    def finish(self, judged: Placed) -> Finished:
+    def _finish(self, judged: Placed) -> Finished:
         """A judged candidate at the final level: on the terrain, or on level ground where that is
         as good, or where less than half of the ground is known."""
         known = judged.pose in self._level_scores
@@ -137,12 +144,12 @@ class ViewOverRelief(ViewOnLevelGround):
             level = self._on_level_ground(judged)
             if level.total > found.total:
                 return level
-        self._found[found.placed.pose] = _Placed(found, found.look / max(on_level, 1e-6))
+        self._gains[found.placed.pose] = found.look / max(on_level, 1e-6)
         return found
 
     def _on_level_ground(self, judged: Placed) -> Finished:
-        made = super().finish(judged)
-        self._found[made.placed.pose] = None
+        made = super()._finish(judged)
+        self._gains[made.placed.pose] = None
         return made
 
     def placed_on_terrain(self, judged: list[Placed], at_most: int) -> list[Placed]:
@@ -234,17 +241,11 @@ class ViewOverRelief(ViewOnLevelGround):
         look = registrar.refiner(made, levels, levels.look).place(placed.pose, 0).score
         return Finished(placed.score + look, placed, made, look)
 
-    def templates_of(self, placed: Placed) -> ViewTemplates:
-        """The templates by which a finalist was placed."""
-        found = self._found.get(placed.pose)
-        return super().templates_of(placed) if found is None else found.made.templates
-
-    def finer(self, placed: Placed) -> ViewTemplates:
-        """The templates of a finalist one level finer than the final one."""
+    def _finer_templates(self, finalist: Placed) -> ViewTemplates:
         made = None
-        if self._found.get(placed.pose) is not None:
-            made = self.seen.templates_at(placed.pose, self.view.levels.final - 1)
-        return super().finer(placed) if made is None else made
+        if self._gains.get(finalist.pose) is not None:
+            made = self.seen.templates_at(finalist.pose, self.view.levels.final - 1)
+        return super()._finer_templates(finalist) if made is None else made
 
     def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
         """The same, of a view on the terrain: heights are counted from the ground below the camera,
@@ -254,10 +255,9 @@ class ViewOverRelief(ViewOnLevelGround):
         orientation = self.seen.orientation(pose)
         if orientation is None:
             return found, None
-        on_terrain = self._on_terrain(pose)
-        gain: float | None = 1.0 if on_terrain is None else on_terrain.gain
-        if isinstance(self.seen.relief.terrain, LevelTerrain):
-            gain = None
+        gain = None
+        if not isinstance(self.seen.relief.terrain, LevelTerrain):
+            gain = self._gain(pose) or 1.0
         seen = GroundSeen(self.seen.middle_en_m(orientation, pose), gain)
         return replace(found, placed=self._by_camera(found.placed), finalists=finalists), seen
 
@@ -276,17 +276,17 @@ class ViewOverRelief(ViewOnLevelGround):
         return camera_found(self.seen, self.registrar, placed)
 
     def _by_camera(self, placed: Placed) -> Placed:
-        if self._on_terrain(placed.pose) is None:
+        if self._gain(placed.pose) is None:
             return placed
         return replace(placed, pose=self.seen.below_camera(placed.pose))
 
-    def _on_terrain(self, pose: Pose) -> _Placed | None:
-        """The finalist at a pose, which may have been refined once more; None where it was placed
-        on level ground."""
+    def _gain(self, pose: Pose) -> float | None:
+        """The gain of the finalist at a pose, which may have been refined once more; None where it
+        was placed on level ground."""
         near = EXCLUSION_SHARE * self.view.side_px
 
         def apart(other: Pose) -> float:
             return math.hypot(pose.x_px - other.x_px, pose.y_px - other.y_px)
 
-        nearest = min(self._found, key=apart, default=None)
-        return None if nearest is None or apart(nearest) > near else self._found[nearest]
+        nearest = min(self._gains, key=apart, default=None)
+        return None if nearest is None or apart(nearest) > near else self._gains[nearest]

@@ -105,6 +105,9 @@ class SearchPlan:
     """Largest number of them where the heading is unknown; docs/decisions/registration.md, 12."""
     tiles_per_candidate: int = 200
     """Between these, one candidate for so many tiles: the right one ranks lower among more."""
+    tile_share_per_nat: float = 0.03
+    """Share of its similarity that a tile loses with every nat by which the telemetry contradicts
+    its pose; docs/decisions/registration.md, 14."""
     tile_reach_strides: float = 1.1
     """The place of a candidate from tiles is sought within so many strides of the tile grid."""
     tile_apart_strides: float = 1.5
@@ -140,11 +143,13 @@ class SearchPlan:
     tiles, or with a prior."""
     terrain_candidates: int = 48
     """At most so many candidates are placed on the terrain, the best that lie apart."""
-    terrain_trials: int = 3
-    """Before an expensive search so many of the best candidates are placed on the terrain;
-    `python -m benchmarks.over_terrain --only oblique`."""
-    terrain_trial_ms: float = 7.0
-    """Estimated cost of one of them: a search that costs more than all of them is expensive."""
+    trials: int = 3
+    """Before a search that costs more than a trial, so many of the best candidates are placed on
+    the terrain, finished and compared one level finer. The search ends if that proves one;
+    docs/decisions/registration.md, 14."""
+    trial_ms: float = 25.0
+    terrain_trial_ms: float = 60.0
+    """Estimated cost of a trial, on level ground and on a terrain."""
     budget_ms: float = math.inf
     """No search after the first one is begun that would end later than this after the first one
     began, ms; the best place so far is the answer."""

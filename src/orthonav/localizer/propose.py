@@ -55,49 +55,60 @@ class TileProposer:
         self,
         view: RectifiedView,
         poses: list[tuple[float, float]],
+        weights: NDArray[np.float32],
         rows: NDArray[np.intp] | None,
         count: int,
         apart_strides: float,
     ) -> list[Candidate]:
         """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
 
-        `poses` are headings (rad) and log scales; scores are those of the embeddings. Up to `count`
-        tiles, at least `apart_strides` strides of the tile grid from each other.
+        `poses` are headings (rad) and log scales; scores are those of the embeddings, times the
+        `weights` (Q,) of the poses. Up to `count` tiles, at least `apart_strides` strides of the
+        tile grid from each other.
         """
         queries = embed_poses(
             self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
         )
+        queries *= weights[:, None]
         scores = self.index.best(queries, rows)
         centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
         chosen = top_tiles(scores, centres, count, apart_strides * self.grid.stride_m)
         tiles = chosen if rows is None else rows[chosen]
         by_pose = self.index.scores(queries, tiles)
-        tried, found = np.array(poses), []
-        for place, tile, similar in zip(chosen, tiles, by_pose, strict=True):
+        peaks = peak_poses(np.array(poses), by_pose)
+        found = []
+        for place, tile, (turn_rad, log_scale) in zip(chosen, tiles, peaks.tolist(), strict=True):
             shift = self.neighbours.peak_offset(scores, int(tile), rows)
             east, north = self.centres_en_m[tile] + np.array(shift) * self.grid.stride_m
             x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
             y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
-            pose = Pose(x_px, y_px, *peak_pose(tried, similar))
+            pose = Pose(x_px, y_px, turn_rad, log_scale)
             found.append(Candidate(float(scores[place]), pose))
         return found
 
 
-def peak_pose(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> tuple[float, float]:
-    """Heading and log scale where the scores (Q,) of poses (Q, 2) on a grid have their peak.
+def peak_poses(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Headings and log scales (N, 2) where the scores (N, Q) of poses (Q, 2) on a grid have their
+    peak.
 
     By a parabola along each, or those of the best pose where one of its neighbours is missing.
     """
-    best = int(scores.argmax())
-    off = poses - poses[best]
-    off[:, 0] = np.remainder(off[:, 0] + np.pi, 2 * np.pi) - np.pi
-    peak = poses[best].copy()
+    off = poses - poses[:, None]
+    off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
+    best, tiles = scores.argmax(axis=1), np.arange(len(scores))
+    peaks = poses[best]
     for axis in (0, 1):
-        along = off[:, axis]
-        others = np.flatnonzero(np.isclose(off[:, 1 - axis], 0.0) & ~np.isclose(along, 0.0))
-        ahead, behind = others[along[others] > 0], others[along[others] < 0]
-        if len(ahead) and len(behind):
-            after, before = ahead[along[ahead].argmin()], behind[along[behind].argmax()]
-            moved = parabola_peak(*scores[[before, best, after]].tolist())
-            peak[axis] += moved * (along[after] - along[before]) / 2
-    return float(peak[0]), float(peak[1])
+        other = np.isclose(off[..., 1 - axis], 0.0)
+        beside = []
+        for sign in (-1, 1):
+            along = sign * off[..., axis]
+            away = np.where(other & (along > 1e-9), along, np.inf)
+            nearest = away.argmin(axis=1)[best]
+            beside.append((nearest, away[best, nearest]))
+        (before, back), (after, ahead) = beside
+        has_both = np.isfinite(back + ahead)
+        around = scores[tiles[:, None], np.stack([before, best, after], axis=1)]
+        moved = np.array([parabola_peak(*each) for each in around.tolist()])
+        step = np.where(has_both, (back + ahead) / 2, 0.0)
+        peaks[:, axis] += np.where(has_both, moved, 0.0) * step
+    return peaks

@@ -1,8 +1,9 @@
-"""Placing a view by registration on the map's imagery: collect candidates, refine, judge the best.
+"""Placing a view by registration on the map's imagery.
 
-`plan` decides which searches to run, this module runs them until one place stands out from chance
-and from its rivals. `register` is the one way from a view to its best place; `locate` makes a fix
-of it, `tracker`, `orthonav.atlas` and `orthonav.check` use the place itself.
+READ FIRST: `register` is the one way from a view to its best place. It rectifies the view
+(`prepared`), and runs the searches (`view_search`) that `plan` chooses; `candidates` runs each of
+them, and `orthonav.register` judges what they find. `locate` makes a fix of the place, `tracker`,
+`orthonav.atlas` and `orthonav.check` use the place itself.
 """
 
 import functools
@@ -10,32 +11,31 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.registered import USUAL_CHANCES, Chances, RegisteredConfidence
+from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import MapFileError, VariantError
+from orthonav.localizer.candidates import ViewCandidates
 from orthonav.localizer.over_relief import GroundSeen, ViewOnLevelGround, ViewOverRelief
-from orthonav.localizer.plan import DEFAULT_PLAN, Budget, ClearMargin, Search, SearchPlan
+from orthonav.localizer.plan import DEFAULT_PLAN, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import looks_aside, off_nadir_deg
 from orthonav.localizer.relief import LevelTerrain, Relief
 from orthonav.localizer.relief_camera import CameraFound
+from orthonav.localizer.view_search import ViewSearch
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.terrain import TerrainLayer
-from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
-from orthonav.register.pose import Pose, rotation
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.register.pose import Pose
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
-from orthonav.register.search import Candidate, search
-from orthonav.search.exact import rows_within
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +154,12 @@ class RegistrationLocalizer:
             prepared = replace(prepared, prior=pose_prior)
         if self.relief is not None:
             prepared = replace(prepared, prior=self.relief.expected(prepared))
-        if prior is not None and not self._touches_map(prior, prepared):
+        candidates = self._candidates(prepared, prior)
+        if not candidates.touches_map:
             outside = NoFix("outside_map", "the map does not reach to where the prior says")
             return RegisteredView(prepared, outside)
         ground = self.on_ground(prepared)
-        found = self.best(prepared, prior, ground)
+        found = ViewSearch(candidates, ground, self.confidence).best()
         if found is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
@@ -171,105 +172,15 @@ class RegistrationLocalizer:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
         return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
 
-    def best(
-        self, view: PreparedView, prior: Prior | None, ground: ViewOnLevelGround | None = None
-    ) -> Registered | None:
-        """The best place after all searches that had to be run; None where nothing was found.
+    def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
+        """The best place after all searches that had to be run; None where nothing was found."""
+        search = ViewSearch(self._candidates(view, prior), self.on_ground(view), self.confidence)
+        return search.best()
 
-        `ground`: the view on the ground of the map; None: made here.
-        """
-        ground = ground or self.on_ground(view)
-        budget = Budget(self.plan.budget_ms)
-        judged: list[Placed] = []
-        direct: list[Placed] = []
-        best: Registered | None = None
-        candidates = 0
-        enough = self.plan.clear
-
-        def finished(judged: list[Placed], finer: int = 0) -> Registered:
-            made = view.templates, view.levels, judged, view.prior, candidates, ground.finish
-            if not finer:
-                return self.registrar.finished(*made, direct)
-            return self.registrar.finished(*made, direct, ground.finer, finer)
-
-        rows = functools.cache(lambda: self._rows_near(view, prior))
-        searches = self.plan.searches(
-            view.levels,
-            view.prior,
-            lambda level, poses: self._fft_ms(view, prior, level, poses),
-            lambda: self._tiles(view, rows()),
+    def _candidates(self, view: PreparedView, prior: Prior | None) -> ViewCandidates:
+        return ViewCandidates(
+            view, prior, self.sheet, self.registrar, self.propose, self.plan, self._pool
         )
-        for each in takewhile(lambda each: budget.allows(each.cost_ms), searches):
-            if early := self._found_early(view, ground, judged, each.cost_ms, enough, finished):
-                return early
-            if each.from_tiles and self.propose is not None:
-                found = self._from_tiles(view, prior, each, rows(), self.propose)
-            else:
-                found = self._searched(view, prior, each)
-            if each.level < view.levels.look:
-                direct = self.registrar.direct(view.templates, view.levels, found)
-            else:
-                judged += self.registrar.judged(
-                    view.templates, view.levels, found, each.level, view.prior, judged
-                )
-            candidates += len(found)
-            best = None
-            enough = self.plan.enough(each, view.levels)
-            if judged and self._seems_clear(view, judged, enough):
-                best = finished(judged)
-                # Candidates from tiles are not all places: their rivals alone prove too little.
-                proven = not each.from_tiles or self._is_proven(best)
-                if proven and self._is_clear(best, enough):
-                    return best
-        return self._concluded(view, ground, judged, best, budget, finished) if judged else None
-
-    def _concluded(
-        self,
-        view: PreparedView,
-        ground: ViewOnLevelGround,
-        judged: list[Placed],
-        best: Registered | None,
-        budget: Budget,
-        finished: Callable[..., Registered],
-    ) -> Registered:
-        """The best place after all searches, none of which ended with one that stands out.
-
-        `best`: what is known of it; None: not finished yet.
-        """
-        if best is None or self.relief is not None:
-            if budget.allows(0.0):
-                judged = ground.placed_on_terrain(judged, self.plan.terrain_candidates)
-            best = finished(judged)
-        for kept, cost_ms in self.plan.finer if view.levels.final > 0 else ():
-            if self._is_proven(best) or not budget.allows(cost_ms):
-                break
-            best = finished(judged, kept)
-        return replace(best, cut_short=budget.cut_short)
-
-    def _found_early(
-        self,
-        view: PreparedView,
-        ground: ViewOnLevelGround,
-        judged: list[Placed],
-        cost_ms: float,
-        enough: ClearMargin,
-        finished: Callable[..., Registered],
-    ) -> Registered | None:
-        """The best place so far, if it stands out on the terrain and no search could change that.
-
-        `cost_ms`: that of the next search. None where trials on the terrain cost more, on level
-        ground, where the place would have ended the search before, and with a budget of time,
-        which does not know the cost of this.
-        """
-        cheap = cost_ms <= self.plan.terrain_trials * self.plan.terrain_trial_ms
-        if cheap or ground.is_level or not judged or math.isfinite(self.plan.budget_ms):
-            return None
-        on_terrain = ground.placed_on_terrain(judged, self.plan.terrain_trials)
-        best, rival = self.registrar.standing(view.templates, on_terrain, view.prior)
-        if best <= max(enough.look_ratio * rival, self._chances.look):
-            return None
-        found = finished(on_terrain)
-        return found if self._is_clear(found, enough) and self._is_proven(found) else None
 
     def on_ground(self, view: PreparedView) -> ViewOnLevelGround:
         """A view on the terrain of the map, where it has one."""
@@ -279,127 +190,6 @@ class RegistrationLocalizer:
             level = Relief(LevelTerrain(), self.grid)
             return ViewOverRelief(level, self.registrar, view)
         return ViewOnLevelGround(self.registrar, view)
-
-    def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
-        """Whether the best candidate may end the search, before the cost of finishing it."""
-        best, rival = self.registrar.standing(view.templates, judged, view.prior)
-        return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
-
-    def _is_clear(self, best: Registered, enough: ClearMargin) -> bool:
-        """Whether a finished place ends the search."""
-        if best.score <= enough.strength * self._chances.total:
-            return False
-        return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio
-
-    def _is_proven(self, best: Registered) -> bool:
-        """Whether a place is so confident that no further search could change the verdict."""
-        if self.confidence is None:
-            return False
-        return self.confidence(best.evidence()) > 1 - self.plan.doubt
-
-    @property
-    def _chances(self) -> Chances:
-        return self.confidence.chances if self.confidence else USUAL_CHANCES
-
-    def _rows_near(self, view: PreparedView, prior: Prior | None) -> NDArray[np.intp] | None:
-        """Rows of the tiles that the prior allows, None for all."""
-        if prior is None or self.propose is None:
-            return None
-        x, y = self._prior_px(prior, view)
-        grid = self.grid
-        centre = np.array([grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m])
-        reach_m = self._reach_px(view, prior) * grid.gsd_m + grid.stride_m
-        return rows_within(self.propose.centres_en_m, centre, reach_m)
-
-    def _tiles(self, view: PreparedView, rows: NDArray[np.intp] | None) -> tuple[int, int]:
-        """Number of tiles that can be compared with a view, and of numbers in their embeddings."""
-        if self.propose is None or not self.propose.fits(view.side_px, self.plan.view_tiles):
-            return 0, 0
-        count = len(self.propose.centres_en_m) if rows is None else len(rows)
-        return count, self.propose.embedder.dims
-
-    def _fft_ms(self, view: PreparedView, prior: Prior | None, level: int, poses: int) -> float:
-        """Estimated cost of an FFT search at a level, of the sheet or of what the prior allows."""
-        rows, cols = self.registrar.reference.shape(level)
-        if prior is not None:
-            across = 2 * self._reach_px(view, prior) / 2**level
-            rows, cols = round(min(rows, across)), round(min(cols, across))
-        side = view.side_px / 2**level
-        if prior is not None or min(rows, cols) < 3 * side:
-            rows, cols = round(rows + side), round(cols + side)
-        return self.plan.fft_ms(poses, rows, cols)
-
-    def _from_tiles(
-        self,
-        view: PreparedView,
-        prior: Prior | None,
-        run: Search,
-        rows: NDArray[np.intp] | None,
-        propose: TileProposer,
-    ) -> list[Candidate]:
-        """Candidates from the most similar tiles, each at its best place near by, best first."""
-        plan, stride_px = self.plan, self.grid.stride_m / self.grid.gsd_m
-        found = propose.candidates(
-            view.rectified_at(0), run.poses, rows, run.candidates, plan.tile_apart_strides
-        )
-        reach_px = plan.tile_reach_strides * stride_px
-        found = self.registrar.nearby(view.templates, view.levels, found, reach_px)
-        if prior is None:
-            return found
-        x, y = self._prior_px(prior, view)
-        most_px = self._reach_px(view, prior)
-        return [
-            each
-            for each in found
-            if max(abs(each.pose.x_px - x), abs(each.pose.y_px - y)) <= most_px
-        ]
-
-    def _searched(self, view: PreparedView, prior: Prior | None, run: Search) -> list[Candidate]:
-        """Candidates of one FFT search, best first."""
-        recipe = view.levels.recipe(run.level)
-        if prior is None:
-            window = self.registrar.whole_window(run.level, recipe, view.side_px)
-        else:
-            window = self.registrar.part_window(
-                run.level,
-                recipe,
-                view.side_px,
-                self._prior_px(prior, view),
-                self._reach_px(view, prior),
-            )
-        template = view.templates.at(run.level, recipe)
-        scales = view.prior.scale_map
-        # Every thread has memory for a whole window.
-        fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
-        pool = self._pool if fits else None
-        found = search(template, window, run.poses, run.candidates, scales, pool)
-        least = self.plan.candidate_share
-        worth = sum(each.score >= least * found[0].score for each in found)
-        return found[: max(worth, self.plan.min_candidates)]
-
-    def _prior_px(self, prior: Prior, view: PreparedView) -> tuple[float, float]:
-        """The middle of the view as the prior expects it, x and y at level 0."""
-        east, north = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
-        x = (float(east) - self.grid.west_m) / self.grid.gsd_m
-        y = (self.grid.north_m - float(north)) / self.grid.gsd_m
-        if view.prior.turn_rad is None:
-            return x, y
-        moved = rotation(view.prior.turn_rad) @ view.camera_px
-        return x - float(moved[0]), y - float(moved[1])
-
-    def _reach_px(self, view: PreparedView, prior: Prior) -> float:
-        """How far from there the middle of the view may lie, in pixels of level 0."""
-        tilt = float(np.hypot(*view.camera_px))
-        turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
-        reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
-        return float(reach + tilt * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
-
-    def _touches_map(self, prior: Prior, view: PreparedView) -> bool:
-        """Whether any of the map lies where the prior allows the view to be."""
-        x, y = self._prior_px(prior, view)
-        reach = self._reach_px(view, prior)
-        rows, cols = self.registrar.reference.shape(0)
-        return -reach < x < cols + reach and -reach < y < rows + reach
 
     def _fix(
         self,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthonav.register.evidence import CHANNELS, FINE, EvidenceRecipe, evidence
 
 Array = NDArray[np.float32]
-WHOLE_LEVEL_PX = 1_500_000
+WHOLE_LEVEL_PX = 2_000_000
 """Levels of up to so many pixels are made ready whole, once (16 bytes each)."""
 
 

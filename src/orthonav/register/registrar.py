@@ -26,7 +26,7 @@ from orthonav.register.template import ViewTemplates
 LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across
 (docs/decisions/registration.md, 2)."""
-KEPT_TO_LOOK = 24
+KEPT_TO_LOOK = 64
 """Candidates that pass from the coarse level to the judged one, at most
 (docs/decisions/registration.md, 12)."""
 KEPT_TO_FINISH = 3
@@ -286,11 +286,14 @@ class Registrar:
             window = whole or self.part_window(levels.coarse, recipe, side_px, place, around_px)
             return best_near(template, window, found.pose, reach_px)
 
-        kept: list[Candidate] = []
-        same_px = side_px * SAME_PLACE_SHARE
-        for each in sorted(self._shared(moved, candidates), key=lambda each: -each.score):
-            if all(each.pose.distance_px(other.pose) > same_px for other in kept):
+        found = sorted(self._shared(moved, candidates), key=lambda each: -each.score)
+        places = np.array([complex(each.pose.x_px, each.pose.y_px) for each in found])
+        free = np.ones(len(found), np.bool_)
+        kept = []
+        for number, each in enumerate(found):
+            if free[number]:
                 kept.append(each)
+                free &= abs(places - places[number]) > side_px * SAME_PLACE_SHARE
         return kept
 
     def judged(
@@ -371,15 +374,15 @@ class Registrar:
         candidates: int,
         finish: Callable[[Placed], Finished] | None = None,
         direct: Sequence[Placed] = (),
-        finer: Callable[[Placed], ViewTemplates] | None = None,
+        finer: Callable[[Placed], float] | None = None,
         kept: int = KEPT_TO_FINISH,
     ) -> Registered:
         """The best of the judged candidates, of one or more searches of `candidates` in all.
 
         The best `kept` of them are refined at the final level, and all `direct` ones, which were
-        found there; each by `finish` (None: `at_final`). With `finer`, the templates of a finalist
-        one level finer, the best of those are compared at that level as well. `judged` must not be
-        empty.
+        found there; each by `finish` (None: `at_final`). With `finer`, the score of a finalist one
+        level finer, the best `KEPT_TO_FINEST` of those are compared at that level as well. `judged`
+        must not be empty.
         """
         judged = _ranked(judged, prior)
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
@@ -390,7 +393,11 @@ class Registrar:
             totals.append(_Finalist(made.total - prior.cost(made.placed.pose), made))
         totals.sort(key=lambda each: -each.score)
         if finer:
-            totals = self._compared_finer(totals[:KEPT_TO_FINEST], finer)
+            compared = [
+                each._replace(fine=each.score + finer(each.made.placed))
+                for each in totals[:KEPT_TO_FINEST]
+            ]
+            totals = sorted(compared, key=lambda each: -each.fine)
         first = totals[0]
         best = first.made.placed
         rivals = [each for each in totals if apart_px(each.made.placed, best) > exclusion]
@@ -398,7 +405,9 @@ class Registrar:
         nearest = min(judged, key=lambda each: apart_px(each, best))
         others = [each for each in judged if apart_px(each, best) > exclusion]
         looks = [(each.score, each) for each in others]
-        looks += [(each.made.look, each.made.placed) for each in rivals if each.made.look]
+        looks += [
+            (each.made.look, each.made.placed) for each in rivals if each.made.look is not None
+        ]
         look = first.made.look
         cost = prior.cost(nearest.pose) if look is None else prior.cost(best.pose)
         return Registered(
@@ -415,17 +424,6 @@ class Registrar:
                 first.made.templates, levels, first.score + prior.cost(best.pose), best
             ),
         )
-
-    def _compared_finer(
-        self, totals: Sequence["_Finalist"], finer: Callable[[Placed], ViewTemplates]
-    ) -> list["_Finalist"]:
-        """Finalists with their score at one level more, best first."""
-        found = []
-        for each in totals:
-            made = finer(each.made.placed)
-            score = Refiner(made.at(made.finest), self.reference).place(each.made.placed.pose, 2)
-            found.append(each._replace(fine=each.score + score.score))
-        return sorted(found, key=lambda each: -each.fine)
 
     def with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
         """A placed view once more, at the final level, with its covariance."""

@@ -1,0 +1,141 @@
+"""The search for one view: runs the searches of the plan until one place stands out.
+
+`plan` decides which searches to run, `candidates` runs them, the registrar judges what they find.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from orthonav.confidence.registered import USUAL_CHANCES, Chances, RegisteredConfidence
+from orthonav.localizer.candidates import ViewCandidates
+from orthonav.localizer.over_relief import ViewOnLevelGround
+from orthonav.localizer.plan import Budget, ClearMargin, Search
+from orthonav.register.refine import Placed
+from orthonav.register.registrar import KEPT_TO_FINISH, Registered
+
+
+class ViewSearch:
+    """The search for one view. To be run once."""
+
+    def __init__(
+        self,
+        candidates: ViewCandidates,
+        ground: ViewOnLevelGround,
+        confidence: RegisteredConfidence | None,
+    ) -> None:
+        """`confidence`: None before it is learnt; no place is proven then."""
+        self._candidates, self._ground, self._confidence = candidates, ground, confidence
+        self._view, self._plan = candidates.view, candidates.plan
+        self._registrar, self._levels = candidates.registrar, candidates.view.levels
+        self._budget = Budget(self._plan.budget_ms)
+        self._judged: list[Placed] = []
+        self._direct: list[Placed] = []
+        self._count = 0
+
+    def best(self) -> Registered | None:
+        """The best place after all searches that had to be run; None where nothing was found."""
+        searches = self._plan.searches(
+            self._levels, self._view.prior, self._candidates.fft_ms, self._candidates.tiles
+        )
+        for each in searches:
+            if early := self._proven_before(each.cost_ms):
+                return early
+            if not self._budget.allows(each.cost_ms):
+                break
+            self._run(each)
+            if clear := self._clear_after(each):
+                return clear
+        return self._concluded() if self._judged else None
+
+    def _run(self, each: Search) -> None:
+        """Run a search and judge what it finds."""
+        view = self._view
+        found = self._candidates.found(each)
+        self._count += len(found)
+        if each.level < self._levels.look:
+            self._direct = self._registrar.direct(view.templates, self._levels, found)
+            return
+        self._judged += self._registrar.judged(
+            view.templates, self._levels, found, each.level, view.prior, self._judged
+        )
+
+    def _clear_after(self, run: Search) -> Registered | None:
+        """The best place so far, if it stands out so far that the search ends with it."""
+        margin = self._plan.enough(run, self._levels)
+        if not self._judged or not self._seems_clear(margin):
+            return None
+        found = self._finished(self._judged)
+        # Candidates from tiles are not all places: their rivals alone prove too little.
+        proven = not run.from_tiles or self._is_proven(found)
+        return found if proven and self._is_clear(found, margin) else None
+
+    def _proven_before(self, cost_ms: float) -> Registered | None:
+        """The best place so far, if a trial proves it that costs less than the next search.
+
+        `cost_ms`: that of the next search. The best few candidates are placed on the terrain, where
+        there is one, and compared one level finer.
+        """
+        plan, ground = self._plan, self._ground
+        trial_ms = plan.trial_ms if ground.is_level else plan.terrain_trial_ms
+        if not self._judged or cost_ms <= trial_ms or not self._budget.allows(trial_ms):
+            return None
+        placed = ground.placed_on_terrain(self._judged, plan.trials)
+        best, _ = self._registrar.standing(self._view.templates, placed, self._view.prior)
+        if best <= self._chances.look:
+            return None
+        found = self._finished(placed, plan.trials, finer=True)
+        return found if self._is_proven(found) else None
+
+    def _concluded(self) -> Registered:
+        """The best place after all searches, none of which ended with one that stands out.
+
+        While it is not proven, more candidates are finished and compared one level finer.
+        """
+        plan, judged = self._plan, self._judged
+        if self._budget.allows(0.0):
+            judged = self._ground.placed_on_terrain(judged, plan.terrain_candidates)
+        found = self._finished(judged)
+        for kept, cost_ms in plan.finer if self._levels.final > 0 else ():
+            if self._is_proven(found) or not self._budget.allows(cost_ms):
+                break
+            found = self._finished(judged, kept, finer=True)
+        return replace(found, cut_short=self._budget.cut_short)
+
+    def _finished(
+        self, judged: Sequence[Placed], kept: int = KEPT_TO_FINISH, *, finer: bool = False
+    ) -> Registered:
+        """The best of candidates, of which `kept` are finished; see `Registrar.finished`."""
+        view, ground = self._view, self._ground
+        return self._registrar.finished(
+            view.templates,
+            self._levels,
+            judged,
+            view.prior,
+            self._count,
+            finish=ground.finish,
+            direct=self._direct,
+            finer=ground.finer_score if finer and self._levels.final > 0 else None,
+            kept=kept,
+        )
+
+    def _seems_clear(self, margin: ClearMargin) -> bool:
+        """Whether the best candidate may end the search, before the cost of finishing it."""
+        view = self._view
+        best, rival = self._registrar.standing(view.templates, self._judged, view.prior)
+        return best > margin.strength * self._chances.look and best > margin.look_ratio * rival
+
+    def _is_clear(self, best: Registered, margin: ClearMargin) -> bool:
+        """Whether a finished place ends the search."""
+        if best.score <= margin.strength * self._chances.total:
+            return False
+        return best.look_ratio > margin.look_ratio and best.peak_ratio > margin.peak_ratio
+
+    def _is_proven(self, best: Registered) -> bool:
+        """Whether a place is so confident that no further search could change the verdict."""
+        if self._confidence is None:
+            return False
+        return self._confidence(best.evidence()) > 1 - self._plan.doubt
+
+    @property
+    def _chances(self) -> Chances:
+        return self._confidence.chances if self._confidence else USUAL_CHANCES
