@@ -188,7 +188,7 @@ def test_sheets_without_imagery_are_empty(make_ortho, tmp_path):
 
 def test_other_versions_are_refused(ortho, tmp_path):
     task = plan_sheets(str(tmp_path), RECIPE, Mosaic.open([ortho]), [ortho])[0]
-    other = replace(task, made_by={**task.made_by, "numpy": "1.0"})
+    other = replace(task, sheet=replace(task.sheet, made_by={**versions(), "numpy": "1.0"}))
     with pytest.raises(WorkerError, match=rf"numpy {np.__version__}, not 1.0"):
         build_sheet(other)
 
@@ -285,7 +285,7 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
 
     def planned(**area):
         found = plan_sheets("atlas", RECIPE, mosaic, [ortho], **area)
-        return tuple(task.sheet for task in found)
+        return tuple(task.sheet.id for task in found)
 
     west, south, east, north = RECIPE.sheets.bounds_deg(names[0])
     assert planned() == names
@@ -311,8 +311,8 @@ def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
         data.transform = Affine(1, 0, 702_000, 0, -1, 6_600_000)
     both = plan_sheets("atlas", RECIPE, Mosaic.open([near, far]), [near, far])
     alone = plan_sheets("atlas", RECIPE, Mosaic.open([near]), [near])
-    by_name = {task.sheet: task for task in both}
-    assert [by_name[task.sheet] for task in alone] == alone
+    by_name = {task.sheet.id: task for task in both}
+    assert [by_name[task.sheet.id] for task in alone] == alone
     assert {task.orthos for task in both} == {(near,), (far,)}
 
 

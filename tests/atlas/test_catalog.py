@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.atlas.catalog import Atlas, SheetDescription, copy_sheets
+from orthonav.atlas.catalog import Atlas, copy_sheets
 from orthonav.atlas.integrity import check_atlas
 from orthonav.atlas.item import Sheet, StoredFile, canonical, read_item
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
@@ -28,7 +28,7 @@ EAST = RECIPE.sheets.name_at(46.6, 2.1)
 
 def described(sheet=HERE, request="request 1", **others):
     """The description of a sheet."""
-    made = SheetDescription(
+    made = Sheet(
         id=sheet,
         bounds_deg=RECIPE.sheets.bounds_deg(sheet),
         gsd_m=1.0,
@@ -353,7 +353,8 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeyp
 MANY = """
 import sys
 from pathlib import Path
-from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.item import Sheet
 
 url, files, number = sys.argv[1:]
 atlas = Atlas.open_or_create(url, __import__("orthonav.atlas.recipe").atlas.recipe.AtlasRecipe(1.0))
@@ -362,7 +363,7 @@ for step in range(6):
     path = Path(files, sheet)
     path.write_text(f"map of {sheet}")
     bounds = atlas.recipe.sheets.bounds_deg(sheet)
-    description = SheetDescription(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
+    description = Sheet(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
     atlas.put({"map": path}, description)
 """
 
@@ -433,7 +434,7 @@ def test_items_are_stac(near, files):
     validator = JsonSchemaSTACValidator()  # it brings the schemas of 1.1, which asks for no less
     for plain, kind in (
         (sheet.to_item(), STACObjectType.ITEM),
-        (Sheet.of(described(dates=("2020",)), 1, sheet.files).to_item(), STACObjectType.ITEM),
+        (described(dates=("2020",)).stored(1, sheet.files).to_item(), STACObjectType.ITEM),
         (json.loads(near.store.read("atlas.json")), STACObjectType.COLLECTION),
     ):
         assert validator.validate_core({**plain, "stac_version": "1.1.0"}, kind, "1.1.0")
@@ -461,7 +462,7 @@ def test_items_are_stac(near, files):
 )
 def test_dates_become_times_of_stac(dates, times):
     asset = StoredFile(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
-    sheet = Sheet.of(described(dates=dates), 1, {"map": asset})
+    sheet = described(dates=dates).stored(1, {"map": asset})
     found = {k: v for k, v in sheet.to_item()["properties"].items() if "date" in k}
     if isinstance(times, tuple):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}

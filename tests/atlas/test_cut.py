@@ -9,9 +9,10 @@ import pytest
 from safetensors import SafetensorError
 
 from helpers import textured, write_dem
-from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_shown
 from orthonav.atlas.cut import cut_in_memory, cut_map
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.stored import embedder_of
@@ -97,7 +98,7 @@ def put(atlas, name, path):
     bounds = RECIPE.sheets.bounds_deg(name)
     dates = tuple(str(each["date"]) for each in manifest.imagery)
     facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
-    return atlas.put({"map": path}, SheetDescription(name, *facts, "asked", {"orthonav": "test"}))
+    return atlas.put({"map": path}, Sheet(name, *facts, "asked", {"orthonav": "test"}))
 
 
 @pytest.fixture

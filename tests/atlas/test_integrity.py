@@ -11,7 +11,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.index_manifest import IndexManifest, Part, ShardInfo
 from orthonav.atlas.integrity import check_atlas
 from orthonav.atlas.item import Sheet, StoredFile, canonical
@@ -32,9 +32,7 @@ def described(sheet, tiles=7, dates=("2020-06-14",)):
     """The description of a sheet."""
     imagery = ({"name": "BD ORTHO", "attribution": "IGN", "licence": "Etalab-2.0"},)
     bounds = RECIPE.sheets.bounds_deg(sheet)
-    return SheetDescription(
-        sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"}
-    )
+    return Sheet(sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"})
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -125,7 +123,7 @@ def second_revision(atlas, missing=False):
     old = atlas.sheets()[HERE]
     asset = replace(old.files["map"], sha256="ab" * 32, size_bytes=3)
     asset = replace(asset, name=f"sheets/{HERE}.abababababab.onav")
-    new = Sheet.of(described(HERE), 2, {"map": asset})
+    new = described(HERE).stored(2, {"map": asset})
     if not missing:
         atlas.store.write(asset.name, b"new")
     atlas.store.write(f"items/{new.item_name}", canonical(new.to_item()))
@@ -163,7 +161,7 @@ def test_files_of_unreadable_items_stay(near):
 
 def test_a_sheet_of_another_lattice_is_found(near):
     description = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
-    sheet = Sheet.of(description, 2, description.files)
+    sheet = description.stored(2, description.files)
     near.store.write(f"items/{sheet.item_name}", canonical(sheet.to_item()))
     kinds = [kind for kind, _ in found(near)]
     assert kinds == ["second revision", "damaged item"]

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.atlas.build_report import BuildReport, SheetResult
-from orthonav.atlas.catalog import CATALOG, Atlas, SheetDescription
+from orthonav.atlas.catalog import CATALOG, Atlas
 from orthonav.atlas.cluster import Failure, TaskRunner
 from orthonav.atlas.coarse import write_coarse
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
 from orthonav.atlas.scratch import scratch_folder
 from orthonav.atlas.sheet_tasks import (
@@ -116,9 +117,9 @@ def build_atlas(
     result = BuildReport(atlas.url, len(tasks), started_s)
     missing = []
     for task in tasks:
-        if task.sheet in known and is_same(task, known):
-            area_km2 = known[task.sheet].area_km2
-            result.add(task.sheet, SheetResult(task.sheet, "unchanged", area_km2=area_km2))
+        name = task.sheet.id
+        if name in known and is_same(task, known):
+            result.add(name, SheetResult(name, "unchanged", area_km2=known[name].area_km2))
         else:
             missing.append(task)
     unchanged = f", {result.done} are there already" if result.done else ""
@@ -169,35 +170,37 @@ def build_sheet(task: SheetTask) -> SheetResult:
     sees other imagery, `ImageryError`, `OutputError`, `StorageError`.
     """
     wall_s, cpu_s = time.perf_counter(), time.process_time()
-    if differences := version_differences(task.made_by, versions()):
+    wanted = task.sheet
+    if differences := version_differences(wanted.made_by, versions()):
         raise WorkerError(_other_versions("this worker", differences))
-    mosaic = Imagery(Mosaic.open(task.orthos)).under(task.bounds_deg, margin_m(task.recipe))
-    wanted = request_digest(task.recipe, mosaic, task.made_by, task.dem, task.dem_datum)
-    if wanted != task.request:
+    mosaic = Imagery(Mosaic.open(task.orthos)).under(wanted.bounds_deg, margin_m(task.recipe))
+    found = request_digest(task.recipe, mosaic, wanted.made_by, task.dem, task.dem_datum)
+    if found != wanted.request:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with scratch_folder() as folder:
-        tiles, area_km2, size_bytes = _built(task, mosaic, folder)
+        built = _built(task, mosaic, folder)
     return SheetResult(
-        task.sheet,
-        "built" if tiles else "empty",
+        wanted.id,
+        "empty" if built is None else "built",
         cpu_s=time.process_time() - cpu_s,
         wall_s=time.perf_counter() - wall_s,
-        size_bytes=size_bytes,
-        area_km2=area_km2,
-        tiles=tiles,
+        size_bytes=built.size_bytes if built else 0,
+        area_km2=built.area_km2 if built else 0.0,
+        tiles=built.tiles if built else 0,
         peak_bytes=_peak_bytes(),
     )
 
 
-def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, int]:
-    """Tiles, km2 and bytes of a sheet that is now in the atlas; zeros where it has no imagery."""
+def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
+    """The sheet, which is now in the atlas; None where it has no imagery."""
     recipe = asdict(task.recipe)
     del recipe["sheet_km"], recipe["coarse"]
-    files = {"map": folder / f"{task.sheet}.onav"}
+    name, bounds_deg = task.sheet.id, task.sheet.bounds_deg
+    files = {"map": folder / f"{name}.onav"}
     request = BuildRequest(
         orthos=task.orthos,
         out=files["map"],
-        bounds_deg=task.bounds_deg,
+        bounds_deg=bounds_deg,
         workers=1,
         dem=task.dem,
         dem_datum=task.dem_datum,
@@ -206,27 +209,15 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, i
         **recipe,
     )
     try:
-        manifest = build_map(request, announce=log.debug).manifest
+        info = build_map(request, announce=log.debug).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
-        log.info("%s is empty: %s", task.sheet, error)
-        return 0, 0.0, 0
+        log.info("%s is empty: %s", name, error)
+        return None
     if task.recipe.coarse is not None:
-        files["coarse"] = folder / f"{task.sheet}.safetensors"
-        write_coarse(mosaic, task.bounds_deg, task.recipe.coarse, files["coarse"])
-    info = manifest.sheets[0]
-    described = SheetDescription(
-        id=task.sheet,
-        bounds_deg=task.bounds_deg,
-        gsd_m=task.recipe.gsd_m,
-        tiles=info.tiles,
-        area_km2=info.area_km2,
-        dates=task.dates,
-        imagery=task.imagery,
-        request=task.request,
-        made_by=task.made_by,
-    )
-    sheet = Atlas.open(task.atlas).put(files, described)
-    return info.tiles, info.area_km2, sheet.size_bytes
+        files["coarse"] = folder / f"{name}.safetensors"
+        write_coarse(mosaic, bounds_deg, task.recipe.coarse, files["coarse"])
+    described = replace(task.sheet, tiles=info.tiles, area_km2=info.area_km2)
+    return Atlas.open(task.atlas).put(files, described)
 
 
 def _build_sheets(
@@ -243,9 +234,9 @@ def _build_sheets(
     gpu = recipe.method.partition(":")[0] in LEARNT
     finished = runner.run(build_sheet, tasks, gpu=gpu)
     for task, made in finished:
-        result.add(task.sheet, made)
+        result.add(task.sheet.id, made)
         if isinstance(made, Failure):
-            log.info("sheet %s failed: %s: %s", task.sheet, made.kind, made.text)
+            log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
             log.debug("%s", made.trace)
             not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
         else:

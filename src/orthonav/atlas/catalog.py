@@ -14,7 +14,6 @@ from orthonav.atlas.item import (
     MAX_ITEM_BYTES,
     STAC_VERSION,
     Sheet,
-    SheetDescription,
     StoredFile,
     canonical,
     file_name,
@@ -27,8 +26,6 @@ from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AreaError, AtlasError, MissingFileError
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Extent
-
-__all__ = ["Atlas", "Sheet", "SheetDescription", "StoredFile", "copy_sheets"]
 
 CATALOG = "atlas.json"
 _SAME_PLACE_DEG = 1e-9
@@ -118,7 +115,7 @@ class Atlas:
         west, south, east, north = zip(*boxes, strict=True)
         return min(west), min(south), max(east), max(north)
 
-    def put(self, files: Mapping[str, Path], described: SheetDescription) -> Sheet:
+    def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
         """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`.
 
         Nothing is written where the same files of the same request are there already. Safe with
@@ -133,7 +130,7 @@ class Atlas:
             sheet = before
         else:
             revision = 1 + max((_revision(each) for each in there), default=0)
-            sheet = Sheet.of(described, revision, stored)
+            sheet = described.stored(revision, stored)
         self.require_place(sheet)
         self._upload(sheet, files, _named_by(there))
         if sheet is not before:

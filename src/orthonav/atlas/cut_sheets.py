@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
-from orthonav.atlas.catalog import Atlas, Sheet
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.pooled_confidence import pooled_registered, pooled_tiles
 from orthonav.atlas.warp import SheetSource
 from orthonav.confidence.logistic import LogisticConfidence

@@ -38,26 +38,17 @@ _POINTS = 17
 class SheetTask:
     """A sheet to be built, with all that a worker on another machine needs.
 
-    `sheet`: name.
-    `bounds_deg`: its box in the lattice: west, south, east, north.
+    `sheet`: its description, without tiles and area yet.
     `atlas`: folder or URL of the atlas.
     `orthos`: the files and folders that may show it.
     `recipe`: how it is made.
-    `request`: digest of what the sheet depends on (`request_digest`).
-    `imagery`, `dates`: description of the orthophotos for the catalogue.
-    `made_by`: the versions that must make it (`versions`).
     `dem`, `dem_datum`: terrain model and what its heights count from, as for a map.
     """
 
-    sheet: str
-    bounds_deg: Extent
+    sheet: Sheet
     atlas: str
     orthos: tuple[Path, ...]
     recipe: AtlasRecipe
-    request: str
-    imagery: tuple[Mapping[str, Any], ...]
-    dates: tuple[str, ...]
-    made_by: Mapping[str, str]
     dem: Path | None = None
     dem_datum: str | None = None
 
@@ -109,21 +100,19 @@ def plan_sheets(
         box_deg = recipe.sheets.bounds_deg(name)
         _require_possible(recipe, box_deg, mosaic.gsd_m)
         part = imagery.under(box_deg, margin_m(recipe))
-        tasks.append(
-            SheetTask(
-                sheet=name,
-                bounds_deg=box_deg,
-                atlas=url,
-                orthos=_orthos_of(orthos, mosaic, part),
-                recipe=recipe,
-                request=request_digest(recipe, part, made_by, dem, dem_datum),
-                imagery=part.describe(),
-                dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
-                made_by=made_by,
-                dem=dem,
-                dem_datum=dem_datum,
-            )
+        sheet = Sheet(
+            id=name,
+            bounds_deg=box_deg,
+            gsd_m=recipe.gsd_m,
+            tiles=0,
+            area_km2=0.0,
+            dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
+            imagery=part.describe(),
+            request=request_digest(recipe, part, made_by, dem, dem_datum),
+            made_by=made_by,
         )
+        needed = _orthos_of(orthos, mosaic, part)
+        tasks.append(SheetTask(sheet, url, needed, recipe, dem, dem_datum))
     return tasks
 
 
@@ -280,18 +269,18 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
     """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
-    other = [task for task in tasks if not is_same(task, known)]
+    other = [task.sheet for task in tasks if not is_same(task, known)]
     if not other:
         return
     why = sorted(
         {
             line
-            for task in other
-            for line in version_differences(task.made_by, known[task.sheet].made_by)
+            for sheet in other
+            for line in version_differences(sheet.made_by, known[sheet.id].made_by)
             or ["their imagery has changed"]
         }
     )
-    named = ", ".join(task.sheet for task in other[:5]) + (", .." if len(other) > 5 else "")
+    named = ", ".join(sheet.id for sheet in other[:5]) + (", .." if len(other) > 5 else "")
     raise AtlasError(
         f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
         f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
@@ -300,4 +289,5 @@ def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None
 
 def is_same(task: SheetTask, known: Mapping[str, Sheet]) -> bool:
     """Whether the sheet of a task is not in the atlas, or is there as the task would make it."""
-    return task.sheet not in known or known[task.sheet].request == task.request
+    there = known.get(task.sheet.id)
+    return there is None or there.request == task.sheet.request
