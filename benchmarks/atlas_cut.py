@@ -117,7 +117,7 @@ def _filled(folder: Path, base: Path, km: float) -> Path:
     if (folder / "complete").is_file():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
-    atlas, opened = Atlas.create(str(folder), _recipe()), open_map(base)
+    atlas, opened = Atlas.open_or_create(str(folder), _recipe()), open_map(base)
     area = Area.from_route(route_of(km), BAND_M)
     sheets = _recipe().sheets
     for name in sheets.over(box_deg(area, 500.0)):

@@ -13,6 +13,13 @@ RECIPE = {
 COARSE = (5.0, 64, 0.875)
 
 
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """Folder of the copies of remote files."""
+    monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
 @pytest.fixture(scope="module")
 def atlas(area, made_once):
     """An atlas of the first date with its index; read-only."""

@@ -64,7 +64,7 @@ def names(middle):
 def folder(ortho, names, middle, tmp_path_factory):
     """An atlas of them, not to be changed."""
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
-    atlas = Atlas.create(str(folder), RECIPE)
+    atlas = Atlas.open_or_create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
         patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
@@ -288,7 +288,7 @@ def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
         cut_map(atlas, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
-    empty = Atlas.create(str(tmp_path / "empty"), RECIPE)
+    empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
     with pytest.raises(AreaError, match="no sheets yet"):
         cut_map(empty, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
 

@@ -44,7 +44,7 @@ def place(request, tmp_path):
 
 def two_sheets(url, tmp_path):
     """An atlas of two sheets whose maps are none."""
-    atlas = Atlas.create(url, RECIPE, cache=tmp_path / "cache")
+    atlas = Atlas.open_or_create(url, RECIPE)
     for sheet in (HERE, EAST):
         (tmp_path / "file").write_text(f"map of {sheet}")
         atlas.put({"map": tmp_path / "file"}, described(sheet))
@@ -221,7 +221,7 @@ def real(map_path, tmp_path, place):
     """Function that puts a real map into an atlas of a recipe."""
 
     def make(recipe, tiles=None):
-        atlas = Atlas.create(place, recipe, cache=tmp_path / "cache")
+        atlas = Atlas.open_or_create(place, recipe)
         description = described(
             HERE, open_map(map_path).manifest.sheets[0].tiles if tiles is None else 1
         )
@@ -285,7 +285,7 @@ def test_info(near, capfd):
 def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, capfd):
     code, done = run(capfd, "info", tmp_path)
     assert code == 1 and done.err.startswith("orthonav: error: no atlas")
-    Atlas.create(tmp_path / "atlas", RECIPE)
+    Atlas.open_or_create(tmp_path / "atlas", RECIPE)
     code, done = run(capfd, "info", tmp_path / "atlas")
     assert code == 0 and "dates      unknown" in done.out and "sheets     0" in done.out
 
@@ -316,7 +316,7 @@ def test_add_and_retire(near, tmp_path, capfd):
     code, done = run(capfd, "retire", copy, HERE)
     assert code == 1 and "has no sheet" in done.err
     shutil.rmtree(copy)
-    Atlas.create(copy, replace(RECIPE, seed=1))
+    Atlas.open_or_create(copy, replace(RECIPE, seed=1))
     code, done = run(capfd, "add", copy, near.url)
     assert code == 1 and "seed: 1, not 0" in done.err
 

@@ -50,40 +50,26 @@ class Atlas:
         return self.store.url
 
     @classmethod
-    def open(cls, url: str | Path, *, cache: Path | None = None) -> "Atlas":
+    def open(cls, url: str | Path) -> "Atlas":
         """Open an atlas. Raises `AtlasError` where there is none, or it is not ours."""
-        store = Store(str(url), cache)
+        store = Store(str(url))
         if store.size(CATALOG) is None:
             raise AtlasError(f"no atlas: it has no {CATALOG}: {store}")
         return cls(store, _read_catalog(store))
 
     @classmethod
-    def create(cls, url: str | Path, recipe: AtlasRecipe, *, cache: Path | None = None) -> "Atlas":
-        """Create an atlas. Raises `AtlasError` where the folder holds one, or anything else."""
-        store = Store(str(url), cache)
-        if store.size(CATALOG) is not None:
-            raise AtlasError(f"there is an atlas already: {store}")
-        if not _is_free(store):
-            raise AtlasError(f"the folder holds other files; name another: {store}")
-        store.write(CATALOG, _catalog(recipe))
-        return cls.open(url, cache=cache).require_recipe(recipe)
-
-    @classmethod
-    def open_or_create(
-        cls, url: str | Path, recipe: AtlasRecipe, *, cache: Path | None = None
-    ) -> "Atlas":
+    def open_or_create(cls, url: str | Path, recipe: AtlasRecipe) -> "Atlas":
         """Open an atlas, or create it where there is none.
 
-        Raises `AtlasError` with the differences where it has another recipe.
+        Raises `AtlasError` with the differences where it has another recipe, and where the folder
+        holds other files.
         """
-        store = Store(str(url), cache)
-        if store.size(CATALOG) is None:
-            try:
-                return cls.create(url, recipe, cache=cache)
-            except AtlasError:
-                if store.size(CATALOG) is None:
-                    raise  # else another process has created it meanwhile
-        return cls.open(url, cache=cache).require_recipe(recipe)
+        store = Store(str(url))
+        if _is_free(store):
+            store.write(CATALOG, _catalog(recipe))
+        elif store.size(CATALOG) is None:
+            raise AtlasError(f"the folder holds other files; name another: {store}")
+        return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:
         """All sheets by name, sorted. Raises `AtlasError` where an item is damaged."""
