@@ -191,7 +191,7 @@ def test_a_stale_or_damaged_index_is_found(atlas):
     assert ("wrong checksum", asset.name) in found(atlas, deep=True)
     outside = replace(manifest, files={"a.npy": replace(asset, name="../../etc/passwd")})
     atlas.store.write("index/index.json", outside.to_json())
-    assert found(atlas) == [("damaged file", "index/index.json"), *stale]
+    assert found(atlas) == [("damaged file", "index/index.json")]
     atlas.store.write("index/index.json", b"{}")
     assert found(atlas) == [("damaged file", "index/index.json")]
 

@@ -275,6 +275,6 @@ def load_whitening(path: Path) -> WhitenedEmbedder:
 def index_file(atlas: Atlas, manifest: IndexManifest, name: str) -> Path:
     """A local path of a file of an index, verified. Raises `AtlasError`, `StorageError`."""
     file = manifest.files.get(name)
-    if file is None or file.name != f"{FOLDER}/{name}":
-        raise AtlasError(f"index of the atlas names no file {name} in its folder: {atlas.url}")
+    if file is None:
+        raise AtlasError(f"index of the atlas names no file {name}: {atlas.url}")
     return atlas.store.fetch(file.name, file.size_bytes, file.sha256)
