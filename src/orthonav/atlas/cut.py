@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_covered, check_shown, require_sheets
-from orthonav.atlas.cut_sheets import CutSheet, opened_sheets, pooled_manifest, recipes
-from orthonav.atlas.cut_terrain import cut_terrain
-from orthonav.atlas.warp import Warp, joined_cells, joined_grey
+from orthonav.atlas.cut_sheets import cut_terrain, opened_sheets, pooled_manifest, recipes
+from orthonav.atlas.warp import SheetSource, Warp, joined_cells, joined_grey
 from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, learn
@@ -71,8 +70,7 @@ def cut_map(
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
     _check_out(atlas, out, cutter.members)
-    sources = [each.source for each in cutter.members]
-    check_covered(area, cutter.grid, sources, atlas.recipe.sheets, allow_holes)
+    check_covered(area, cutter.grid, cutter.members, atlas.recipe.sheets, allow_holes)
     progress("sheets", 1.0)
     cutter.read(progress, workers)
     check_shown(area, cutter.grid, cutter.cells, allow_holes)
@@ -105,7 +103,7 @@ class _MapCutter:
         self.members = members = opened_sheets(atlas, sheets, grid)
         self.recipe, representation = recipes(members[0].manifest)
         turns = isinstance(representation, OrientedGradients)
-        self._warps = [Warp(each.source, area.frame, grid, turns) for each in members]
+        self._warps = [Warp(each, area.frame, grid, turns) for each in members]
         self._layout = layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
         height, width = grid.height_px, grid.width_px
         self.cells = CellSheet(layout, height, width, representation.channels)
@@ -168,7 +166,7 @@ def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) 
     return Area.from_bounds(bounds_deg)
 
 
-def _check_out(atlas: Atlas, out: Path, members: Sequence[CutSheet]) -> None:
+def _check_out(atlas: Atlas, out: Path, members: Sequence[SheetSource]) -> None:
     if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in members):
         raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
 
@@ -202,7 +200,7 @@ def _learnt(
 
 
 def _shares(
-    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[CutSheet]
+    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[SheetSource]
 ) -> NDArray[np.float64]:
     """Share of the tiles in the box of each sheet; equal shares where there are none."""
     lat, lon = area.frame.latlon_from_en(centres_en_m)

@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.atlas.item import Sheet
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AtlasError, MapFileError
-from orthonav.geo.area import Extent
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.mapfile.layer import GreyLayer
+from orthonav.mapfile.manifest import Manifest
+from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.prepare.blocks import Block
 from orthonav.prepare.cellparts import StoredCells
 from orthonav.represent.gradients import HARMONICS
@@ -44,14 +46,24 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True, eq=False)
 class SheetSource:
-    """Pixels and cells of a sheet; `bounds_deg` is its box in the lattice."""
+    """A sheet that a map is cut from: its item, manifest, pixels, cells and, if it has one, terrain
+    layer."""
 
-    name: str
-    bounds_deg: Extent
-    frame: LocalFrame
-    grid: TileGrid
+    sheet: Sheet
+    manifest: Manifest
     layer: GreyLayer
     cells: StoredCells
+    terrain: TerrainLayer | None
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Its local plane."""
+        return self.manifest.sheets[0].frame
+
+    @property
+    def grid(self) -> TileGrid:
+        """Its tile grid."""
+        return self.manifest.sheets[0].grid
 
     def covers(self, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
         """Which places (N,) lie on the raster of the sheet."""
@@ -60,7 +72,7 @@ class SheetSource:
 
     def outline_deg(self) -> tuple[Array, Array]:
         """Latitudes and longitudes of points around its box."""
-        west, south, east, north = self.bounds_deg
+        west, south, east, north = self.sheet.bounds_deg
         share = np.linspace(0, 1, EDGE_POINTS)[:-1]
         lon, lat = west + (east - west) * share, south + (north - south) * share
         fixed = np.ones(len(share))
@@ -158,7 +170,7 @@ class Warp:
             return read()
         except MapFileError as error:
             raise AtlasError(
-                f"sheet {self.source.name} is damaged, rebuild it ({error})"
+                f"sheet {self.source.sheet.id} is damaged, rebuild it ({error})"
             ) from error
 
     def _source_px(self, target_px: Array) -> Array:
