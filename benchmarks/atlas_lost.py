@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.atlas.build import AtlasRequest, build_atlas
+from orthonav.atlas.build import build_atlas
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.cluster import SerialRunner
 from orthonav.atlas.locate import AtlasLocator
 from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.sheet_tasks import AtlasRequest
 from orthonav.atlas.tile_search import TileSearch
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m

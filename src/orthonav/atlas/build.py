@@ -10,7 +10,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
 from orthonav.atlas.scratch import scratch_folder
 from orthonav.atlas.sheet_tasks import (
+    AtlasRequest,
     Imagery,
     SheetTask,
     is_same,
@@ -35,8 +36,6 @@ from orthonav.atlas.sheet_tasks import (
 from orthonav.atlas.store import Store
 from orthonav.errors import AreaError, AtlasError, OrthonavError, WorkerError
 from orthonav.files import Progress, no_progress
-from orthonav.geo.area import Extent
-from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.imagery.terrain import open_dem
 from orthonav.prepare.build import BuildRequest, build_map
@@ -50,35 +49,6 @@ GIVE_UP_AFTER = 8
 """Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
 LEARNT = ("autoencoder", "triplet")
 """Methods for which a worker is given a GPU."""
-
-
-@dataclass(frozen=True)
-class AtlasRequest:
-    """What to build into an atlas.
-
-    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
-    `orthos`: files and folders of orthophotos; the first covers the next.
-    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
-    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
-    `bounds_deg`: area: west, south, east, north.
-    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
-    imagery is the area.
-    `replace`: rebuild sheets that were made otherwise, instead of refusing them.
-    `index`: also make the index of the coarse tiles.
-    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
-    what its heights count from.
-    """
-
-    url: str
-    orthos: Sequence[Path]
-    recipe: Mapping[str, Any] = field(default_factory=dict)
-    bounds_deg: Extent | None = None
-    route: Route | None = None
-    band_m: float | None = None
-    replace: bool = False
-    index: bool = True
-    dem: Path | None = None
-    dem_datum: str | None = None
 
 
 def build_atlas(
@@ -98,17 +68,9 @@ def build_atlas(
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)
-    tasks = plan_sheets(
-        Store(request.url).url,
-        recipe,
-        mosaic,
-        orthos,
-        bounds_deg=request.bounds_deg,
-        route=request.route,
-        band_m=request.band_m,
-        dem=_checked_dem(request),
-        dem_datum=request.dem_datum,
-    )
+    dem = request.dem and open_dem(Path(request.dem).absolute(), request.dem_datum).path
+    request = replace(request, url=Store(request.url).url, orthos=orthos, dem=dem)
+    tasks = plan_sheets(request, recipe, mosaic)
     _require_same_versions(runner)
     atlas = Atlas.open_or_create(request.url, recipe)
     known = atlas.sheets()
@@ -119,26 +81,21 @@ def build_atlas(
     for task in tasks:
         name = task.sheet.id
         if name in known and is_same(task, known):
-            result.add(name, SheetResult(name, "unchanged", area_km2=known[name].area_km2))
+            area_km2 = known[name].area_km2
+            result.results.append(SheetResult(name, "unchanged", area_km2=area_km2))
         else:
             missing.append(task)
-    unchanged = f", {result.done} are there already" if result.done else ""
+    there = len(result.results)
+    unchanged = f", {there} are there already" if there else ""
     report(
         f"{len(tasks):,} sheets of at most {recipe.sheet_km:g} km at {recipe.gsd_m:g} m"
         f"{unchanged}; {len(missing):,} to build, {runner.at_once} at a time"
     )
     _build_sheets(missing, recipe, runner, result, progress, report)
-    index = request.index and recipe.coarse is not None and not result.failed
+    index = request.index and recipe.coarse is not None and not result.names("failed")
     result.finish_error = _finish(atlas, index, progress)
     result.wall_s = time.monotonic() - started_s
     return result
-
-
-def _checked_dem(request: AtlasRequest) -> Path | None:
-    """The terrain model, opened once before the work; raises as `open_dem`."""
-    if request.dem is None:
-        return None
-    return open_dem(Path(request.dem).absolute(), request.dem_datum).path
 
 
 def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
@@ -234,13 +191,14 @@ def _build_sheets(
     gpu = recipe.method.partition(":")[0] in LEARNT
     finished = runner.run(build_sheet, tasks, gpu=gpu)
     for task, made in finished:
-        result.add(task.sheet.id, made)
         if isinstance(made, Failure):
             log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
             log.debug("%s", made.trace)
             not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
+            made = SheetResult(task.sheet.id, "failed", f"{made.kind}: {made.text}")
         else:
             not_stored = 0
+        result.results.append(made)
         progress("sheets", result.share)
         if not_stored >= GIVE_UP_AFTER:
             report(f"{not_stored} sheets in a row could not be stored: the others are not tried")

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,35 @@ TOUCH_DEG = 1e-9
 """Boxes that overlap by less than this only touch: a tenth of a millimetre."""
 _POINTS = 17
 """Points along a side of a sheet at which it is compared with a search band."""
+
+
+@dataclass(frozen=True)
+class AtlasRequest:
+    """What to build into an atlas.
+
+    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
+    `orthos`: files and folders of orthophotos; the first covers the next.
+    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
+    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
+    `bounds_deg`: area: west, south, east, north.
+    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
+    imagery is the area.
+    `replace`: rebuild sheets that were made otherwise, instead of refusing them.
+    `index`: also make the index of the coarse tiles.
+    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
+    what its heights count from.
+    """
+
+    url: str
+    orthos: Sequence[Path]
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+    bounds_deg: Extent | None = None
+    route: Route | None = None
+    band_m: float | None = None
+    replace: bool = False
+    index: bool = True
+    dem: Path | None = None
+    dem_datum: str | None = None
 
 
 @dataclass(frozen=True)
@@ -73,28 +102,17 @@ def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> 
     ]
 
 
-def plan_sheets(
-    url: str,
-    recipe: AtlasRecipe,
-    mosaic: Mosaic,
-    orthos: Sequence[Path],
-    *,
-    bounds_deg: Extent | None = None,
-    route: Route | None = None,
-    band_m: float | None = None,
-    dem: Path | None = None,
-    dem_datum: str | None = None,
-) -> list[SheetTask]:
+def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> list[SheetTask]:
     """A task for each sheet of an area that imagery may touch, from south to north, west to east.
 
-    Without bounds and route the area is all imagery. Raises `AreaError` where there is no sheet,
+    `mosaic`: that of the orthophotos of the request. Raises `AreaError` where there is no sheet,
     and for recipes by which no sheet could be built.
     """
     imagery = Imagery(mosaic)
-    names = sorted(_names(recipe, imagery, bounds_deg, route, band_m))
+    names = sorted(_names(recipe, imagery, request))
     if not names:
         raise AreaError("the area lies outside the orthophotos")
-    made_by = versions()
+    made_by, terrain = versions(), (request.dem, request.dem_datum)
     tasks = []
     for name in names:
         box_deg = recipe.sheets.bounds_deg(name)
@@ -108,11 +126,11 @@ def plan_sheets(
             area_km2=0.0,
             dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
             imagery=part.describe(),
-            request=request_digest(recipe, part, made_by, dem, dem_datum),
+            request=request_digest(recipe, part, made_by, *terrain),
             made_by=made_by,
         )
-        needed = _orthos_of(orthos, mosaic, part)
-        tasks.append(SheetTask(sheet, url, needed, recipe, dem, dem_datum))
+        needed = _orthos_of(request.orthos, mosaic, part)
+        tasks.append(SheetTask(sheet, request.url, needed, recipe, *terrain))
     return tasks
 
 
@@ -186,15 +204,10 @@ class Imagery:
         return np.array(boxes, np.float64)
 
 
-def _names(
-    recipe: AtlasRecipe,
-    imagery: Imagery,
-    bounds_deg: Extent | None,
-    route: Route | None,
-    band_m: float | None,
-) -> Iterable[str]:
+def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iterable[str]:
     """Names of the sheets of an area that imagery may touch."""
-    require_one_area(route, band_m, bounds_deg)
+    route, bounds_deg = request.route, request.bounds_deg
+    require_one_area(route, request.band_m, bounds_deg)
     there = imagery.sheets(recipe)
     if bounds_deg is not None:
         west, south, east, north = bounds_deg
@@ -202,7 +215,7 @@ def _names(
             raise AreaError(f"bounds are empty: {','.join(map(str, bounds_deg))}")
         asked = (west, south, east + 360 if east < west else east, north)
         return {name for name in there if _overlap(recipe.sheets.bounds_deg(name), asked)}
-    return there if route is None else set(_along(recipe, route, band_m, there))
+    return there if route is None else set(_along(recipe, route, request.band_m, there))
 
 
 def _along(
