@@ -6,7 +6,6 @@ half a tile beyond the box. So every place of the atlas is within half a stride 
 """
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from orthonav import represent
-from orthonav.atlas.item import reason
+from orthonav.atlas.item import canonical, reason
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.embed.cells import MICRO
 from orthonav.embed.whitened import WhitenedRecipe, pooled_features
@@ -117,7 +116,7 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
         "features": made.features,
         "valid": made.valid,
     }
-    save_tensors(path, arrays, _metadata(made), "coarse tiles")
+    save_tensors(path, arrays, _metadata(recipe, bounds_deg), "coarse tiles")
     return len(made.valid)
 
 
@@ -166,35 +165,33 @@ def _inside(latlon_deg: NDArray[np.float64], bounds_deg: Extent) -> NDArray[np.b
     return np.asarray((lat >= south) & (lat < north) & (turned < (east - west)))
 
 
-def _metadata(made: CoarseTiles) -> str:
+def _metadata(recipe: CoarseRecipe, bounds_deg: Extent) -> str:
     plain = {
         "format": FORMAT,
         "schema": SCHEMA,
-        "recipe": asdict(made.recipe),
+        "recipe": asdict(recipe),
         "edges": EDGES,
         "cells": POOLING.cells,
-        "bounds_deg": list(made.bounds_deg),
+        "bounds_deg": bounds_deg,
     }
-    return json.dumps(plain, sort_keys=True, separators=(",", ":"))
+    return canonical(plain).decode()
 
 
 def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
+    """What `_metadata` wrote; raises `AtlasError` unless writing it again gives the same."""
     plain: Any = json.loads(metadata)
-    if plain["format"] != FORMAT:
-        raise AtlasError("not coarse tiles of an atlas")
     if plain["schema"] != SCHEMA:
-        raise AtlasError(f"coarse tiles of schema {plain['schema']!r:.20}, this program reads 1")
-    if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
         raise AtlasError(
-            f"coarse tiles show {plain['edges']!r:.40} in {plain['cells']!r:.20} cells, "
-            f"this program compares {EDGES} in {POOLING.cells}"
+            f"coarse tiles of schema {plain['schema']!r:.20}, this program reads {SCHEMA}"
         )
     recipe = CoarseRecipe(**plain["recipe"])
-    west, south, east, north = (float(value) for value in plain["bounds_deg"])
-    complete = asdict(recipe) == plain["recipe"] and math.isfinite(west + south + east + north)
-    if not complete or recipe.tile_px % MICRO:
-        raise AtlasError("coarse tiles have an impossible recipe")
-    return recipe, (west, south, east, north)
+    west, south, east, north = map(float, plain["bounds_deg"])
+    bounds_deg = west, south, east, north
+    if _metadata(recipe, bounds_deg) != metadata or recipe.tile_px % MICRO:
+        raise AtlasError(
+            f"altered, or not coarse tiles of an atlas ({EDGES} in {POOLING.cells} cells)"
+        )
+    return recipe, bounds_deg
 
 
 def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
