@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from orthonav.atlas import build as building
-from orthonav.atlas import scratch
 from orthonav.atlas import sheet_tasks as tasks
 from orthonav.atlas.build import build_atlas, build_sheet
 from orthonav.atlas.catalog import Atlas
@@ -364,13 +363,13 @@ def test_imagery_across_the_antimeridian_has_sheets_on_both_sides(ortho):
 
 def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with scratch.scratch_folder() as first:
-        dead = tmp_path / f"{scratch.PREFIX}dead"
+    with building.scratch_folder() as first:
+        dead = tmp_path / f"{building.SCRATCH}dead"
         dead.mkdir()
         (dead / "in-use").touch()
-        strange = tmp_path / f"{scratch.PREFIX}being-made"
+        strange = tmp_path / f"{building.SCRATCH}being-made"
         strange.mkdir()
-        with scratch.scratch_folder() as second:
+        with building.scratch_folder() as second:
             assert sorted(tmp_path.iterdir()) == sorted([first, second, strange])
     assert list(tmp_path.iterdir()) == [strange]
 

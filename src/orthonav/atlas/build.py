@@ -6,10 +6,13 @@ byte, with any number of workers, on processors that round alike.
 """
 
 import contextlib
+import fcntl
 import logging
-import sys
+import shutil
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +23,6 @@ from orthonav.atlas.cluster import Failure, TaskRunner
 from orthonav.atlas.coarse import write_coarse
 from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.atlas.scratch import scratch_folder
 from orthonav.atlas.sheet_tasks import (
     AtlasRequest,
     Imagery,
@@ -34,7 +36,7 @@ from orthonav.atlas.sheet_tasks import (
     versions,
 )
 from orthonav.atlas.store import Store
-from orthonav.errors import AreaError, AtlasError, OrthonavError, WorkerError
+from orthonav.errors import AreaError, AtlasError, OrthonavError, OutputError, WorkerError
 from orthonav.files import Progress, no_progress
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.imagery.terrain import open_dem
@@ -47,6 +49,9 @@ PROGRESS_EVERY_S = 10.0
 """Between two lines of progress."""
 GIVE_UP_AFTER = 8
 """Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
+SCRATCH = "orthonav-sheet-"
+"""Names of temporary folders begin with it."""
+_LOCK = "in-use"
 LEARNT = ("autoencoder", "triplet")
 """Methods for which a worker is given a GPU."""
 
@@ -239,16 +244,38 @@ def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
     return None
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards.
+
+    It is locked while this process lives; folders of processes that were killed are removed first.
+    Raises `OutputError`.
+    """
+    root = Path(tempfile.gettempdir())
+    for path in root.glob(f"{SCRATCH}*/{_LOCK}"):
+        with contextlib.suppress(OSError), path.open("r+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(path.parent, ignore_errors=True)
+    try:
+        made = tempfile.TemporaryDirectory(prefix=SCRATCH, dir=root, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise OutputError(f"no temporary folder can be made ({error.strerror}): {root}") from error
+    with made as name:
+        folder = Path(name)
+        with (folder / f".{_LOCK}").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            (folder / f".{_LOCK}").rename(folder / _LOCK)  # visible to others only when locked
+            yield folder
+
+
 def _peak_bytes() -> int:
-    """Greatest memory that this process ever had, earlier sheets included."""
-    with contextlib.suppress(OSError):  # Linux's own count: getrusage's includes the parent's
+    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown.
+
+    Linux's own count: that of getrusage includes the parent's.
+    """
+    with contextlib.suppress(OSError):
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         for line in status.splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    with contextlib.suppress(ImportError):  # not a Unix
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
     return 0

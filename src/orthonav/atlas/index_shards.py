@@ -130,8 +130,7 @@ class OpenShard:
         self._dims, self._offset = dims, path.stat().st_size - vectors.nbytes
         self._file = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._file)
-        if hasattr(os, "posix_fadvise"):
-            os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
+        os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
         self._retired = info.retired_rows
         self._index = quantizers.empty_index()
         self._map_lists(folder / f"{info.name}.codes", codes_bytes, table, quantizers)
