@@ -38,8 +38,7 @@ def fewer_candidates(monkeypatch):
 
 @pytest.fixture(scope="module")
 def search(atlas):
-    with TileSearch(atlas) as opened:
-        yield opened
+    return TileSearch(atlas)
 
 
 @pytest.fixture
@@ -157,8 +156,7 @@ def test_a_removed_sheet_is_retired_and_a_new_one_is_added(copied, tmp_path, mon
     assert stages[-1] == ("index", 1.0)
     assert len(again.shards) == len(before.shards) + 1
     assert stale_sheets(changed, again) == ([], [])
-    with TileSearch(changed) as opened:
-        assert not opened.unknown and all(shard.rows for shard in again.shards)
+    assert not TileSearch(changed).unknown and all(shard.rows for shard in again.shards)
 
 
 @pytest.mark.parametrize(

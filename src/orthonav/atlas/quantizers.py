@@ -202,14 +202,8 @@ def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
 def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers:
     """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes.
 
-    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used. Raises `AtlasError` where there
-    are fewer vectors than centres.
+    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used.
     """
-    if sample.ndim != 2 or sample.shape[1] != recipe.dims:
-        raise AtlasError(f"vectors must be (N, {recipe.dims}), got {sample.shape}")
-    least = max(2 ** (recipe.list_bits // 2), 2**CODE_BITS)
-    if len(sample) < least:
-        raise AtlasError(f"an index with these lists needs {least} vectors, got {len(sample)}")
     step = max(1, -(-len(sample) // MAX_TRAINING_VECTORS))
     taken = np.asarray(sample[::step], dtype=np.float32)
     rotation = _rotation(taken, recipe.quantizers)
