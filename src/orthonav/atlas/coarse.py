@@ -23,6 +23,7 @@ from orthonav.errors import AreaError, AtlasError
 from orthonav.files import no_progress, require_file
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
+from orthonav.geo.world import in_box
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile.writer import METADATA_KEY, save_tensors
 from orthonav.prepare.calibrate import CropSampler
@@ -86,7 +87,7 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
     rows, cols = np.mgrid[: grid.rows, : grid.cols]
     tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
     latlon = np.stack(area.frame.latlon_from_en(grid.centres_en_m(tiles)), axis=1)
-    inside = _inside(latlon, bounds_deg)
+    inside = in_box(bounds_deg, *latlon.T)
     tiles, latlon = tiles[inside], latlon[inside]
     try:
         reader.read(no_progress, workers=1)
@@ -158,13 +159,6 @@ class _NoCrops(CropSampler):
         return np.zeros((0, 2), np.intp)
 
 
-def _inside(latlon_deg: NDArray[np.float64], bounds_deg: Extent) -> NDArray[np.bool_]:
-    """Which places (N, 2) lie in a box, its southern and western border included."""
-    west, south, east, north = bounds_deg
-    lat, turned = latlon_deg[:, 0], (latlon_deg[:, 1] - west) % 360
-    return np.asarray((lat >= south) & (lat < north) & (turned < (east - west)))
-
-
 def _metadata(recipe: CoarseRecipe, bounds_deg: Extent) -> str:
     plain = {
         "format": FORMAT,
@@ -213,7 +207,7 @@ def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -
         raise AtlasError("coarse tiles are damaged (not finite)")
     west, south, east, north = bounds_deg
     slack = west - _SLACK_DEG, south - _SLACK_DEG, east + 2 * _SLACK_DEG, north + 2 * _SLACK_DEG
-    if not _inside(centres, slack).all():
+    if not in_box(slack, *centres.T).all():
         raise AtlasError("coarse tiles are damaged (centres lie outside their sheet)")
     for array in (centres, features, valid):
         array.flags.writeable = False

@@ -5,8 +5,8 @@ are embedded from the cell means of the sheets, and confidences are pooled. The 
 the same bytes for any number of threads.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,11 @@ from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.route import Route
+from orthonav.geo.world import in_box
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
-from orthonav.prepare.blocks import Block, Preview, blocks_of
+from orthonav.prepare.blocks import Block, Preview
 from orthonav.prepare.build import BuildResult
 from orthonav.prepare.layer import GreyLayerWriter, Parts
 from orthonav.prepare.layout import grid_of, tiles_of
@@ -36,8 +37,9 @@ from orthonav.prepare.parallel import in_order
 from orthonav.prepare.request import MAX_WORKERS
 from orthonav.prepare.sheet import (
     PREVIEW_PX,
-    block_side_px,
+    blocks_of_area,
     layer_parts,
+    one_opencv_thread,
     put_layer_parts,
 )
 from orthonav.represent.gradients import OrientedGradients
@@ -112,25 +114,12 @@ class _MapCutter:
 
     def read(self, progress: Progress, workers: int) -> None:
         """Resample all blocks with `workers` threads. Raises `AtlasError` for a damaged sheet."""
-        side_px = block_side_px(self.grid.tile_px, self._layout.micro_px)
-        blocks = [
-            block
-            for block in blocks_of(self.grid, side_px)
-            if block.may_matter(self.area, self.grid)
-        ]
-
-        @contextmanager
-        def opened() -> Iterator[Callable[[Block], Parts]]:
-            yield self._made
-
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            for done, parts in enumerate(in_order(blocks, opened, workers)):
+        blocks = blocks_of_area(self.area, self.grid, self._layout)
+        with one_opencv_thread():
+            made = in_order(blocks, lambda: nullcontext(self._made), workers)
+            for done, parts in enumerate(made):
                 self._take(blocks[done], parts)
                 progress("imagery", (done + 1) / len(blocks))
-        finally:
-            cv2.setNumThreads(threads)
 
     def _made(self, block: Block) -> Parts:
         """The parts of the map in a block. Called by several threads: changes nothing."""
@@ -204,10 +193,6 @@ def _shares(
 ) -> NDArray[np.float64]:
     """Share of the tiles in the box of each sheet; equal shares where there are none."""
     lat, lon = area.frame.latlon_from_en(centres_en_m)
-    counts = []
-    for each in members:
-        west, south, east, north = each.sheet.bounds_deg
-        inside = (lon >= west) & (lon < east) & (lat >= south) & (lat < north)
-        counts.append(float(np.count_nonzero(inside)))
-    found = np.array(counts)
+    boxes = [each.sheet.bounds_deg for each in members]
+    found = np.array([np.count_nonzero(in_box(box, lat, lon)) for box in boxes], np.float64)
     return found / found.sum() if found.any() else np.full(len(found), 1 / len(found))

@@ -28,6 +28,7 @@ from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.errors import AtlasError, MapFileError, MissingFileError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
+from orthonav.geo.world import in_box
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile, open_map
@@ -231,9 +232,7 @@ def _heights(
     found = np.full(lat_deg.shape, np.nan)
     for own in (True, False):
         for member, layer in layers:
-            west, south, east, north = member.sheet.bounds_deg
-            off = (lon_deg - (west + east) / 2 + 180) % 360 - 180
-            inside = (abs(off) <= (east - west) / 2) & (lat_deg >= south) & (lat_deg <= north)
+            inside = in_box(member.sheet.bounds_deg, lat_deg, lon_deg)
             wanted = np.isnan(found) & (inside if own else True)
             if wanted.any():
                 found[wanted] = layer(lat_deg[wanted], lon_deg[wanted])
