@@ -180,7 +180,7 @@ def test_creating_and_opening(tmp_path):
         (lambda text: text[:-5], "damaged"),
         (lambda text: text.replace("orthonav-atlas", "other"), "not an atlas of orthonav"),
         (lambda text: text.replace('"schema":1', '"schema":2'), "update orthonav"),
-        (lambda text: text.replace('"schema":1', '"schema":"1"'), "impossible schema"),
+        (lambda text: text.replace('"schema":1', '"schema":"1"'), "impossible recipe or schema"),
         (lambda text: text.replace('"gsd_m":1.0', '"gsd_m":NaN'), "recipe of the atlas"),
         (lambda text: text.replace('"seed":0,', ""), "recipe of the atlas cannot be read"),
         (lambda text: text.replace("Licences", "No licences"), "altered"),

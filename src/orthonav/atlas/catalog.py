@@ -299,14 +299,12 @@ def _read_catalog(store: Store) -> AtlasRecipe:
     if not isinstance(own, dict) or own.get("format") != FORMAT:
         raise AtlasError(f"not an atlas of orthonav: {where}")
     schema = own.get("schema")
-    if type(schema) is not int or schema < 1:
-        raise AtlasError(f"atlas has an impossible schema: {where}")
-    if schema > SCHEMA:
+    if isinstance(schema, int) and schema > SCHEMA:
         raise AtlasError(
             f"atlas has schema {schema}, this program reads up to {SCHEMA}; update orthonav: "
             f"{where}"
         )
     recipe = AtlasRecipe.from_plain(own.get("recipe"))
     if _catalog(recipe) != data:
-        raise AtlasError(f"atlas was altered or has an impossible recipe: {where}")
+        raise AtlasError(f"atlas was altered or has an impossible recipe or schema: {where}")
     return recipe

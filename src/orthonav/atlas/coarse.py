@@ -71,15 +71,20 @@ class CoarseTiles:
         return self.features[tiles].astype(np.float32), np.repeat(share, repeats, axis=1)
 
 
+def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
+    """The grid of the coarse tiles of an area. Raises `AreaError` for impossible recipes."""
+    return TileGrid.covering(
+        area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
+    )
+
+
 def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
     """The coarse tiles whose centres lie in a box, made from the imagery with one thread.
 
     Raises `AreaError` for impossible recipes, `ImageryError` where the imagery cannot be read.
     """
     area = Area.from_bounds(bounds_deg)
-    grid = TileGrid.covering(
-        area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
-    )
+    grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
     reader = SheetReader(
         mosaic, area, grid, representation, _NoCrops(recipe.tile_px, 0), registration=False

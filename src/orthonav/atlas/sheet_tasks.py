@@ -13,13 +13,13 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__
+from orthonav.atlas.coarse import coarse_grid
 from orthonav.atlas.coverage import box_around, turned
 from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AreaError, AtlasError
 from orthonav.geo.area import Area, Extent, require_one_area
-from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.geo.sheets import sheets_of_route
 from orthonav.imagery.mosaic import Mosaic
@@ -257,12 +257,7 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
     )
     CellLayout.for_tiles(grid.tile_px, grid.stride_px)
     if recipe.coarse is not None:
-        coarse = TileGrid.covering(
-            area.extent_en_m,
-            gsd_m=recipe.coarse.gsd_m,
-            tile_px=recipe.coarse.tile_px,
-            overlap=recipe.coarse.overlap,
-        )
+        coarse = coarse_grid(area, recipe.coarse)
         CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
 
 

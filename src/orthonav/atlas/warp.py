@@ -268,10 +268,6 @@ def _corners(block: Block) -> Array:
     )
 
 
-def _applied(affine: Array, points: Array) -> Array:
-    return np.asarray(points @ affine[:, :2].T + affine[:, 2])
-
-
 def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
     """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
 
@@ -286,7 +282,7 @@ def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Top, left, height and width of the part of the sheet that `size` (w, h) pixels need."""
     cols, rows = size
     corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
-    there = _applied(matrix, corners)
+    there = corners @ matrix[:, :2].T + matrix[:, 2]
     left, top = (int(value) for value in np.floor(there.min(axis=0)) - KERNEL_PX)
     right, bottom = (int(value) for value in np.ceil(there.max(axis=0)) + KERNEL_PX)
     return top, left, bottom - top + 1, right - left + 1
