@@ -31,9 +31,10 @@ from benchmarks.corridor import BAND_M, GSD_M, LAMBERT, route_of
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav import __version__
-from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg
 from orthonav.atlas.cut import cut_map
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.frames import LocalFrame
@@ -116,7 +117,7 @@ def _filled(folder: Path, base: Path, km: float) -> Path:
     if (folder / "complete").is_file():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
-    atlas, opened = Atlas.create(str(folder), _recipe()), open_map(base)
+    atlas, opened = Atlas.open_or_create(str(folder), _recipe()), open_map(base)
     area = Area.from_route(route_of(km), BAND_M)
     sheets = _recipe().sheets
     for name in sheets.over(box_deg(area, 500.0)):
@@ -135,7 +136,7 @@ def _near(area: Area, bounds: Extent) -> bool:
     return bool(area.contains(middle[None], 1000 * SHEET_KM)[0])
 
 
-def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> SheetDescription:
+def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> Sheet:
     """Write the map moved to the middle of other bounds."""
     west, south, east, north = bounds
     sheet = opened.manifest.sheets[0]
@@ -145,7 +146,7 @@ def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> SheetDescri
     imagery = manifest.imagery
     dates = tuple(str(each["date"]) for each in imagery)
     made_by = {"orthonav": __version__}
-    return SheetDescription(
+    return Sheet(
         name, bounds, GSD_M, sheet.tiles, sheet.area_km2, dates, imagery, "benchmark", made_by
     )
 

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.atlas.build import AtlasRequest, build_atlas
+from orthonav.atlas.build import build_atlas
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.cluster import SerialRunner
 from orthonav.atlas.locate import AtlasLocator
 from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.sheet_tasks import AtlasRequest
 from orthonav.atlas.tile_search import TileSearch
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
@@ -119,21 +120,21 @@ def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) ->
     focal_px = AGL_M / GSD_M
     camera = Camera(width, height, focal_px, focal_px, width / 2, height / 2)
     outcomes = []
-    with TileSearch(Atlas.open(atlas)) as search:
-        registrar = SheetRegistrar(search.atlas)
-        for number_, flight in enumerate(flights(ortho, count, seed, mirrored=mirrored)):
-            locator = AtlasLocator(registrar, search)
-            for view, (grey, telemetry, truth) in enumerate(flight):
-                start = time.perf_counter()
-                outcome = locator.locate(View(grey, camera, telemetry))
-                latency_ms = (time.perf_counter() - start) * 1e3
-                error_m = confidence = math.nan
-                if isinstance(outcome, Fix):
-                    place = (outcome.lat_deg, outcome.lon_deg)
-                    error_m = math.inf if mirrored else float(distances_m([place], [truth])[0])
-                    confidence = outcome.confidence
-                outcomes.append(Outcome(number_, view, error_m, confidence, latency_ms))
-            _say(f"flight {number_ + 1} of {count}: {_shown(outcomes[-VIEWS:])}")
+    search = TileSearch(Atlas.open(atlas))
+    registrar = SheetRegistrar(search.atlas)
+    for number_, flight in enumerate(flights(ortho, count, seed, mirrored=mirrored)):
+        locator = AtlasLocator(registrar, search)
+        for view, (grey, telemetry, truth) in enumerate(flight):
+            start = time.perf_counter()
+            outcome = locator.locate(View(grey, camera, telemetry))
+            latency_ms = (time.perf_counter() - start) * 1e3
+            error_m = confidence = math.nan
+            if isinstance(outcome, Fix):
+                place = (outcome.lat_deg, outcome.lon_deg)
+                error_m = math.inf if mirrored else float(distances_m([place], [truth])[0])
+                confidence = outcome.confidence
+            outcomes.append(Outcome(number_, view, error_m, confidence, latency_ms))
+        _say(f"flight {number_ + 1} of {count}: {_shown(outcomes[-VIEWS:])}")
     return outcomes
 
 

@@ -166,7 +166,7 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
     queries, exact, own = truth["queries"], truth["ids"], truth["own"]
     start = time.perf_counter()
     about = _about(folder)
-    index = ShardedIndex(folder, shard_infos(about["count"], about["shards"]))
+    index = ShardedIndex(folder.joinpath, shard_infos(about["count"], about["shards"]))
     open_ms = (time.perf_counter() - start) * 1e3
     for query in queries[:20]:
         index.search(query[None], K, probes, rerank)

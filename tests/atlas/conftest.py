@@ -13,20 +13,28 @@ RECIPE = {
 COARSE = (5.0, 64, 0.875)
 
 
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """Folder of the copies of remote files."""
+    monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
 @pytest.fixture(scope="module")
 def atlas(area, made_once):
     """An atlas of the first date with its index; read-only."""
-    from orthonav.atlas.build import AtlasRequest, build_atlas
+    from orthonav.atlas.build import build_atlas
     from orthonav.atlas.catalog import Atlas
     from orthonav.atlas.cluster import SerialRunner
     from orthonav.atlas.recipe import CoarseRecipe
+    from orthonav.atlas.sheet_tasks import AtlasRequest
 
     def make(folder):
         recipe = {**RECIPE, "coarse": dataclasses.asdict(CoarseRecipe(*COARSE))}
         with pytest.MonkeyPatch.context() as patch, SerialRunner() as runner:
             patch.setattr("orthonav.prepare.calibrate.CROPS", 24)  # most of the time of a sheet
             request = AtlasRequest(str(folder / "atlas"), [area.past], recipe)
-            assert not build_atlas(request, runner).failed
+            assert not build_atlas(request, runner).names("failed")
 
     return Atlas.open(made_once("searched-atlas", make) / "atlas")
 

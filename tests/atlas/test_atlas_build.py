@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 from orthonav.atlas import build as building
-from orthonav.atlas import scratch
 from orthonav.atlas import sheet_tasks as tasks
-from orthonav.atlas.build import AtlasRequest, build_atlas, build_sheet
+from orthonav.atlas.build import build_atlas, build_sheet
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.cluster import SerialRunner
 from orthonav.atlas.coarse import read_coarse
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.atlas.sheet_tasks import Imagery, plan_sheets, request_digest, versions
+from orthonav.atlas.sheet_tasks import AtlasRequest, Imagery, plan_sheets, request_digest, versions
 from orthonav.errors import AreaError, AtlasError, StorageError, WorkerError
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
@@ -75,7 +74,9 @@ def content(place):
 def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
     place, result = built
     sheets = Atlas.open(place).sheets()
-    assert list(sheets) == list(result.built) and len(sheets) == COUNT and result.is_complete
+    assert (
+        list(sheets) == list(result.names("built")) and len(sheets) == COUNT and result.is_complete
+    )
     mosaic = Mosaic.open([ortho])
     atlas = Atlas.open(place)
     for name, sheet in sheets.items():
@@ -110,12 +111,18 @@ def test_an_atlas_does_not_depend_on_place_and_time_of_building(built, ortho, tm
 def test_present_sheets_are_unchanged_and_missing_ones_are_built(built, ortho, tmp_path):
     place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
     again = made(place, ortho)
-    assert (again.built, again.unchanged) == ((), built[1].built) and again.is_complete
+    assert (again.names("built"), again.names("unchanged")) == (
+        [],
+        built[1].names("built"),
+    ) and again.is_complete
     assert again.to_plain()["mb_per_km2"] is None
     lost = sorted((place / "items").iterdir())[1]
     lost.unlink()
     again = made(place, ortho)
-    assert again.built == (lost.name.partition(".")[0],) and len(again.unchanged) == COUNT - 1
+    assert (
+        again.names("built") == [lost.name.partition(".")[0]]
+        and len(again.names("unchanged")) == COUNT - 1
+    )
     assert content(place) == content(built[0])
 
 
@@ -129,7 +136,7 @@ def test_an_interrupt_keeps_finished_sheets(built, ortho, tmp_path):
     with pytest.raises(KeyboardInterrupt), SerialRunner() as runner:
         build_atlas(AtlasRequest(str(place), [ortho], SMALL, index=False), runner, progress)
     assert len(Atlas.open(place).sheets()) == COUNT / 2
-    assert len(made(place, ortho).built) == COUNT / 2
+    assert len(made(place, ortho).names("built")) == COUNT / 2
     assert content(place) == content(built[0])
 
 
@@ -143,16 +150,16 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
         AtlasError, match=r"8 of 8 sheets .*imagery has changed.*--replace"
     ) as caught:
         made(place, changed)
-    assert built[1].built[0] in str(caught.value) and content(place) == before
+    assert built[1].names("built")[0] in str(caught.value) and content(place) == before
     result = made(place, changed, replace=True)
-    assert len(result.built) == COUNT
+    assert len(result.names("built")) == COUNT
     assert {sheet.revision for sheet in Atlas.open(place).sheets().values()} == {2}
     # The pictures are the same: so are the maps.
     after = content(place)
     assert [n for n in after if n.startswith("sheets")] == [
         n for n in before if n.startswith("sheets")
     ]
-    assert made(place, changed, replace=True).unchanged == result.built
+    assert made(place, changed, replace=True).names("unchanged") == result.names("built")
 
 
 def test_other_recipes_are_refused_with_the_differences(built, ortho):
@@ -161,7 +168,9 @@ def test_other_recipes_are_refused_with_the_differences(built, ortho):
         made(built[0], ortho, recipe={"tile_px": 96})
     with pytest.raises(AtlasError, match=r"coarse: .*'overlap': 0.5.*, not .*0.75"):
         made(built[0], ortho, recipe={"coarse": {"overlap": 0.75}})
-    assert made(built[0], ortho, recipe={}).unchanged == built[1].built, "an atlas knows its own"
+    assert made(built[0], ortho, recipe={}).names("unchanged") == built[1].names("built"), (
+        "an atlas knows its own"
+    )
     assert content(built[0]) == before
 
 
@@ -182,13 +191,13 @@ def test_sheets_without_imagery_are_empty(make_ortho, tmp_path):
     grey[:500] = 0
     ortho = make_ortho(tmp_path / "half.tif", grey, nodata=0)
     result = made(tmp_path / "atlas", ortho)
-    assert result.empty and result.built and result.is_complete
-    assert set(Atlas.open(tmp_path / "atlas").sheets()) == set(result.built)
+    assert result.names("empty") and result.names("built") and result.is_complete
+    assert set(Atlas.open(tmp_path / "atlas").sheets()) == set(result.names("built"))
 
 
 def test_other_versions_are_refused(ortho, tmp_path):
-    task = plan_sheets(str(tmp_path), RECIPE, Mosaic.open([ortho]), [ortho])[0]
-    other = replace(task, made_by={**task.made_by, "numpy": "1.0"})
+    task = plan_sheets(AtlasRequest(str(tmp_path), [ortho]), RECIPE, Mosaic.open([ortho]))[0]
+    other = replace(task, sheet=replace(task.sheet, made_by={**versions(), "numpy": "1.0"}))
     with pytest.raises(WorkerError, match=rf"numpy {np.__version__}, not 1.0"):
         build_sheet(other)
 
@@ -204,7 +213,7 @@ def test_other_versions_are_refused(ortho, tmp_path):
 
 def test_a_worker_that_sees_other_imagery_refuses(ortho, tmp_path):
     copy = Path(shutil.copy2(ortho, tmp_path))
-    task = plan_sheets(str(tmp_path), RECIPE, Mosaic.open([copy]), [copy])[0]
+    task = plan_sheets(AtlasRequest(str(tmp_path), [copy]), RECIPE, Mosaic.open([copy]))[0]
     os.utime(copy, (5, 5))
     with pytest.raises(AtlasError, match="imagery has changed"):
         build_sheet(task)
@@ -214,7 +223,7 @@ def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     ortho, tmp_path, monkeypatch, run, built
 ):
     """Full while the map of one sheet is copied; a bug while another is built."""
-    full, broken = built[1].built[:2]
+    full, broken = built[1].names("built")[:2]
     copied, make = shutil.copyfile, building.build_map
 
     def copy(source, to):
@@ -256,7 +265,9 @@ def test_a_disk_that_stays_full_ends_the_build(ortho, tmp_path, monkeypatch):
     monkeypatch.setattr(building, "build_sheet", full)
     monkeypatch.setattr(building, "GIVE_UP_AFTER", 2)
     result = made(tmp_path / "atlas", ortho)
-    assert len(result.failed) == 2 and result.untried == COUNT - 2 and not result.is_complete
+    assert (
+        len(result.names("failed")) == 2 and result.untried == COUNT - 2 and not result.is_complete
+    )
 
 
 def test_sheets_count_where_snapshot_and_index_cannot_be_written(
@@ -268,7 +279,9 @@ def test_sheets_count_where_snapshot_and_index_cannot_be_written(
     place = shutil.copytree(built[0], tmp_path / "atlas")
     monkeypatch.setattr(Atlas, "snapshot", full)
     result = made(place, ortho)
-    assert result.unchanged == built[1].built and result.finish_error == "disk full"
+    assert (
+        result.names("unchanged") == built[1].names("built") and result.finish_error == "disk full"
+    )
     assert not result.is_complete
 
 
@@ -281,11 +294,11 @@ def test_the_index_is_made_at_the_end(built, ortho, tmp_path):
 
 def test_only_sheets_of_the_area_are_planned(ortho, built):
     mosaic = Mosaic.open([ortho])
-    names = built[1].built
+    names = built[1].names("built")
 
     def planned(**area):
-        found = plan_sheets("atlas", RECIPE, mosaic, [ortho], **area)
-        return tuple(task.sheet for task in found)
+        found = plan_sheets(AtlasRequest("atlas", [ortho], **area), RECIPE, mosaic)
+        return [task.sheet.id for task in found]
 
     west, south, east, north = RECIPE.sheets.bounds_deg(names[0])
     assert planned() == names
@@ -309,10 +322,10 @@ def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
     far = make_ortho(tmp_path / "far.tif")
     with rasterio.open(far, "r+") as data:
         data.transform = Affine(1, 0, 702_000, 0, -1, 6_600_000)
-    both = plan_sheets("atlas", RECIPE, Mosaic.open([near, far]), [near, far])
-    alone = plan_sheets("atlas", RECIPE, Mosaic.open([near]), [near])
-    by_name = {task.sheet: task for task in both}
-    assert [by_name[task.sheet] for task in alone] == alone
+    both = plan_sheets(AtlasRequest("atlas", [near, far]), RECIPE, Mosaic.open([near, far]))
+    alone = plan_sheets(AtlasRequest("atlas", [near]), RECIPE, Mosaic.open([near]))
+    by_name = {task.sheet.id: task for task in both}
+    assert [by_name[task.sheet.id] for task in alone] == alone
     assert {task.orthos for task in both} == {(near,), (far,)}
 
 
@@ -350,13 +363,13 @@ def test_imagery_across_the_antimeridian_has_sheets_on_both_sides(ortho):
 
 def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with scratch.scratch_folder() as first:
-        dead = tmp_path / f"{scratch.PREFIX}dead"
+    with building.scratch_folder() as first:
+        dead = tmp_path / f"{building.SCRATCH}dead"
         dead.mkdir()
         (dead / "in-use").touch()
-        strange = tmp_path / f"{scratch.PREFIX}being-made"
+        strange = tmp_path / f"{building.SCRATCH}being-made"
         strange.mkdir()
-        with scratch.scratch_folder() as second:
+        with building.scratch_folder() as second:
             assert sorted(tmp_path.iterdir()) == sorted([first, second, strange])
     assert list(tmp_path.iterdir()) == [strange]
 

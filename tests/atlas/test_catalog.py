@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.atlas.catalog import Atlas, SheetDescription, copy_sheets
+from orthonav.atlas.catalog import Atlas, copy_sheets
 from orthonav.atlas.integrity import check_atlas
 from orthonav.atlas.item import Sheet, StoredFile, canonical, read_item
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
@@ -28,7 +28,7 @@ EAST = RECIPE.sheets.name_at(46.6, 2.1)
 
 def described(sheet=HERE, request="request 1", **others):
     """The description of a sheet."""
-    made = SheetDescription(
+    made = Sheet(
         id=sheet,
         bounds_deg=RECIPE.sheets.bounds_deg(sheet),
         gsd_m=1.0,
@@ -59,21 +59,21 @@ def files(tmp_path):
 def atlas(request, tmp_path):
     """An empty atlas, near and far."""
     url = tmp_path / "atlas" if request.param == "folder" else "memory://test/atlas"
-    yield Atlas.create(url, RECIPE, cache=tmp_path / "cache")
+    yield Atlas.open_or_create(url, RECIPE)
     fsspec.filesystem("memory").store.clear()
 
 
 @pytest.fixture
 def far(tmp_path):
     """An empty atlas in memory, as in object storage."""
-    yield Atlas.create("memory://test/atlas", RECIPE, cache=tmp_path / "cache")
+    yield Atlas.open_or_create("memory://test/atlas", RECIPE)
     fsspec.filesystem("memory").store.clear()
 
 
 @pytest.fixture
 def near(tmp_path):
     """An empty atlas in a folder."""
-    return Atlas.create(tmp_path / "atlas", RECIPE)
+    return Atlas.open_or_create(tmp_path / "atlas", RECIPE)
 
 
 def contents(url):
@@ -87,7 +87,7 @@ def contents(url):
 
 def test_a_sheet_that_is_put_is_read_back(atlas, files):
     sheet = atlas.put(files(), described())
-    again = Atlas.open(atlas.url, cache=atlas.store.cache)
+    again = Atlas.open(atlas.url)
     assert again.recipe == RECIPE and again.sheets() == {HERE: sheet} == atlas.sheets()
     assert sheet.revision == 1 and sheet.made_by == {"orthonav": "1.0"}
     assert sheet.size_bytes == len("map of one") + len("coarse of one")
@@ -112,7 +112,7 @@ def test_a_sheet_is_replaced(atlas, files, content, request_):
     atlas.put(files("east"), described(EAST))
     sheet = atlas.put(files(content), described(request=request_))
     assert sheet.revision == 2
-    again = Atlas.open(atlas.url, cache=atlas.store.cache)
+    again = Atlas.open(atlas.url)
     assert list(again.sheets()) == [HERE, EAST] and again.sheets()[HERE] == sheet
     assert again.path(sheet).read_text() == f"map of {content}"
     assert [len(atlas.store.names(name)) for name in ("items", "sheets", "coarse")] == [2, 2, 2]
@@ -131,7 +131,7 @@ def test_a_sheet_is_retired(atlas, files):
 
 def test_the_same_atlas_byte_for_byte(tmp_path, files):
     def make(url, order):
-        atlas = Atlas.create(url, RECIPE)
+        atlas = Atlas.open_or_create(url, RECIPE)
         for sheet in order:
             atlas.put(files(sheet), described(sheet))
         atlas.snapshot()
@@ -164,12 +164,10 @@ def test_creating_and_opening(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "inner").mkdir()
     with pytest.raises(AtlasError, match="holds other files"):
-        Atlas.create(tmp_path / "photos", RECIPE)
+        Atlas.open_or_create(tmp_path / "photos", RECIPE)
     url = tmp_path / "atlas"
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
-    with pytest.raises(AtlasError, match="there is an atlas already"):
-        Atlas.create(url, RECIPE)
     with pytest.raises(AtlasError, match=r"made alike.*gsd_m: 1\.0, not 0\.5.*seed: 0, not 3"):
         Atlas.open_or_create(url, replace(RECIPE, gsd_m=0.5, seed=3))
     with pytest.raises(AtlasError, match="coarse"):
@@ -182,7 +180,7 @@ def test_creating_and_opening(tmp_path):
         (lambda text: text[:-5], "damaged"),
         (lambda text: text.replace("orthonav-atlas", "other"), "not an atlas of orthonav"),
         (lambda text: text.replace('"schema":1', '"schema":2'), "update orthonav"),
-        (lambda text: text.replace('"schema":1', '"schema":"1"'), "impossible schema"),
+        (lambda text: text.replace('"schema":1', '"schema":"1"'), "impossible recipe or schema"),
         (lambda text: text.replace('"gsd_m":1.0', '"gsd_m":NaN'), "recipe of the atlas"),
         (lambda text: text.replace('"seed":0,', ""), "recipe of the atlas cannot be read"),
         (lambda text: text.replace("Licences", "No licences"), "altered"),
@@ -353,7 +351,8 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeyp
 MANY = """
 import sys
 from pathlib import Path
-from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.item import Sheet
 
 url, files, number = sys.argv[1:]
 atlas = Atlas.open_or_create(url, __import__("orthonav.atlas.recipe").atlas.recipe.AtlasRecipe(1.0))
@@ -362,7 +361,7 @@ for step in range(6):
     path = Path(files, sheet)
     path.write_text(f"map of {sheet}")
     bounds = atlas.recipe.sheets.bounds_deg(sheet)
-    description = SheetDescription(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
+    description = Sheet(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
     atlas.put({"map": path}, description)
 """
 
@@ -433,7 +432,7 @@ def test_items_are_stac(near, files):
     validator = JsonSchemaSTACValidator()  # it brings the schemas of 1.1, which asks for no less
     for plain, kind in (
         (sheet.to_item(), STACObjectType.ITEM),
-        (Sheet.of(described(dates=("2020",)), 1, sheet.files).to_item(), STACObjectType.ITEM),
+        (described(dates=("2020",)).stored(1, sheet.files).to_item(), STACObjectType.ITEM),
         (json.loads(near.store.read("atlas.json")), STACObjectType.COLLECTION),
     ):
         assert validator.validate_core({**plain, "stac_version": "1.1.0"}, kind, "1.1.0")
@@ -461,7 +460,7 @@ def test_items_are_stac(near, files):
 )
 def test_dates_become_times_of_stac(dates, times):
     asset = StoredFile(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
-    sheet = Sheet.of(described(dates=dates), 1, {"map": asset})
+    sheet = described(dates=dates).stored(1, {"map": asset})
     found = {k: v for k, v in sheet.to_item()["properties"].items() if "date" in k}
     if isinstance(times, tuple):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
@@ -474,7 +473,7 @@ def wide(tmp_path_factory):
     """An atlas of sheets on both sides of the antimeridian, at a pole and around one place."""
     folder = tmp_path_factory.mktemp("wide")
     recipe = AtlasRecipe(gsd_m=10.0, sheet_km=40.0)
-    atlas = Atlas.create(folder / "atlas", recipe)
+    atlas = Atlas.open_or_create(folder / "atlas", recipe)
     (folder / "map").write_bytes(b"map")
     boxes = [(1.0, 46.0, 2.5, 47.0), (179.5, -17.0, -179.5, -16.5), (0.0, 89.9, 10.0, 90.0)]
     for sheet in {each for box in boxes for each in recipe.sheets.over(box)}:
@@ -506,7 +505,7 @@ def test_invalid_boxes_are_refused(wide):
 
 
 def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
-    source = Atlas.create(tmp_path / "source", RECIPE)
+    source = Atlas.open_or_create(tmp_path / "source", RECIPE)
     for sheet in (HERE, EAST):
         source.put(files(sheet), described(sheet))
     assert copy_sheets(source, near, [EAST]) == ([EAST], [])
@@ -519,6 +518,6 @@ def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
     assert check_atlas(near) == []
     with pytest.raises(AtlasError, match="has no sheet 'x'"):
         copy_sheets(source, near, ["x"])
-    other = Atlas.create(tmp_path / "other", replace(RECIPE, overlap=0.5))
+    other = Atlas.open_or_create(tmp_path / "other", replace(RECIPE, overlap=0.5))
     with pytest.raises(AtlasError, match=r"overlap: 0\.5, not 0\.875"):
         copy_sheets(source, other)

@@ -8,6 +8,7 @@ from safetensors.numpy import load_file, save_file
 
 from orthonav import represent
 from orthonav.atlas.coarse import POOLING, make_coarse, read_coarse, write_coarse
+from orthonav.atlas.item import canonical
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.embed.cells import MICRO, CellLayout
 from orthonav.embed.whitened import CellSheet, pooled_features
@@ -163,6 +164,8 @@ def _with(**more):
         _with(schema=2),
         _with(schema=None),
         _with(edges="canny"),
+        _with(cells=4),
+        _with(more=1),
         _with(recipe={"gsd_m": 1}),
         _with(recipe={"gsd_m": -1.0, "tile_px": 64, "overlap": 0.5}),
         _with(recipe={"gsd_m": 1.0, "tile_px": 33, "overlap": 0.5}),
@@ -176,7 +179,7 @@ def test_altered_files_are_refused(stored, tmp_path, change):
     metadata = _metadata(stored)
     change(arrays, metadata)
     path = tmp_path / "altered.safetensors"
-    save_file(arrays, path, metadata={"orthonav": json.dumps(metadata)})
+    save_file(arrays, path, metadata={"orthonav": canonical(metadata).decode()})
     with pytest.raises(AtlasError, match=r"altered\.safetensors"):
         read_coarse(path)
 

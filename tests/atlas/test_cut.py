@@ -9,9 +9,10 @@ import pytest
 from safetensors import SafetensorError
 
 from helpers import textured, write_dem
-from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_shown
 from orthonav.atlas.cut import cut_in_memory, cut_map
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.stored import embedder_of
@@ -63,7 +64,7 @@ def names(middle):
 def folder(ortho, names, middle, tmp_path_factory):
     """An atlas of them, not to be changed."""
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
-    atlas = Atlas.create(str(folder), RECIPE)
+    atlas = Atlas.open_or_create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
         patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
@@ -97,7 +98,7 @@ def put(atlas, name, path):
     bounds = RECIPE.sheets.bounds_deg(name)
     dates = tuple(str(each["date"]) for each in manifest.imagery)
     facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
-    return atlas.put({"map": path}, SheetDescription(name, *facts, "asked", {"orthonav": "test"}))
+    return atlas.put({"map": path}, Sheet(name, *facts, "asked", {"orthonav": "test"}))
 
 
 @pytest.fixture
@@ -287,7 +288,7 @@ def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
         cut_map(atlas, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
-    empty = Atlas.create(str(tmp_path / "empty"), RECIPE)
+    empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
     with pytest.raises(AreaError, match="no sheets yet"):
         cut_map(empty, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
 

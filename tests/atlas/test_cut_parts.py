@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.atlas.pooled_confidence import pooled_registered, pooled_tiles
+from orthonav.atlas.cut_sheets import pooled_registered, pooled_tiles
 from orthonav.atlas.warp import Warp, _turn
 from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import Chances, RegisteredConfidence

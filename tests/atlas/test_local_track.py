@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
 
-from orthonav.atlas import local_track
+from orthonav.atlas import locate
 from orthonav.atlas.agreement import Placement
 from orthonav.atlas.find import FoundPlace
-from orthonav.atlas.local_track import LocalTrack
+from orthonav.atlas.locate import LocalTrack
 from orthonav.flight.folder import open_flight
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.records import NoFix, View
@@ -45,9 +45,9 @@ def found(views, places, confidence=0.95, moved_m=0.0):
 
 
 def test_the_track_follows_from_one_map_to_the_next(atlas, views, places, monkeypatch):
-    cuts, cut = [], local_track.cut_in_memory
-    monkeypatch.setattr(local_track, "AHEAD_M", 0.0)
-    monkeypatch.setattr(local_track, "cut_in_memory", lambda *args: cuts.append(args) or cut(*args))
+    cuts, cut = [], locate.cut_in_memory
+    monkeypatch.setattr(locate, "AHEAD_M", 0.0)
+    monkeypatch.setattr(locate, "cut_in_memory", lambda *args: cuts.append(args) or cut(*args))
     track = LocalTrack(atlas, found(views, places), heading_known=False)
     assert track.agrees
     assert track.fix.confidence <= 0.95  # no more than that of the place found
@@ -66,7 +66,7 @@ def test_the_track_follows_from_one_map_to_the_next(atlas, views, places, monkey
 def test_a_focal_length_of_a_specification_is_uncertain(atlas, views, places):
     cameras = [replace(view, camera=replace(view.camera, focal_std=0.06)) for view in views]
     track = LocalTrack(atlas, found(cameras, places), heading_known=False)
-    usual = local_track.MODEL.log_scale
+    usual = locate.MODEL.log_scale
     assert track._tracker.model.log_scale == pytest.approx(math.hypot(usual, 0.06))
 
 
@@ -81,7 +81,7 @@ def test_views_of_another_place_have_no_fix(atlas, views, places):
 
 
 def test_views_that_do_not_show_the_place_found_begin_no_track(atlas, views, places, monkeypatch):
-    monkeypatch.setattr(local_track, "AHEAD_M", 0.0)
+    monkeypatch.setattr(locate, "AHEAD_M", 0.0)
     track = LocalTrack(atlas, found(views, places, moved_m=300.0), heading_known=False)
     assert not track.agrees
 

@@ -16,6 +16,7 @@ from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.find import _against, rectified
 from orthonav.atlas.index import make_index
 from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets
+from orthonav.atlas.item import canonical
 from orthonav.atlas.locate import AtlasLocator
 from orthonav.atlas.sheet_registration import SheetRegistrar
 from orthonav.atlas.store import Store
@@ -37,8 +38,7 @@ def fewer_candidates(monkeypatch):
 
 @pytest.fixture(scope="module")
 def search(atlas):
-    with TileSearch(atlas) as opened:
-        yield opened
+    return TileSearch(atlas)
 
 
 @pytest.fixture
@@ -152,31 +152,39 @@ def test_a_removed_sheet_is_retired_and_a_new_one_is_added(copied, tmp_path, mon
         Store, "fetch", lambda self, name, *rest: fetched.append(name) or fetch(self, name, *rest)
     )
     again = make_index(changed, lambda stage, share: stages.append((stage, share)))
-    assert sorted(name.partition("/")[0] for name in fetched) == ["coarse", "index", "index"]
+    assert sorted(name.partition("/")[0] for name in set(fetched)) == ["coarse", "index", "index"]
     assert stages[-1] == ("index", 1.0)
     assert len(again.shards) == len(before.shards) + 1
     assert stale_sheets(changed, again) == ([], [])
-    with TileSearch(changed) as opened:
-        assert not opened.unknown and all(shard.rows for shard in again.shards)
+    assert not TileSearch(changed).unknown and all(shard.rows for shard in again.shards)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda plain: plain["shards"][0].update(name="../../../tmp/x"), "name"),
-        (lambda plain: plain["shards"][0].update(base=-5), "shard"),
-        (lambda plain: plain["shards"][0]["parts"][0].update(rows=2.5), "rows"),
+        (lambda plain: plain["shards"][0].update(name="../../../tmp/x"), "altered"),
+        (lambda plain: plain["shards"][0].update(base=-5), "altered"),
+        (lambda plain: plain["shards"][0]["parts"][0].update(rows=2.5), "altered"),
+        (lambda plain: plain["shards"][0]["parts"][0].update(rows=True), "altered"),
+        (lambda plain: plain["shards"][0]["parts"][0].update(sheet=1), "altered"),
+        (lambda plain: plain["shards"][0]["parts"][0].update(retired=0), "altered"),
+        (lambda plain: _asset(plain).update(name="../../../etc/passwd"), "altered"),
         (lambda plain: _asset(plain).update(size_bytes="x"), "size"),
         (lambda plain: _asset(plain).update(sha256="../../../etc/passwd"), "sha256"),
-        (lambda plain: plain.update(shards=7), "cannot be read"),
+        (lambda plain: plain.update(shards=7), "another kind"),
+        (lambda plain: plain.update(more=7), "altered"),
     ],
-    ids=["name", "base", "rows", "size", "sha256", "shards"],
+    ids=[
+        *("name", "base", "rows", "truth", "sheet", "retired"),
+        *("outside", "size", "sha256", "shards", "more"),
+    ],
 )
 def test_an_untrusted_index_is_checked(atlas, change, words):
     plain = json.loads(atlas.store.read(MANIFEST))
+    assert IndexManifest.from_json(canonical(plain) + b"\n").to_json() == canonical(plain) + b"\n"
     change(plain)
-    with pytest.raises(AtlasError, match=words):
-        IndexManifest.from_json(json.dumps(plain).encode())
+    with pytest.raises(AtlasError, match=f"cannot be read.*{words}"):
+        IndexManifest.from_json(canonical(plain) + b"\n")
 
 
 def _asset(plain):

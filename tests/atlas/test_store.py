@@ -75,7 +75,7 @@ def store(request, tmp_path):
     """An empty place, near and far, with a cache of its own."""
     root = tmp_path / "atlas"
     url = {"folder": str(root), "memory": "memory://test/atlas", "trouble": f"trouble://{root}"}
-    return Store(url[request.param], cache=tmp_path / "cache")
+    return Store(url[request.param])
 
 
 def sha256(data):
@@ -211,7 +211,7 @@ def _of_boto(name, status=None):
     ],
 )
 def test_failures_are_reported_with_their_cause(trouble, tmp_path, error, words):
-    store = Store(f"trouble://{tmp_path}/atlas", cache=tmp_path / "cache")
+    store = Store(f"trouble://{tmp_path}/atlas")
     store.write("items/a", b"12")
     trouble.update(dict.fromkeys(("ls", "info", "get_file", "mv"), error))
     for act in (
@@ -257,13 +257,13 @@ def test_passwords_are_not_shown(monkeypatch):
 def test_a_store_can_be_pickled(store):
     store.write("items/a", b"12")
     again = pickle.loads(pickle.dumps(store))
-    assert (again.url, again.cache, again.read("items/a")) == (store.url, store.cache, b"12")
+    assert (again.url, again.read("items/a")) == (store.url, b"12")
 
 
 @pytest.fixture
 def far(tmp_path):
     """A far place with a file in it, and its cache."""
-    store = Store("memory://test/atlas", cache=tmp_path / "cache")
+    store = Store("memory://test/atlas")
     store.write("sheets/a.onav", b"map of a")
     return store
 
@@ -282,7 +282,7 @@ def test_an_incomplete_copy_is_fetched_again(far):
     assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")).read_bytes() == b"map of a"
 
 
-def test_files_that_differ_from_the_catalogue_are_refused(store):
+def test_files_that_differ_from_the_catalogue_are_refused(store, cache):
     store.write("sheets/a.onav", b"map of a")
     with pytest.raises(StorageError, match=r"incomplete or altered: 8 bytes, the catalogue has 9"):
         store.fetch("sheets/a.onav", 9, sha256(b"map of a"))
@@ -290,8 +290,7 @@ def test_files_that_differ_from_the_catalogue_are_refused(store):
         store.fetch("sheets/a.onav", 8, sha256(b"map of b"))
     with pytest.raises(StorageError, match="no such file"):
         store.fetch("sheets/b.onav", 8, sha256(b"map of b"))
-    assert store.cache is not None
-    assert not [path for path in store.cache.rglob("*") if path.is_file()]
+    assert not [path for path in cache.rglob("*") if path.is_file()]
 
 
 def test_local_files_are_not_copied(tmp_path):

@@ -6,21 +6,25 @@ byte, with any number of workers, on processors that round alike.
 """
 
 import contextlib
+import fcntl
 import logging
-import sys
+import shutil
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from orthonav.atlas.build_report import BuildReport, SheetResult
-from orthonav.atlas.catalog import CATALOG, Atlas, SheetDescription
+from orthonav.atlas.catalog import CATALOG, Atlas
 from orthonav.atlas.cluster import Failure, TaskRunner
 from orthonav.atlas.coarse import write_coarse
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.atlas.scratch import scratch_folder
 from orthonav.atlas.sheet_tasks import (
+    AtlasRequest,
     Imagery,
     SheetTask,
     is_same,
@@ -32,10 +36,8 @@ from orthonav.atlas.sheet_tasks import (
     versions,
 )
 from orthonav.atlas.store import Store
-from orthonav.errors import AreaError, AtlasError, OrthonavError, WorkerError
+from orthonav.errors import AreaError, AtlasError, OrthonavError, OutputError, WorkerError
 from orthonav.files import Progress, no_progress
-from orthonav.geo.area import Extent
-from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.imagery.terrain import open_dem
 from orthonav.prepare.build import BuildRequest, build_map
@@ -47,37 +49,11 @@ PROGRESS_EVERY_S = 10.0
 """Between two lines of progress."""
 GIVE_UP_AFTER = 8
 """Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
+SCRATCH = "orthonav-sheet-"
+"""Names of temporary folders begin with it."""
+_LOCK = "in-use"
 LEARNT = ("autoencoder", "triplet")
 """Methods for which a worker is given a GPU."""
-
-
-@dataclass(frozen=True)
-class AtlasRequest:
-    """What to build into an atlas.
-
-    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
-    `orthos`: files and folders of orthophotos; the first covers the next.
-    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
-    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
-    `bounds_deg`: area: west, south, east, north.
-    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
-    imagery is the area.
-    `replace`: rebuild sheets that were made otherwise, instead of refusing them.
-    `index`: also make the index of the coarse tiles.
-    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
-    what its heights count from.
-    """
-
-    url: str
-    orthos: Sequence[Path]
-    recipe: Mapping[str, Any] = field(default_factory=dict)
-    bounds_deg: Extent | None = None
-    route: Route | None = None
-    band_m: float | None = None
-    replace: bool = False
-    index: bool = True
-    dem: Path | None = None
-    dem_datum: str | None = None
 
 
 def build_atlas(
@@ -97,17 +73,9 @@ def build_atlas(
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)
-    tasks = plan_sheets(
-        Store(request.url).url,
-        recipe,
-        mosaic,
-        orthos,
-        bounds_deg=request.bounds_deg,
-        route=request.route,
-        band_m=request.band_m,
-        dem=_checked_dem(request),
-        dem_datum=request.dem_datum,
-    )
+    dem = request.dem and open_dem(Path(request.dem).absolute(), request.dem_datum).path
+    request = replace(request, url=Store(request.url).url, orthos=orthos, dem=dem)
+    tasks = plan_sheets(request, recipe, mosaic)
     _require_same_versions(runner)
     atlas = Atlas.open_or_create(request.url, recipe)
     known = atlas.sheets()
@@ -116,28 +84,23 @@ def build_atlas(
     result = BuildReport(atlas.url, len(tasks), started_s)
     missing = []
     for task in tasks:
-        if task.sheet in known and is_same(task, known):
-            area_km2 = known[task.sheet].area_km2
-            result.add(task.sheet, SheetResult(task.sheet, "unchanged", area_km2=area_km2))
+        name = task.sheet.id
+        if name in known and is_same(task, known):
+            area_km2 = known[name].area_km2
+            result.results.append(SheetResult(name, "unchanged", area_km2=area_km2))
         else:
             missing.append(task)
-    unchanged = f", {result.done} are there already" if result.done else ""
+    there = len(result.results)
+    unchanged = f", {there} are there already" if there else ""
     report(
         f"{len(tasks):,} sheets of at most {recipe.sheet_km:g} km at {recipe.gsd_m:g} m"
         f"{unchanged}; {len(missing):,} to build, {runner.at_once} at a time"
     )
     _build_sheets(missing, recipe, runner, result, progress, report)
-    index = request.index and recipe.coarse is not None and not result.failed
+    index = request.index and recipe.coarse is not None and not result.names("failed")
     result.finish_error = _finish(atlas, index, progress)
     result.wall_s = time.monotonic() - started_s
     return result
-
-
-def _checked_dem(request: AtlasRequest) -> Path | None:
-    """The terrain model, opened once before the work; raises as `open_dem`."""
-    if request.dem is None:
-        return None
-    return open_dem(Path(request.dem).absolute(), request.dem_datum).path
 
 
 def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
@@ -169,35 +132,37 @@ def build_sheet(task: SheetTask) -> SheetResult:
     sees other imagery, `ImageryError`, `OutputError`, `StorageError`.
     """
     wall_s, cpu_s = time.perf_counter(), time.process_time()
-    if differences := version_differences(task.made_by, versions()):
+    wanted = task.sheet
+    if differences := version_differences(wanted.made_by, versions()):
         raise WorkerError(_other_versions("this worker", differences))
-    mosaic = Imagery(Mosaic.open(task.orthos)).under(task.bounds_deg, margin_m(task.recipe))
-    wanted = request_digest(task.recipe, mosaic, task.made_by, task.dem, task.dem_datum)
-    if wanted != task.request:
+    mosaic = Imagery(Mosaic.open(task.orthos)).under(wanted.bounds_deg, margin_m(task.recipe))
+    found = request_digest(task.recipe, mosaic, wanted.made_by, task.dem, task.dem_datum)
+    if found != wanted.request:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with scratch_folder() as folder:
-        tiles, area_km2, size_bytes = _built(task, mosaic, folder)
+        built = _built(task, mosaic, folder)
     return SheetResult(
-        task.sheet,
-        "built" if tiles else "empty",
+        wanted.id,
+        "empty" if built is None else "built",
         cpu_s=time.process_time() - cpu_s,
         wall_s=time.perf_counter() - wall_s,
-        size_bytes=size_bytes,
-        area_km2=area_km2,
-        tiles=tiles,
+        size_bytes=built.size_bytes if built else 0,
+        area_km2=built.area_km2 if built else 0.0,
+        tiles=built.tiles if built else 0,
         peak_bytes=_peak_bytes(),
     )
 
 
-def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, int]:
-    """Tiles, km2 and bytes of a sheet that is now in the atlas; zeros where it has no imagery."""
+def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
+    """The sheet, which is now in the atlas; None where it has no imagery."""
     recipe = asdict(task.recipe)
     del recipe["sheet_km"], recipe["coarse"]
-    files = {"map": folder / f"{task.sheet}.onav"}
+    name, bounds_deg = task.sheet.id, task.sheet.bounds_deg
+    files = {"map": folder / f"{name}.onav"}
     request = BuildRequest(
         orthos=task.orthos,
         out=files["map"],
-        bounds_deg=task.bounds_deg,
+        bounds_deg=bounds_deg,
         workers=1,
         dem=task.dem,
         dem_datum=task.dem_datum,
@@ -206,27 +171,15 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, i
         **recipe,
     )
     try:
-        manifest = build_map(request, announce=log.debug).manifest
+        info = build_map(request, announce=log.debug).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
-        log.info("%s is empty: %s", task.sheet, error)
-        return 0, 0.0, 0
+        log.info("%s is empty: %s", name, error)
+        return None
     if task.recipe.coarse is not None:
-        files["coarse"] = folder / f"{task.sheet}.safetensors"
-        write_coarse(mosaic, task.bounds_deg, task.recipe.coarse, files["coarse"])
-    info = manifest.sheets[0]
-    described = SheetDescription(
-        id=task.sheet,
-        bounds_deg=task.bounds_deg,
-        gsd_m=task.recipe.gsd_m,
-        tiles=info.tiles,
-        area_km2=info.area_km2,
-        dates=task.dates,
-        imagery=task.imagery,
-        request=task.request,
-        made_by=task.made_by,
-    )
-    sheet = Atlas.open(task.atlas).put(files, described)
-    return info.tiles, info.area_km2, sheet.size_bytes
+        files["coarse"] = folder / f"{name}.safetensors"
+        write_coarse(mosaic, bounds_deg, task.recipe.coarse, files["coarse"])
+    described = replace(task.sheet, tiles=info.tiles, area_km2=info.area_km2)
+    return Atlas.open(task.atlas).put(files, described)
 
 
 def _build_sheets(
@@ -243,13 +196,14 @@ def _build_sheets(
     gpu = recipe.method.partition(":")[0] in LEARNT
     finished = runner.run(build_sheet, tasks, gpu=gpu)
     for task, made in finished:
-        result.add(task.sheet, made)
         if isinstance(made, Failure):
-            log.info("sheet %s failed: %s: %s", task.sheet, made.kind, made.text)
+            log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
             log.debug("%s", made.trace)
             not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
+            made = SheetResult(task.sheet.id, "failed", f"{made.kind}: {made.text}")
         else:
             not_stored = 0
+        result.results.append(made)
         progress("sheets", result.share)
         if not_stored >= GIVE_UP_AFTER:
             report(f"{not_stored} sheets in a row could not be stored: the others are not tried")
@@ -290,16 +244,38 @@ def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
     return None
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards.
+
+    It is locked while this process lives; folders of processes that were killed are removed first.
+    Raises `OutputError`.
+    """
+    root = Path(tempfile.gettempdir())
+    for path in root.glob(f"{SCRATCH}*/{_LOCK}"):
+        with contextlib.suppress(OSError), path.open("r+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(path.parent, ignore_errors=True)
+    try:
+        made = tempfile.TemporaryDirectory(prefix=SCRATCH, dir=root, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise OutputError(f"no temporary folder can be made ({error.strerror}): {root}") from error
+    with made as name:
+        folder = Path(name)
+        with (folder / f".{_LOCK}").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            (folder / f".{_LOCK}").rename(folder / _LOCK)  # visible to others only when locked
+            yield folder
+
+
 def _peak_bytes() -> int:
-    """Greatest memory that this process ever had, earlier sheets included."""
-    with contextlib.suppress(OSError):  # Linux's own count: getrusage's includes the parent's
+    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown.
+
+    Linux's own count: that of getrusage includes the parent's.
+    """
+    with contextlib.suppress(OSError):
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         for line in status.splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    with contextlib.suppress(ImportError):  # not a Unix
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
     return 0

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from orthonav.atlas.cluster import Failure
+Status = Literal["built", "unchanged", "empty", "failed"]
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,8 @@ class SheetResult:
     """The result of one sheet and its cost.
 
     `sheet`: name.
-    `status`: `built`; `unchanged`, it was there already; `empty`, there is no imagery.
+    `status`: `built`; `unchanged`, it was there already; `empty`, there is no imagery; `failed`.
+    `error`: why it failed.
     `cpu_s`: processor time.
     `wall_s`: time that the worker spent on it.
     `size_bytes`, `area_km2`, `tiles`: of the sheet.
@@ -20,7 +21,8 @@ class SheetResult:
     """
 
     sheet: str
-    status: Literal["built", "unchanged", "empty"]
+    status: Status
+    error: str = ""
     cpu_s: float = 0.0
     wall_s: float = 0.0
     size_bytes: int = 0
@@ -36,8 +38,7 @@ class BuildReport:
     `url`: the atlas.
     `total`: sheets asked for.
     `started_s`: monotonic clock at the start.
-    `results`: sheets that are finished.
-    `failed`: sheets that failed, each with its error.
+    `results`: sheets that are finished or failed.
     `finish_error`: why snapshot or index could not be written.
     """
 
@@ -45,66 +46,42 @@ class BuildReport:
     total: int
     started_s: float = field(default_factory=time.monotonic)
     results: list[SheetResult] = field(default_factory=list)
-    failed: list[tuple[str, str]] = field(default_factory=list)
     finish_error: str | None = None
     wall_s: float = 0.0
 
-    def add(self, sheet: str, result: SheetResult | Failure) -> None:
-        """Add what came of a sheet."""
-        if isinstance(result, Failure):
-            self.failed.append((sheet, f"{result.kind}: {result.text}"))
-        else:
-            self.results.append(result)
-
-    @property
-    def built(self) -> tuple[str, ...]:
-        """Names of the sheets that were built."""
-        return self._names("built")
-
-    @property
-    def unchanged(self) -> tuple[str, ...]:
-        """Names of the sheets that were there already."""
-        return self._names("unchanged")
-
-    @property
-    def empty(self) -> tuple[str, ...]:
-        """Names of the sheets without imagery."""
-        return self._names("empty")
-
-    @property
-    def done(self) -> int:
-        """Number of sheets that are finished or failed."""
-        return len(self.results) + len(self.failed)
+    def names(self, status: Status) -> list[str]:
+        """Names of the sheets with that status, sorted."""
+        return sorted(each.sheet for each in self.results if each.status == status)
 
     @property
     def untried(self) -> int:
         """Number of sheets that were not begun."""
-        return self.total - self.done
+        return self.total - len(self.results)
 
     @property
     def share(self) -> float:
         """Share of the sheets that is done."""
-        return self.done / max(1, self.total)
+        return len(self.results) / max(1, self.total)
 
     @property
     def is_complete(self) -> bool:
         """Whether all that was asked for is there."""
-        return not self.failed and not self.untried and self.finish_error is None
+        return not self.names("failed") and not self.untried and self.finish_error is None
 
     def line(self) -> str:
         """Progress in one line."""
         plain = self.to_plain()
-        text = f"{self.done:,} of {self.total:,} sheets"
+        text = f"{len(self.results):,} of {self.total:,} sheets"
         if plain["area_km2"]:
             text += (
                 f", {plain['km2_per_hour']:,.0f} km2/h, {plain['cpu_s_per_km2']:.2f} CPU s/km2, "
                 f"{plain['mb_per_km2']:.2f} MB/km2"
             )
-        tried = self.done - len(self.unchanged)
+        tried = len(self.results) - plain["unchanged"]
         if tried:
             left_s = plain["wall_s"] / tried * self.untried
             text += f", {duration(left_s)} left"
-        return text + (f", {len(self.failed)} failed" if self.failed else "")
+        return text + (f", {len(plain['failed'])} failed" if plain["failed"] else "")
 
     def to_plain(self, cpu_hour_price: float | None = None) -> dict[str, Any]:
         """Sums and rates as plain values; `cpu_hour_price` is the price of an hour of a core.
@@ -120,9 +97,13 @@ class BuildReport:
         plain: dict[str, Any] = {
             "atlas": self.url,
             "built": len(built),
-            "unchanged": len(self.unchanged),
-            "empty": len(self.empty),
-            "failed": [{"sheet": sheet, "error": error} for sheet, error in sorted(self.failed)],
+            "unchanged": len(self.names("unchanged")),
+            "empty": len(self.names("empty")),
+            "failed": [
+                {"sheet": each.sheet, "error": each.error}
+                for each in sorted(self.results, key=lambda each: each.sheet)
+                if each.status == "failed"
+            ],
             "untried": self.untried,
             "area_km2": round(area_km2, 4),
             "tiles": sum(each.tiles for each in built),
@@ -142,9 +123,6 @@ class BuildReport:
             plain["cost"] = round(cost, 4)
             plain["cost_per_km2"] = _rate(cost, area_km2, 6)
         return plain
-
-    def _names(self, status: str) -> tuple[str, ...]:
-        return tuple(sorted(each.sheet for each in self.results if each.status == status))
 
 
 def duration(seconds: float) -> str:

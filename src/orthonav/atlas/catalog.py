@@ -14,7 +14,6 @@ from orthonav.atlas.item import (
     MAX_ITEM_BYTES,
     STAC_VERSION,
     Sheet,
-    SheetDescription,
     StoredFile,
     canonical,
     file_name,
@@ -27,8 +26,6 @@ from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AreaError, AtlasError, MissingFileError
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Extent
-
-__all__ = ["Atlas", "Sheet", "SheetDescription", "StoredFile", "copy_sheets"]
 
 CATALOG = "atlas.json"
 _SAME_PLACE_DEG = 1e-9
@@ -53,40 +50,26 @@ class Atlas:
         return self.store.url
 
     @classmethod
-    def open(cls, url: str | Path, *, cache: Path | None = None) -> "Atlas":
+    def open(cls, url: str | Path) -> "Atlas":
         """Open an atlas. Raises `AtlasError` where there is none, or it is not ours."""
-        store = Store(str(url), cache)
+        store = Store(str(url))
         if store.size(CATALOG) is None:
             raise AtlasError(f"no atlas: it has no {CATALOG}: {store}")
         return cls(store, _read_catalog(store))
 
     @classmethod
-    def create(cls, url: str | Path, recipe: AtlasRecipe, *, cache: Path | None = None) -> "Atlas":
-        """Create an atlas. Raises `AtlasError` where the folder holds one, or anything else."""
-        store = Store(str(url), cache)
-        if store.size(CATALOG) is not None:
-            raise AtlasError(f"there is an atlas already: {store}")
-        if not _is_free(store):
-            raise AtlasError(f"the folder holds other files; name another: {store}")
-        store.write(CATALOG, _catalog(recipe))
-        return cls.open(url, cache=cache).require_recipe(recipe)
-
-    @classmethod
-    def open_or_create(
-        cls, url: str | Path, recipe: AtlasRecipe, *, cache: Path | None = None
-    ) -> "Atlas":
+    def open_or_create(cls, url: str | Path, recipe: AtlasRecipe) -> "Atlas":
         """Open an atlas, or create it where there is none.
 
-        Raises `AtlasError` with the differences where it has another recipe.
+        Raises `AtlasError` with the differences where it has another recipe, and where the folder
+        holds other files.
         """
-        store = Store(str(url), cache)
-        if store.size(CATALOG) is None:
-            try:
-                return cls.create(url, recipe, cache=cache)
-            except AtlasError:
-                if store.size(CATALOG) is None:
-                    raise  # else another process has created it meanwhile
-        return cls.open(url, cache=cache).require_recipe(recipe)
+        store = Store(str(url))
+        if _is_free(store):
+            store.write(CATALOG, _catalog(recipe))
+        elif store.size(CATALOG) is None:
+            raise AtlasError(f"the folder holds other files; name another: {store}")
+        return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:
         """All sheets by name, sorted. Raises `AtlasError` where an item is damaged."""
@@ -118,7 +101,7 @@ class Atlas:
         west, south, east, north = zip(*boxes, strict=True)
         return min(west), min(south), max(east), max(north)
 
-    def put(self, files: Mapping[str, Path], described: SheetDescription) -> Sheet:
+    def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
         """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`.
 
         Nothing is written where the same files of the same request are there already. Safe with
@@ -133,7 +116,7 @@ class Atlas:
             sheet = before
         else:
             revision = 1 + max((_revision(each) for each in there), default=0)
-            sheet = Sheet.of(described, revision, stored)
+            sheet = described.stored(revision, stored)
         self.require_place(sheet)
         self._upload(sheet, files, _named_by(there))
         if sheet is not before:
@@ -316,14 +299,12 @@ def _read_catalog(store: Store) -> AtlasRecipe:
     if not isinstance(own, dict) or own.get("format") != FORMAT:
         raise AtlasError(f"not an atlas of orthonav: {where}")
     schema = own.get("schema")
-    if type(schema) is not int or schema < 1:
-        raise AtlasError(f"atlas has an impossible schema: {where}")
-    if schema > SCHEMA:
+    if isinstance(schema, int) and schema > SCHEMA:
         raise AtlasError(
             f"atlas has schema {schema}, this program reads up to {SCHEMA}; update orthonav: "
             f"{where}"
         )
     recipe = AtlasRecipe.from_plain(own.get("recipe"))
     if _catalog(recipe) != data:
-        raise AtlasError(f"atlas was altered or has an impossible recipe: {where}")
+        raise AtlasError(f"atlas was altered or has an impossible recipe or schema: {where}")
     return recipe

@@ -6,7 +6,6 @@ half a tile beyond the box. So every place of the atlas is within half a stride 
 """
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from orthonav import represent
-from orthonav.atlas.item import reason
+from orthonav.atlas.item import canonical, reason
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.embed.cells import MICRO
 from orthonav.embed.whitened import WhitenedRecipe, pooled_features
@@ -24,6 +23,7 @@ from orthonav.errors import AreaError, AtlasError
 from orthonav.files import no_progress, require_file
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
+from orthonav.geo.world import in_box
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile.writer import METADATA_KEY, save_tensors
 from orthonav.prepare.calibrate import CropSampler
@@ -71,15 +71,20 @@ class CoarseTiles:
         return self.features[tiles].astype(np.float32), np.repeat(share, repeats, axis=1)
 
 
+def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
+    """The grid of the coarse tiles of an area. Raises `AreaError` for impossible recipes."""
+    return TileGrid.covering(
+        area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
+    )
+
+
 def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
     """The coarse tiles whose centres lie in a box, made from the imagery with one thread.
 
     Raises `AreaError` for impossible recipes, `ImageryError` where the imagery cannot be read.
     """
     area = Area.from_bounds(bounds_deg)
-    grid = TileGrid.covering(
-        area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
-    )
+    grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
     reader = SheetReader(
         mosaic, area, grid, representation, _NoCrops(recipe.tile_px, 0), registration=False
@@ -87,7 +92,7 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
     rows, cols = np.mgrid[: grid.rows, : grid.cols]
     tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
     latlon = np.stack(area.frame.latlon_from_en(grid.centres_en_m(tiles)), axis=1)
-    inside = _inside(latlon, bounds_deg)
+    inside = in_box(bounds_deg, *latlon.T)
     tiles, latlon = tiles[inside], latlon[inside]
     try:
         reader.read(no_progress, workers=1)
@@ -117,7 +122,7 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
         "features": made.features,
         "valid": made.valid,
     }
-    save_tensors(path, arrays, _metadata(made), "coarse tiles")
+    save_tensors(path, arrays, _metadata(recipe, bounds_deg), "coarse tiles")
     return len(made.valid)
 
 
@@ -159,42 +164,33 @@ class _NoCrops(CropSampler):
         return np.zeros((0, 2), np.intp)
 
 
-def _inside(latlon_deg: NDArray[np.float64], bounds_deg: Extent) -> NDArray[np.bool_]:
-    """Which places (N, 2) lie in a box, its southern and western border included."""
-    west, south, east, north = bounds_deg
-    lat, turned = latlon_deg[:, 0], (latlon_deg[:, 1] - west) % 360
-    return np.asarray((lat >= south) & (lat < north) & (turned < (east - west)))
-
-
-def _metadata(made: CoarseTiles) -> str:
+def _metadata(recipe: CoarseRecipe, bounds_deg: Extent) -> str:
     plain = {
         "format": FORMAT,
         "schema": SCHEMA,
-        "recipe": asdict(made.recipe),
+        "recipe": asdict(recipe),
         "edges": EDGES,
         "cells": POOLING.cells,
-        "bounds_deg": list(made.bounds_deg),
+        "bounds_deg": bounds_deg,
     }
-    return json.dumps(plain, sort_keys=True, separators=(",", ":"))
+    return canonical(plain).decode()
 
 
 def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
+    """What `_metadata` wrote; raises `AtlasError` unless writing it again gives the same."""
     plain: Any = json.loads(metadata)
-    if plain["format"] != FORMAT:
-        raise AtlasError("not coarse tiles of an atlas")
     if plain["schema"] != SCHEMA:
-        raise AtlasError(f"coarse tiles of schema {plain['schema']!r:.20}, this program reads 1")
-    if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
         raise AtlasError(
-            f"coarse tiles show {plain['edges']!r:.40} in {plain['cells']!r:.20} cells, "
-            f"this program compares {EDGES} in {POOLING.cells}"
+            f"coarse tiles of schema {plain['schema']!r:.20}, this program reads {SCHEMA}"
         )
     recipe = CoarseRecipe(**plain["recipe"])
-    west, south, east, north = (float(value) for value in plain["bounds_deg"])
-    complete = asdict(recipe) == plain["recipe"] and math.isfinite(west + south + east + north)
-    if not complete or recipe.tile_px % MICRO:
-        raise AtlasError("coarse tiles have an impossible recipe")
-    return recipe, (west, south, east, north)
+    west, south, east, north = map(float, plain["bounds_deg"])
+    bounds_deg = west, south, east, north
+    if _metadata(recipe, bounds_deg) != metadata or recipe.tile_px % MICRO:
+        raise AtlasError(
+            f"altered, or not coarse tiles of an atlas ({EDGES} in {POOLING.cells} cells)"
+        )
+    return recipe, bounds_deg
 
 
 def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
@@ -216,7 +212,7 @@ def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -
         raise AtlasError("coarse tiles are damaged (not finite)")
     west, south, east, north = bounds_deg
     slack = west - _SLACK_DEG, south - _SLACK_DEG, east + 2 * _SLACK_DEG, north + 2 * _SLACK_DEG
-    if not _inside(centres, slack).all():
+    if not in_box(slack, *centres.T).all():
         raise AtlasError("coarse tiles are damaged (centres lie outside their sheet)")
     for array in (centres, features, valid):
         array.flags.writeable = False

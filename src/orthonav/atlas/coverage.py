@@ -82,17 +82,13 @@ def check_covered(
     covered = _covered(sources, lat, lon)
     if not covered.any():
         raise AreaError("no part of the area lies on a sheet of the atlas")
-    names = _missing(lattice, lat[~covered], lon[~covered])
     route_lat, route_lon = area.frame.latlon_from_en(_route_en_m(area, grid))
-    on_route = ~_covered(sources, route_lat, route_lon)
-    under = _missing(lattice, route_lat[on_route], route_lon[on_route])
-    _require_route(on_route, f"lies on sheets that the atlas lacks ({under})", allow_holes)
-    if names:
-        log.warning(
-            "%.3g %% of the area lies on sheets that the atlas lacks: %s",
-            100 * float((~covered).mean()),
-            names,
-        )
+    missing = ~_covered(sources, route_lat, route_lon)
+    under = _missing(lattice, route_lat[missing], route_lon[missing])
+    elsewhere = _missing(lattice, lat[~covered], lon[~covered])
+    lacks = "lies on sheets that the atlas lacks"
+    _require_route(missing, f"{lacks} ({under})", allow_holes)
+    _warn_area(~covered, f"{lacks}: {elsewhere}")
 
 
 def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool) -> None:
@@ -100,22 +96,27 @@ def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool)
 
     With `allow_holes` that is a warning too.
     """
-    share = cells.valid_share(_some_tiles(area, grid) * grid.stride_px)
-    empty = float((share < MIN_TILE_VALID_SHARE).mean())
-    if empty > 0:
-        log.warning("%.3g %% of the area has no imagery in the atlas", 100 * empty)
     route = grid.tiles_rc(_route_en_m(area, grid)).clip(0, [grid.rows - 1, grid.cols - 1])
-    bare = cells.valid_share(route * grid.stride_px) < MIN_TILE_VALID_SHARE
-    _require_route(bare, "has no imagery in the atlas", allow_holes)
+    tiles, lacks = _some_tiles(area, grid), "has no imagery in the atlas"
+    on_route, bare = (
+        cells.valid_share(each * grid.stride_px) < MIN_TILE_VALID_SHARE for each in (route, tiles)
+    )
+    _require_route(on_route, lacks, allow_holes)
+    _warn_area(bare, lacks)
 
 
-def _require_route(lacking: NDArray[np.bool_], what: str, allow_holes: bool) -> None:
+def _require_route(lacking: NDArray[np.bool_], lacks: str, allow_holes: bool) -> None:
     """Raise `AtlasError` where points (N,) along a route lack something, unless holes may be."""
     if lacking.any() and not allow_holes:
         raise AtlasError(
-            f"{lacking.mean():.0%} of the route {what}; extend the atlas, or allow holes "
+            f"{lacking.mean():.0%} of the route {lacks}; extend the atlas, or allow holes "
             "(--allow-holes)"
         )
+
+
+def _warn_area(lacking: NDArray[np.bool_], lacks: str) -> None:
+    if lacking.any():
+        log.warning("%.3g %% of the area %s", 100 * float(lacking.mean()), lacks)
 
 
 def _covered(sources: Sequence[SheetSource], lat: Array, lon: Array) -> NDArray[np.bool_]:

@@ -5,8 +5,8 @@ are embedded from the cell means of the sheets, and confidences are pooled. The 
 the same bytes for any number of threads.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_covered, check_shown, require_sheets
-from orthonav.atlas.cut_sheets import CutSheet, opened_sheets, pooled_manifest, recipes
-from orthonav.atlas.cut_terrain import cut_terrain
-from orthonav.atlas.warp import Warp, joined_cells, joined_grey
+from orthonav.atlas.cut_sheets import cut_terrain, opened_sheets, pooled_manifest, recipes
+from orthonav.atlas.warp import SheetSource, Warp, joined_cells, joined_grey
 from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, learn
@@ -26,10 +25,11 @@ from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.route import Route
+from orthonav.geo.world import in_box
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
-from orthonav.prepare.blocks import Block, Preview, blocks_of
+from orthonav.prepare.blocks import Block, Preview
 from orthonav.prepare.build import BuildResult
 from orthonav.prepare.layer import GreyLayerWriter, Parts
 from orthonav.prepare.layout import grid_of, tiles_of
@@ -37,8 +37,9 @@ from orthonav.prepare.parallel import in_order
 from orthonav.prepare.request import MAX_WORKERS
 from orthonav.prepare.sheet import (
     PREVIEW_PX,
-    block_side_px,
+    blocks_of_area,
     layer_parts,
+    one_opencv_thread,
     put_layer_parts,
 )
 from orthonav.represent.gradients import OrientedGradients
@@ -71,8 +72,7 @@ def cut_map(
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
     _check_out(atlas, out, cutter.members)
-    sources = [each.source for each in cutter.members]
-    check_covered(area, cutter.grid, sources, atlas.recipe.sheets, allow_holes)
+    check_covered(area, cutter.grid, cutter.members, atlas.recipe.sheets, allow_holes)
     progress("sheets", 1.0)
     cutter.read(progress, workers)
     check_shown(area, cutter.grid, cutter.cells, allow_holes)
@@ -105,7 +105,7 @@ class _MapCutter:
         self.members = members = opened_sheets(atlas, sheets, grid)
         self.recipe, representation = recipes(members[0].manifest)
         turns = isinstance(representation, OrientedGradients)
-        self._warps = [Warp(each.source, area.frame, grid, turns) for each in members]
+        self._warps = [Warp(each, area.frame, grid, turns) for each in members]
         self._layout = layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
         height, width = grid.height_px, grid.width_px
         self.cells = CellSheet(layout, height, width, representation.channels)
@@ -114,25 +114,12 @@ class _MapCutter:
 
     def read(self, progress: Progress, workers: int) -> None:
         """Resample all blocks with `workers` threads. Raises `AtlasError` for a damaged sheet."""
-        side_px = block_side_px(self.grid.tile_px, self._layout.micro_px)
-        blocks = [
-            block
-            for block in blocks_of(self.grid, side_px)
-            if block.may_matter(self.area, self.grid)
-        ]
-
-        @contextmanager
-        def opened() -> Iterator[Callable[[Block], Parts]]:
-            yield self._made
-
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            for done, parts in enumerate(in_order(blocks, opened, workers)):
+        blocks = blocks_of_area(self.area, self.grid, self._layout)
+        with one_opencv_thread():
+            made = in_order(blocks, lambda: nullcontext(self._made), workers)
+            for done, parts in enumerate(made):
                 self._take(blocks[done], parts)
                 progress("imagery", (done + 1) / len(blocks))
-        finally:
-            cv2.setNumThreads(threads)
 
     def _made(self, block: Block) -> Parts:
         """The parts of the map in a block. Called by several threads: changes nothing."""
@@ -168,7 +155,7 @@ def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) 
     return Area.from_bounds(bounds_deg)
 
 
-def _check_out(atlas: Atlas, out: Path, members: Sequence[CutSheet]) -> None:
+def _check_out(atlas: Atlas, out: Path, members: Sequence[SheetSource]) -> None:
     if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in members):
         raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
 
@@ -202,14 +189,10 @@ def _learnt(
 
 
 def _shares(
-    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[CutSheet]
+    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[SheetSource]
 ) -> NDArray[np.float64]:
     """Share of the tiles in the box of each sheet; equal shares where there are none."""
     lat, lon = area.frame.latlon_from_en(centres_en_m)
-    counts = []
-    for each in members:
-        west, south, east, north = each.sheet.bounds_deg
-        inside = (lon >= west) & (lon < east) & (lat >= south) & (lat < north)
-        counts.append(float(np.count_nonzero(inside)))
-    found = np.array(counts)
+    boxes = [each.sheet.bounds_deg for each in members]
+    found = np.array([np.count_nonzero(in_box(box, lat, lon)) for box in boxes], np.float64)
     return found / found.sum() if found.any() else np.full(len(found), 1 / len(found))

@@ -1,54 +1,63 @@
-"""The sheets that a map is cut from: opened, checked for the same recipe, manifests joined."""
+"""The sheets that a map is cut from: opened, checked for the same recipe, and what they say joined:
+manifests, confidences, terrain.
 
+The confidences of a cut map are pooled from those of its sheets, not learnt again. Where on the map
+a view was taken is not known, so the confidence of a fix is the mean of the sheets' confidences,
+weighted by their shares of the map. A logistic regression cannot represent that mean exactly. The
+pooled one has the mean weights, and a bias so low that it nowhere exceeds the mean in the range of
+evidence that decides.
+"""
+
+import itertools
 import json
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
-from orthonav.atlas.catalog import Atlas, Sheet
-from orthonav.atlas.pooled_confidence import pooled_registered, pooled_tiles
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.warp import SheetSource
 from orthonav.confidence.logistic import LogisticConfidence
-from orthonav.confidence.registered import RegisteredConfidence
+from orthonav.confidence.registered import CHANCES, Chances, RegisteredConfidence
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.errors import AtlasError, MapFileError, MissingFileError, VariantError
+from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
+from orthonav.geo.world import in_box
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile, open_map
 from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.prepare.cellparts import StoredCells
+from orthonav.prepare.terrain import TerrainParts, terrain_parts
 from orthonav.variants import variant_from_recipe
 
 CACHE_BYTES = 24 * 2**20
 """Decoded chunks cached of each sheet: those along the border of a row of blocks."""
 REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
 
-
-@dataclass(frozen=True, eq=False)
-class CutSheet:
-    """A sheet that a map is cut from: its item, manifest, pixels and, if it has one, terrain."""
-
-    sheet: Sheet
-    manifest: Manifest
-    source: SheetSource
-    terrain: TerrainLayer | None = None
+DECIDING = 0.5, 0.99
+"""Thresholds of acceptance lie in this range of probabilities."""
+SCORES = np.linspace(0.05, 1.0, 20)
+MARGINS = np.linspace(0.0, 0.6, 13)
+"""Evidence at which the pooled confidence is compared with the sheets': scores and margins of
+tiles."""
+Array = NDArray[np.float64]
 
 
-def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[CutSheet]:
+def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
     """Open and verify sheets. Raises `AtlasError` where one is damaged or differs from others."""
-    found: list[CutSheet] = []
+    found: list[SheetSource] = []
     for sheet in sheets:
         try:
             opened = open_map(atlas.path(sheet, "map"))
             _check_alike(opened, sheet, grid, found[0].manifest if found else None)
-            terrain = TerrainLayer.of(opened)
-            found.append(CutSheet(sheet, opened.manifest, _source(opened, sheet), terrain))
+            found.append(_source(opened, sheet))
         except (MapFileError, MissingFileError) as error:
             raise AtlasError(f"sheet {sheet.id} is damaged, {REBUILD}: {error}") from error
     return found
@@ -70,7 +79,7 @@ def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
 
 
 def pooled_manifest(
-    members: Sequence[CutSheet], shares: NDArray[np.float64], sheet: SheetInfo
+    members: Sequence[SheetSource], shares: NDArray[np.float64], sheet: SheetInfo
 ) -> Manifest:
     """Manifest of a map with that sheet, cut from sheets that make up these shares of it."""
     manifests = [member.manifest for member in members]
@@ -80,7 +89,7 @@ def pooled_manifest(
         for each, share in zip(manifests, shares, strict=True)
         if each.confidence is not None and share > 0
     ]
-    confidence = pooled_tiles(*_apart(known), sheet.tiles / tiles)
+    confidence = pooled_tiles([c for c, _ in known], [s for _, s in known], sheet.tiles / tiles)
     return Manifest(
         recipe={
             **manifests[0].recipe,
@@ -116,8 +125,40 @@ def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) ->
     }
 
 
-def _apart(known: Sequence[tuple[Any, float]]) -> tuple[list[Any], list[float]]:
-    return [confidence for confidence, _ in known], [share for _, share in known]
+def pooled_tiles(
+    confidences: Sequence[LogisticConfidence], shares: Sequence[float], more_tiles: float
+) -> LogisticConfidence | None:
+    """Confidence of tile search on a map made of sheets in these shares; None without sheets.
+
+    `more_tiles`: tiles of the map over tiles of a sheet. As many times more tiles resemble a view
+    by chance, and the odds of the best tile are lower by that factor.
+    """
+    if not confidences:
+        return None
+    bias = float(np.average([each.bias for each in confidences], weights=shares))
+    weights = np.average([each.weights for each in confidences], axis=0, weights=shares)
+    pooled = LogisticConfidence(bias, tuple(weights.tolist()))
+    evidence = [{"score": s, "margin": m} for s, m in itertools.product(SCORES, MARGINS) if m <= s]
+    own = np.array([pooled(each) for each in evidence])
+    theirs = np.array([[single(each) for each in evidence] for single in confidences])
+    mean = np.average(theirs, axis=0, weights=shares)
+    deciding = (own > DECIDING[0]) & (mean < DECIDING[1])
+    own, mean = (np.clip(each[deciding], 1e-9, 1 - 1e-9) for each in (own, mean))
+    excess = (np.log(own / (1 - own)) - np.log(mean / (1 - mean))).max(initial=0.0)
+    return LogisticConfidence(bias - float(excess) - math.log(max(more_tiles, 1.0)), pooled.weights)
+
+
+def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> RegisteredConfidence | None:
+    """Confidence of registered views on a map made of sheets; None without sheets.
+
+    It is the usual one, with the scores of chance of the sheet where they are highest.
+    """
+    if not confidences:
+        return None
+    chances = Chances(
+        **{name: max(getattr(each.chances, name) for each in confidences) for name in CHANCES}
+    )
+    return RegisteredConfidence.usual(chances)
 
 
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
@@ -161,4 +202,38 @@ def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
         raise AtlasError(
             f"sheet {sheet.id} has no {lacking}, from which maps are cut; {REBUILD}: {opened.path}"
         )
-    return SheetSource(sheet.id, sheet.bounds_deg, info.frame, info.grid, layer, cells)
+    return SheetSource(sheet, opened.manifest, layer, cells, TerrainLayer.of(opened))
+
+
+def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> TerrainParts | None:
+    """The terrain layer of a map cut from sheets; None where none of them has one.
+
+    A place has the height of the sheet whose box holds it, else of one that reaches over its
+    border. Raises `MapFileError` for a damaged layer.
+    """
+    layers = [(each, each.terrain) for each in members if each.terrain is not None]
+    if not layers:
+        return None
+    infos = [layer.info for _, layer in layers]
+    posting_m = min(info.posting_m for info in infos)
+    names, datums = sorted({info.name for info in infos}), sorted({info.datum for info in infos})
+
+    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> Array:
+        row, col = np.mgrid[:rows, :cols] + 0.5
+        points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
+        return _heights(layers, *area.frame.latlon_from_en(points))
+
+    return terrain_parts(area, grid, posting_m, ", ".join(names), ", ".join(datums), sampled)
+
+
+def _heights(
+    layers: Sequence[tuple[SheetSource, TerrainLayer]], lat_deg: Array, lon_deg: Array
+) -> Array:
+    found = np.full(lat_deg.shape, np.nan)
+    for own in (True, False):
+        for member, layer in layers:
+            inside = in_box(member.sheet.bounds_deg, lat_deg, lon_deg)
+            wanted = np.isnan(found) & (inside if own else True)
+            if wanted.any():
+                found[wanted] = layer(lat_deg[wanted], lon_deg[wanted])
+    return found

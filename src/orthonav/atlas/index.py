@@ -7,7 +7,7 @@ after many changes the whole index is rebuilt.
 
 import hashlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,7 +112,7 @@ class _IndexBuilder:
 
     def build(self, sheets: Sequence[Sheet]) -> IndexManifest:
         """The index of these sheets."""
-        counts = [tile_count(self._atlas.path(sheet, "coarse")) for sheet in sheets]
+        counts = self._counts(sheets)
         total = sum(counts)
         if total < MIN_TILES:
             raise AtlasError(
@@ -120,25 +120,18 @@ class _IndexBuilder:
                 "with smaller ones (--coarse-gsd-m, --coarse-tile-px)"
             )
         embedder, quantizers = self._learnt(sheets, total)
-        shards: list[ShardInfo] = []
-        for group in _groups(sheets, counts):
-            base = shards[-1].base + shards[-1].rows if shards else 0
-            done = sum(len(shard.parts) for shard in shards) / len(sheets)
-            share = done, done + len(group) / len(sheets)
-            shards.append(self._shard(group, base, embedder, quantizers, share))
-        return self._put(quantizers.recipe, shards, {})
+        empty = IndexManifest(quantizers.recipe, (), {})
+        return self._extended(empty, embedder, quantizers, _groups(sheets, counts))
 
     def _learnt(self, sheets: Sequence[Sheet], total: int) -> tuple[WhitenedEmbedder, Quantizers]:
         """Whitening and quantizers of an index of `total` tiles, written to the folder."""
         step = max(1, total // MAX_TRAINING_TILES)
         dims = POOLING.dims if total <= MANY_TILES else MANY_DIMS
-        done = iter(range(LEARN_PASSES * len(sheets)))
+        shares = _shares(LEARN_PASSES * len(sheets))
 
         def over_sheets(work: Work[Made], step: int = step) -> Iterator[Made]:
-            for sheet in sheets:
-                self._progress("learn index", next(done) / (LEARN_PASSES * len(sheets)))
-                for _, features in self._batches(sheet, step):
-                    yield work(*features)
+            for _, features in self._tiles(sheets, "learn index", shares, step):
+                yield work(*features)
 
         embedder = _shortened(learn_in_two_passes(POOLING, over_sheets), dims)
         (self._folder / WHITENING_NAME).write_bytes(
@@ -149,14 +142,13 @@ class _IndexBuilder:
         recipe = VectorRecipe.for_count(total, embedder.dims)
         quantizers = train(np.concatenate(list(sample)), recipe)
         quantizers.save(self._folder / QUANTIZERS_NAME)
-        self._progress("learn index", 1.0)
         return embedder, quantizers
 
     def update(self, before: IndexManifest, new: Sequence[Sheet], stale: set[str]) -> IndexManifest:
         """`before` with a shard of the new sheets and the rows of stale sheets retired."""
         embedder = load_whitening(index_file(self._atlas, before, WHITENING_NAME))
         quantizers = Quantizers.load(index_file(self._atlas, before, QUANTIZERS_NAME))
-        shards = [
+        shards = tuple(
             replace(
                 shard,
                 parts=tuple(
@@ -165,65 +157,65 @@ class _IndexBuilder:
                 ),
             )
             for shard in before.shards
-        ]
-        base = shards[-1].base + shards[-1].rows
-        if new:
-            shards.append(self._shard(new, base, embedder, quantizers, (0.0, 1.0)))
-        return self._put(quantizers.recipe, shards, before.files)
+        )
+        left = replace(before, shards=shards)
+        return self._extended(left, embedder, quantizers, [new] if new else [])
 
-    def _shard(
+    def _extended(
         self,
-        sheets: Sequence[Sheet],
-        base: int,
+        index: IndexManifest,
         embedder: WhitenedEmbedder,
         quantizers: Quantizers,
-        share: tuple[float, float],
-    ) -> ShardInfo:
-        """A shard of these sheets; `share` of the progress is done before and after it."""
-        digests = [sheet.files["coarse"].sha256 for sheet in sheets]
-        content = hashlib.sha256("".join([quantizers.digest, *digests]).encode()).hexdigest()[:12]
-        name = f"shard-{base:012d}-{content}"
-        parts: list[Part] = []
-
-        def vectors() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-            for number, (sheet, digest) in enumerate(zip(sheets, digests, strict=True)):
-                rows = 0
-                for places, features in self._batches(sheet):
-                    rows += len(places)
-                    yield places, vectors_of(embedder, features)
-                parts.append(Part(sheet.id, digest, rows))
-                done = (number + 1) / len(sheets)
-                self._progress("index", share[0] + done * (share[1] - share[0]))
-
-        write_shard(self._folder, name, quantizers, vectors())
-        return ShardInfo(name, base, tuple(parts))
-
-    def _batches(
-        self, sheet: Sheet, step: int = 1
-    ) -> Iterator[tuple[NDArray[np.float64], Features]]:
-        """Places (n, 2) and features of every `step`-th tile of a sheet, some at a time."""
-        tiles = read_coarse(self._atlas.path(sheet, "coarse"))
-        for start in range(0, len(tiles.valid), step * BATCH_TILES):
-            part = slice(start, start + step * BATCH_TILES, step)
-            yield tiles.centres_latlon_deg[part], tiles.features_of(part)
-
-    def _put(
-        self, recipe: VectorRecipe, shards: Sequence[ShardInfo], before: Mapping[str, StoredFile]
+        groups: Sequence[Sequence[Sheet]],
     ) -> IndexManifest:
-        """Put the new files into the atlas, then the manifest; remove files not used any more."""
-        store = self._atlas.store
-        files = dict(before)
+        """The index with a further shard for each group of sheets, put into the atlas: the manifest
+        after the files; then files that are not used any more are removed."""
+        shards, files, store = list(index.shards), dict(index.files), self._atlas.store
+        shares = _shares(sum(map(len, groups)))
+        for group in groups:
+            base = shards[-1].base + shards[-1].rows if shards else 0
+            digests = [sheet.files["coarse"].sha256 for sheet in group]
+            content = hashlib.sha256("".join([quantizers.digest, *digests]).encode()).hexdigest()
+            name = f"shard-{base:012d}-{content[:12]}"
+            tiles = self._tiles(group, "index", shares)
+            rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
+            write_shard(self._folder, name, quantizers, rows)
+            ids = [sheet.id for sheet in group]
+            parts = tuple(map(Part, ids, digests, self._counts(group)))
+            shards.append(ShardInfo(name, base, parts))
         for path in sorted(self._folder.iterdir()):
             name = f"{FOLDER}/{path.name}"
             files[path.name] = StoredFile(name, path.stat().st_size, digest_of(path))
             store.put(path, name)
-        manifest = IndexManifest(recipe, tuple(shards), files)
+        manifest = IndexManifest(quantizers.recipe, tuple(shards), files)
         store.write(MANIFEST, manifest.to_json())
         used = {MANIFEST, *(file.name for file in files.values())}
         for name in store.names(FOLDER):
             if f"{FOLDER}/{name}" not in used:
                 store.remove(f"{FOLDER}/{name}")
         return manifest
+
+    def _counts(self, sheets: Sequence[Sheet]) -> list[int]:
+        return [tile_count(self._atlas.path(sheet, "coarse")) for sheet in sheets]
+
+    def _tiles(
+        self, sheets: Sequence[Sheet], stage: str, shares: Iterator[float], step: int = 1
+    ) -> Iterator[tuple[NDArray[np.float64], Features]]:
+        """Places (n, 2) and features of every `step`-th tile of sheets, some at a time.
+
+        `shares`: share of the stage that is done after each sheet.
+        """
+        for sheet in sheets:
+            tiles = read_coarse(self._atlas.path(sheet, "coarse"))
+            for start in range(0, len(tiles.valid), step * BATCH_TILES):
+                part = slice(start, start + step * BATCH_TILES, step)
+                yield tiles.centres_latlon_deg[part], tiles.features_of(part)
+            self._progress(stage, next(shares))
+
+
+def _shares(count: int) -> Iterator[float]:
+    """Shares done after each of so many steps."""
+    return (number / count for number in range(1, count + 1))
 
 
 def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[list[Sheet]]:
@@ -275,6 +267,6 @@ def load_whitening(path: Path) -> WhitenedEmbedder:
 def index_file(atlas: Atlas, manifest: IndexManifest, name: str) -> Path:
     """A local path of a file of an index, verified. Raises `AtlasError`, `StorageError`."""
     file = manifest.files.get(name)
-    if file is None or file.name != f"{FOLDER}/{name}":
-        raise AtlasError(f"index of the atlas names no file {name} in its folder: {atlas.url}")
+    if file is None:
+        raise AtlasError(f"index of the atlas names no file {name}: {atlas.url}")
     return atlas.store.fetch(file.name, file.size_bytes, file.sha256)

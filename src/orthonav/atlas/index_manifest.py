@@ -4,17 +4,17 @@ The manifest is written last: an atlas without it has no index. The index may co
 source, so every value is checked when it is read.
 """
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.item import Sheet, StoredFile, reason
+from orthonav.atlas.item import Sheet, StoredFile, canonical, parsed, reason
 from orthonav.atlas.quantizers import VectorRecipe
 from orthonav.errors import AtlasError
 
@@ -23,12 +23,9 @@ MANIFEST = f"{FOLDER}/index.json"
 FORMAT = "orthonav-index"
 SCHEMA = 2
 """2: shards have no manifests of their own."""
-MAX_MANIFEST_BYTES = 64 * 2**20
-"""A guard for memory: 10^6 sheets at some 60 bytes each."""
 MAX_ROWS = 10**6
 """Rows of a sheet: as many as it may have coarse tiles (`orthonav.atlas.coarse`)."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -99,57 +96,43 @@ class IndexManifest:
             "shards": [asdict(shard) for shard in self.shards],
             "files": {name: asdict(file) for name, file in sorted(self.files.items())},
         }
-        return (json.dumps(plain, sort_keys=True, separators=(",", ":")) + "\n").encode()
+        return canonical(plain) + b"\n"
 
     @classmethod
     def from_json(cls, data: bytes) -> "IndexManifest":
-        """Inverse of `to_json`; raises `AtlasError`."""
+        """Inverse of `to_json`; raises `AtlasError` unless writing it again gives `data`."""
         try:
-            if len(data) > MAX_MANIFEST_BYTES:
-                raise ValueError(f"{len(data)} bytes")
-            plain: Any = json.loads(data)
-            if plain["format"] != FORMAT or plain["schema"] != SCHEMA:
+            plain: Any = parsed(data, MANIFEST)
+            if (plain["format"], plain["schema"]) != (FORMAT, SCHEMA):
                 raise ValueError(
                     f"format {plain['format']!r:.40}, schema {plain['schema']!r:.20}, expected "
                     f"schema {SCHEMA}; rebuild it with 'orthonav atlas index'"
                 )
-            shards = tuple(_shard(shard) for shard in plain["shards"])
-            files = {_checked_name(name): _file(file) for name, file in plain["files"].items()}
-            first = 0
-            for shard in shards:
-                if shard.base != first:
-                    raise ValueError(f"shard {shard.name} begins at {shard.base}, not at {first}")
-                first += shard.rows
-            return cls(VectorRecipe(**plain["recipe"]), shards, files)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            shards = tuple(map(_shard, plain["shards"]))
+            files = {name: StoredFile(**file) for name, file in plain["files"].items()}
+            made = cls(VectorRecipe(**plain["recipe"]), shards, files)
+            possible = (
+                all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
+                and all(file.name == f"{FOLDER}/{name}" for name, file in files.items())
+                and all(0 <= part.rows <= MAX_ROWS for shard in shards for part in shard.parts)
+                and list(accumulate((shard.rows for shard in shards), initial=0))[:-1]
+                == [shard.base for shard in shards]
+                and made.to_json() == data
+            )
+            if not possible:
+                raise ValueError("damaged or altered")
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise AtlasError(f"index of the atlas cannot be read ({reason(error)})") from error
+        return made
 
 
 def _shard(plain: Any) -> ShardInfo:
-    parts = tuple(Part(**part) for part in plain["parts"])
-    for part in parts:
-        if type(part.rows) is not int or not 0 <= part.rows <= MAX_ROWS:
-            raise ValueError(f"rows of a sheet are {part.rows!r:.40}")
-        if type(part.sheet) is not str or type(part.retired) is not bool:
-            raise ValueError(f"a part of a shard is {part!r:.80}")
-    if type(plain["base"]) is not int:
-        raise ValueError(f"base of a shard is {plain['base']!r:.40}")
-    return ShardInfo(_checked_name(plain["name"]), plain["base"], parts)
-
-
-def _file(plain: Any) -> StoredFile:
-    file = StoredFile(**plain)
-    if type(file.size_bytes) is not int or file.size_bytes < 0:
-        raise ValueError(f"size of a file is {file.size_bytes!r:.40}")
-    if type(file.sha256) is not str or not _SHA256.fullmatch(file.sha256):
-        raise ValueError(f"sha256 of a file is {file.sha256!r:.80}")
-    return file
-
-
-def _checked_name(name: Any) -> str:
-    if type(name) is not str or not _NAME.fullmatch(name):
-        raise ValueError(f"invalid name of a file of an index: {name!r:.60}")
-    return name
+    """A shard; values of another type are converted, and differ when they are written again."""
+    parts = tuple(
+        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"]), bool(part["retired"]))
+        for part in plain["parts"]
+    )
+    return ShardInfo(str(plain["name"]), int(plain["base"]), parts)
 
 
 def read_manifest(atlas: Atlas) -> IndexManifest | None:

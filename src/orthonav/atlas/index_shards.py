@@ -10,7 +10,7 @@ own: every length is checked before FAISS is given the map.
 
 import os
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -45,7 +45,7 @@ def write_shard(
 
     `batches`: latitudes and longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory
     grows by codes and places, some 40 bytes a vector. Raises `AtlasError` where the vectors are not
-    finite, or not as many as places.
+    finite.
     """
     folder.mkdir(parents=True, exist_ok=True)
     dims, index = quantizers.recipe.dims, quantizers.empty_index()
@@ -53,8 +53,6 @@ def write_shard(
     with (folder / f"{name}.vectors.npy").open("wb") as out:
         _write_header(out, 0, dims)
         for places, batch in batches:
-            if batch.shape != (len(places), dims):
-                raise AtlasError(f"vectors must be ({len(places)}, {dims}), got {batch.shape}")
             places_deg.append(places)
             for start in range(0, len(batch), ADD_ROWS):
                 stored = np.ascontiguousarray(batch[start : start + ADD_ROWS], dtype=np.float16)
@@ -106,17 +104,20 @@ class OpenShard:
     """The files of a shard, opened. Lists are mapped. Vectors are read row by row: the system
     would map a megabyte around each."""
 
-    def __init__(self, folder: Path, info: ShardInfo, quantizers: Quantizers) -> None:
+    def __init__(
+        self, file: Callable[[str], Path], info: ShardInfo, quantizers: Quantizers
+    ) -> None:
         """Raises `AtlasError` where a file cannot be read or does not fit `info`."""
         self.info = info
-        path = folder / f"{info.name}.vectors.npy"
+        ends = ("vectors.npy", "codes", "lists.npy", "places.npy")
+        path, codes, lists, places = (file(f"{info.name}.{end}") for end in ends)
         try:
             vectors = np.load(path, mmap_mode="r")
-            table = np.load(folder / f"{info.name}.lists.npy")
-            self.places_deg = np.load(folder / f"{info.name}.places.npy", mmap_mode="r")
-            codes_bytes = (folder / f"{info.name}.codes").stat().st_size
+            table = np.load(lists)
+            self.places_deg = np.load(places, mmap_mode="r")
+            codes_bytes = codes.stat().st_size
         except (OSError, ValueError) as error:
-            raise AtlasError(f"shard cannot be read ({error}): {folder / info.name}") from error
+            raise AtlasError(f"shard {info.name} cannot be read ({error})") from error
         dims = quantizers.recipe.dims
         if vectors.shape != (info.rows, dims) or vectors.dtype != np.float16:
             raise AtlasError(
@@ -124,17 +125,14 @@ class OpenShard:
                 f"{dims} float16; rebuild the index: {path}"
             )
         if self.places_deg.shape != (info.rows, 2) or self.places_deg.dtype != np.float64:
-            raise AtlasError(
-                f"places of shard {info.name} are damaged; rebuild the index: {folder}"
-            )
+            raise AtlasError(f"places of shard {info.name} are damaged; rebuild the index")
         self._dims, self._offset = dims, path.stat().st_size - vectors.nbytes
         self._file = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._file)
-        if hasattr(os, "posix_fadvise"):
-            os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
+        os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
         self._retired = info.retired_rows
         self._index = quantizers.empty_index()
-        self._map_lists(folder / f"{info.name}.codes", codes_bytes, table, quantizers)
+        self._map_lists(codes, codes_bytes, table, quantizers)
 
     def _map_lists(
         self, path: Path, size: int, table: NDArray[np.uint64], quantizers: Quantizers
@@ -199,10 +197,13 @@ class ShardedIndex:
     The id of a vector is the base of its shard plus its row. Not for several threads at once.
     """
 
-    def __init__(self, folder: Path, shards: Sequence[ShardInfo]) -> None:
-        """Open shards and quantizers; raises `AtlasError` where a file is damaged."""
-        self.quantizers = Quantizers.load(folder / QUANTIZERS_NAME)
-        self._shards = [OpenShard(folder, each, self.quantizers) for each in shards]
+    def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
+        """Open shards and quantizers; `file` gives the path of each of their files.
+
+        Raises `AtlasError` where a file is damaged.
+        """
+        self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
+        self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
 
     def __len__(self) -> int:
         return sum(each.info.rows for each in self._shards)
@@ -215,9 +216,6 @@ class ShardedIndex:
         `probes` lists of every shard are scanned. The `rerank` best by code, over all shards, are
         compared by their stored vectors. Where fewer are found: id -1 and product -inf.
         """
-        dims = self.quantizers.recipe.dims
-        if queries.ndim != 2 or queries.shape[1] != dims:
-            raise ValueError(f"queries must be (Q, {dims}), got {queries.shape}")
         queries = np.ascontiguousarray(queries, dtype=np.float32)
         rotated = self.quantizers.rotated(queries)
         lists, centre_scores = self.quantizers.nearest_lists(rotated, probes)

@@ -218,10 +218,7 @@ def _index_problems(atlas: Atlas, deep: bool) -> Iterator[Problem]:
         return
     sizes = atlas.store.names(INDEX)
     for name, file in manifest.files.items():
-        if file.name == f"{INDEX}/{name}":
-            yield from _file_problems(atlas.store, file, sizes.get(name), deep, remedy)
-        else:
-            yield Problem("damaged file", MANIFEST, f"names a file outside the index; {remedy}")
+        yield from _file_problems(atlas.store, file, sizes.get(name), deep, remedy)
     new, gone = stale_sheets(atlas, manifest)
     if new or gone:
         detail = f"{len(new)} sheets are new or changed, {len(gone)} gone; run orthonav atlas index"

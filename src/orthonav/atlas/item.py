@@ -12,7 +12,7 @@ import json
 import re
 from calendar import monthrange
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, replace
 from datetime import date
 from typing import Any
 
@@ -41,22 +41,30 @@ _SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
 _ITEM_NAME = re.compile(r"(r[0-9]{6}c[0-9]{6})\.([0-9]{4})\.([0-9a-f]{12})\.json")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
-_KINDS = {str: "text", int: "a whole number", dict: "an object"}
-_DATE = re.compile(r"([0-9]{4})(?:-([0-9]{2})(?:-([0-9]{2}))?)?")
+_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of an atlas: its name in the atlas, its size in bytes and its SHA-256 (hex)."""
+    """A file of an atlas: its name in the atlas, its size in bytes and its SHA-256 (hex).
+
+    Raises `AtlasError` for an impossible size or digest.
+    """
 
     name: str
     size_bytes: int
     sha256: str
 
+    def __post_init__(self) -> None:
+        if not (isinstance(self.size_bytes, int) and self.size_bytes >= 0):
+            raise AtlasError(f"size of a file is {self.size_bytes!r:.40}")
+        if not (isinstance(self.sha256, str) and _SHA256.fullmatch(self.sha256)):
+            raise AtlasError(f"sha256 of a file is {self.sha256!r:.80}")
+
 
 @dataclass(frozen=True)
-class SheetDescription:
-    """What is known of a sheet when it is put into an atlas. Independent of place and time of
+class Sheet:
+    """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
     building, so that the same sheet is the same bytes everywhere.
 
     `id`: name in the lattice, as r001526c001392.
@@ -68,6 +76,8 @@ class SheetDescription:
     `imagery`: its orthophotos, as the manifest of a map describes them.
     `request`: digest of all that it was made from and how.
     `made_by`: programs and versions that made it.
+    `revision`: from 1; 0 for a sheet that is not in an atlas yet.
+    `files`: its files by kind: `map`, `coarse`.
     """
 
     id: str
@@ -79,29 +89,16 @@ class SheetDescription:
     imagery: tuple[Mapping[str, Any], ...]
     request: str
     made_by: Mapping[str, str]
+    revision: int = 0
+    files: Mapping[str, StoredFile] = field(default_factory=dict)
 
+    def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
+        """The sheet with its files, as it will be read back.
 
-@dataclass(frozen=True)
-class Sheet(SheetDescription):
-    """A sheet in an atlas: its description, its revision (from 1) and its files by kind."""
-
-    revision: int
-    files: Mapping[str, StoredFile]
-
-    @classmethod
-    def of(
-        cls, described: SheetDescription, revision: int, files: Mapping[str, StoredFile]
-    ) -> "Sheet":
-        """The sheet as it would be read back; raises `AtlasError` where it could not be."""
-        values = {each.name: getattr(described, each.name) for each in fields(SheetDescription)}
-        values |= {
-            "bounds_deg": tuple(float(each) for each in described.bounds_deg),
-            "gsd_m": float(described.gsd_m),
-            "area_km2": float(described.area_km2),
-            "tiles": int(described.tiles),
-        }
-        data = canonical(cls(**values, revision=revision, files=files).to_item())
-        return cls.from_item(json.loads(data), data)
+        Raises `AtlasError` where it could not be.
+        """
+        data = canonical(replace(self, revision=revision, files=files).to_item())
+        return self.from_item(json.loads(data), data)
 
     @property
     def size_bytes(self) -> int:
@@ -115,7 +112,7 @@ class Sheet(SheetDescription):
 
     def to_item(self) -> dict[str, Any]:
         """The STAC item, as plain values."""
-        west, south, east, north = self.bounds_deg
+        west, south, east, north = map(float, self.bounds_deg)
         ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
         return {
             "type": "Feature",
@@ -127,12 +124,12 @@ class Sheet(SheetDescription):
             "bbox": [west, south, east, north],
             "properties": {
                 **_times(self.dates),
-                "gsd": self.gsd_m,
+                "gsd": float(self.gsd_m),
                 "orthonav:sheet": {
                     "schema": SCHEMA,
                     "revision": self.revision,
                     "tiles": self.tiles,
-                    "area_km2": self.area_km2,
+                    "area_km2": float(self.area_km2),
                     "dates": list(self.dates),
                     "imagery": [dict(each) for each in self.imagery],
                     "request": self.request,
@@ -159,28 +156,29 @@ class Sheet(SheetDescription):
     def from_item(cls, plain: Any, data: bytes) -> "Sheet":
         """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from.
 
-        Raises `AtlasError` unless every value is possible and the bytes are canonical.
+        Raises `AtlasError` unless every value is possible and writing the sheet gives `data`. That
+        also refuses values of another type, which are converted here.
         """
         try:
             properties = plain["properties"]
             own = properties["orthonav:sheet"]
-            if type(own["schema"]) is int and own["schema"] > SCHEMA:
+            if own["schema"] > SCHEMA:
                 raise AtlasError(
                     f"an item has schema {own['schema']}, this program reads up to {SCHEMA}; "
                     "update orthonav"
                 )
-            west, south, east, north = (float(each) for each in plain["bbox"])
+            west, south, east, north = map(float, plain["bbox"])
             sheet = cls(
-                id=_of_type(str, plain["id"]),
+                id=str(plain["id"]),
                 bounds_deg=(west, south, east, north),
                 gsd_m=float(properties["gsd"]),
-                tiles=_of_type(int, own["tiles"]),
+                tiles=int(own["tiles"]),
                 area_km2=float(own["area_km2"]),
-                dates=tuple(_of_type(str, each) for each in own["dates"]),
-                imagery=tuple(_of_type(dict, each) for each in own["imagery"]),
-                request=_of_type(str, own["request"]),
-                made_by={key: _of_type(str, value) for key, value in own["made_by"].items()},
-                revision=_of_type(int, own["revision"]),
+                dates=tuple(map(str, own["dates"])),
+                imagery=tuple(own["imagery"]),
+                request=str(own["request"]),
+                made_by={key: str(value) for key, value in own["made_by"].items()},
+                revision=int(own["revision"]),
                 files=_files(plain["assets"], plain["id"]),
             )
             possible = (
@@ -192,12 +190,12 @@ class Sheet(SheetDescription):
                 and 1 <= sheet.tiles <= MAX_TILES
                 and sheet.area_km2 >= 0
             )
+            if not possible or canonical(sheet.to_item()) != data:
+                raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
         except AtlasError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise AtlasError(f"damaged, or not an item of orthonav ({reason(error)})") from error
-        if not possible or canonical(sheet.to_item()) != data:
-            raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
         return sheet
 
 
@@ -271,14 +269,11 @@ def sheet_of_file(name: str) -> str | None:
 def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
     found = {}
     for key, entry in sorted(assets.items()):
-        sha256 = entry["file:checksum"].removeprefix(_SHA256_MULTIHASH)
-        size = _of_type(int, entry["file:size"])
-        if key not in FILES or not _SHA256.fullmatch(sha256) or size < 0:
+        if key not in FILES:
             raise AtlasError(f"an item names an impossible file: {key:.40} {entry!r:.200}")
+        sha256 = entry["file:checksum"].removeprefix(_SHA256_MULTIHASH)
         name = file_name(key, sheet_id, sha256)
-        if entry["href"] != f"../{name}":
-            raise AtlasError(f"an item names a file of another sheet: {entry['href']!r:.120}")
-        found[key] = StoredFile(name, size, sha256)
+        found[key] = StoredFile(name, int(entry["file:size"]), sha256)
     if "map" not in found:
         raise AtlasError("an item names no map")
     return found
@@ -305,28 +300,18 @@ def _times(dates: tuple[str, ...]) -> dict[str, Any]:
 
 def _span(text: str) -> tuple[date, date] | None:
     """First and last day of YYYY[-MM[-DD]], None for an invalid date."""
-    match = _DATE.fullmatch(text)
-    if match is None:
+    if not _DATE.fullmatch(text):
         return None
-    year, month, day = (None if part is None else int(part) for part in match.groups())
     try:
-        first = date(year or 0, month or 1, day or 1)
+        first = date.fromisoformat(f"{text}-01-01"[:10])
     except ValueError:
         return None
-    if day is not None:
-        return first, first
-    last_month = month or 12
-    return first, date(first.year, last_month, monthrange(first.year, last_month)[1])
+    if len(text) == len("YYYY-MM"):
+        return first, first.replace(day=monthrange(first.year, first.month)[1])
+    return first, date.fromisoformat(f"{text}-12-31"[:10])
 
 
 def _integer(text: str) -> int:
     if len(text) > MAX_DIGITS:
         raise ValueError(f"a number has {len(text)} digits")
     return int(text)
-
-
-def _of_type(kind: type, value: Any) -> Any:
-    """`value` if it is exactly of that type; raises `ValueError`."""
-    if type(value) is not kind:
-        raise ValueError(f"{value!r:.80} where {_KINDS[kind]} is expected")
-    return value

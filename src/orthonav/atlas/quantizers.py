@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -155,22 +155,11 @@ class Quantizers:
         """The `probes` lists (Q, probes) whose centres have the highest scalar products with
         rotated queries (Q, D), in the order of list numbers, and those products (Q, probes)."""
         half = self.recipe.dims // 2
-        probes = min(probes, self.recipe.lists)
-        lists = np.empty((len(rotated), probes), dtype=np.int64)
-        scores = np.empty((len(rotated), probes), dtype=np.float32)
-        side = self.halves.shape[1]
-        first, second = _pairs(side, probes)
-        products = rotated[:, :half] @ self.halves[0].T, rotated[:, half:] @ self.halves[1].T
-        for query, (low, high) in enumerate(zip(*products, strict=True)):
-            lows, highs = np.argsort(-low), np.argsort(-high)
-            sums = low[lows][first] + high[highs][second]
-            chosen = np.arange(len(sums))
-            if probes < len(sums):
-                chosen = np.argpartition(sums, -probes)[-probes:]
-            numbers = highs[second[chosen]] * side + lows[first[chosen]]
-            order = np.argsort(numbers)
-            lists[query], scores[query] = numbers[order], sums[chosen[order]]
-        return lists, scores
+        low, high = rotated[:, :half] @ self.halves[0].T, rotated[:, half:] @ self.halves[1].T
+        sums = (high[:, :, None] + low[:, None, :]).reshape(len(rotated), -1)
+        probes = min(probes, sums.shape[1])
+        lists = np.sort(np.argpartition(sums, -probes, axis=1)[:, -probes:], axis=1)
+        return lists, np.take_along_axis(sums, lists, axis=1)
 
     def empty_index(self) -> Any:
         """An empty FAISS index (IndexIVFPQFastScan) with these quantizers."""
@@ -210,28 +199,11 @@ def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
     }
 
 
-@lru_cache(maxsize=16)
-def _pairs(side: int, count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Ranks in either half of all pairs that can be among the `count` pairs with highest sums.
-
-    At least i * j pairs are as good as or better than the pair of ranks (i, j), counted from 1.
-    """
-    ranks = np.arange(1, side + 1)
-    first, second = np.nonzero(np.multiply.outer(ranks, ranks) <= count)
-    return first, second
-
-
 def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers:
     """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes.
 
-    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used. Raises `AtlasError` where there
-    are fewer vectors than centres.
+    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used.
     """
-    if sample.ndim != 2 or sample.shape[1] != recipe.dims:
-        raise AtlasError(f"vectors must be (N, {recipe.dims}), got {sample.shape}")
-    least = max(2 ** (recipe.list_bits // 2), 2**CODE_BITS)
-    if len(sample) < least:
-        raise AtlasError(f"an index with these lists needs {least} vectors, got {len(sample)}")
     step = max(1, -(-len(sample) // MAX_TRAINING_VECTORS))
     taken = np.asarray(sample[::step], dtype=np.float32)
     rotation = _rotation(taken, recipe.quantizers)

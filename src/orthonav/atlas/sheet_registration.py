@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.atlas.agreement import Placement
 from orthonav.atlas.catalog import Atlas
@@ -46,16 +45,12 @@ class SearchRegion(Placement):
 class SheetMatch(Placement):
     """The placement of a view registered on a sheet.
 
-    `covariance` (4, 4): of metres east and north, heading (rad) and log scale.
     `evidence`: scores of the match and of its rivals.
     `confidence`: what the sheet makes of the evidence, None where it has learnt nothing.
-    `radius_m`: error below which that confidence counts a fix as correct.
     """
 
-    covariance: NDArray[np.float64]
     evidence: Mapping[str, float]
     confidence: RegisteredConfidence | None
-    radius_m: float
 
 
 class SheetRegistrar:
@@ -108,16 +103,13 @@ def _registered(
     seen = sheet.register(turned, prior, heading_std_rad=region.turn_std_rad)
     if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
-    prepared, best = seen.prepared, seen.found
-    pose = best.placed.pose
-    lat, lon = sheet.sheet.frame.latlon_from_en(sheet.camera_en_m(prepared, pose))
+    pose = seen.found.placed.pose
+    lat, lon = sheet.sheet.frame.latlon_from_en(sheet.camera_en_m(seen.prepared, pose))
     return SheetMatch(
         lat_deg=float(lat),
         lon_deg=float(lon),
         turn_rad=pose.turn_rad,
         log_scale=pose.log_scale,
-        covariance=sheet.covariance(prepared, best.placed),
-        evidence=best.evidence(),
+        evidence=seen.found.evidence(),
         confidence=sheet.confidence,
-        radius_m=sheet.radius_m,
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__
+from orthonav.atlas.coarse import coarse_grid
 from orthonav.atlas.coverage import box_around, turned
 from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AreaError, AtlasError
 from orthonav.geo.area import Area, Extent, require_one_area
-from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.geo.sheets import sheets_of_route
 from orthonav.imagery.mosaic import Mosaic
@@ -35,29 +35,49 @@ _POINTS = 17
 
 
 @dataclass(frozen=True)
+class AtlasRequest:
+    """What to build into an atlas.
+
+    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
+    `orthos`: files and folders of orthophotos; the first covers the next.
+    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
+    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
+    `bounds_deg`: area: west, south, east, north.
+    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
+    imagery is the area.
+    `replace`: rebuild sheets that were made otherwise, instead of refusing them.
+    `index`: also make the index of the coarse tiles.
+    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
+    what its heights count from.
+    """
+
+    url: str
+    orthos: Sequence[Path]
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+    bounds_deg: Extent | None = None
+    route: Route | None = None
+    band_m: float | None = None
+    replace: bool = False
+    index: bool = True
+    dem: Path | None = None
+    dem_datum: str | None = None
+
+
+@dataclass(frozen=True)
 class SheetTask:
     """A sheet to be built, with all that a worker on another machine needs.
 
-    `sheet`: name.
-    `bounds_deg`: its box in the lattice: west, south, east, north.
+    `sheet`: its description, without tiles and area yet.
     `atlas`: folder or URL of the atlas.
     `orthos`: the files and folders that may show it.
     `recipe`: how it is made.
-    `request`: digest of what the sheet depends on (`request_digest`).
-    `imagery`, `dates`: description of the orthophotos for the catalogue.
-    `made_by`: the versions that must make it (`versions`).
     `dem`, `dem_datum`: terrain model and what its heights count from, as for a map.
     """
 
-    sheet: str
-    bounds_deg: Extent
+    sheet: Sheet
     atlas: str
     orthos: tuple[Path, ...]
     recipe: AtlasRecipe
-    request: str
-    imagery: tuple[Mapping[str, Any], ...]
-    dates: tuple[str, ...]
-    made_by: Mapping[str, str]
     dem: Path | None = None
     dem_datum: str | None = None
 
@@ -82,48 +102,35 @@ def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> 
     ]
 
 
-def plan_sheets(
-    url: str,
-    recipe: AtlasRecipe,
-    mosaic: Mosaic,
-    orthos: Sequence[Path],
-    *,
-    bounds_deg: Extent | None = None,
-    route: Route | None = None,
-    band_m: float | None = None,
-    dem: Path | None = None,
-    dem_datum: str | None = None,
-) -> list[SheetTask]:
+def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> list[SheetTask]:
     """A task for each sheet of an area that imagery may touch, from south to north, west to east.
 
-    Without bounds and route the area is all imagery. Raises `AreaError` where there is no sheet,
+    `mosaic`: that of the orthophotos of the request. Raises `AreaError` where there is no sheet,
     and for recipes by which no sheet could be built.
     """
     imagery = Imagery(mosaic)
-    names = sorted(_names(recipe, imagery, bounds_deg, route, band_m))
+    names = sorted(_names(recipe, imagery, request))
     if not names:
         raise AreaError("the area lies outside the orthophotos")
-    made_by = versions()
+    made_by, terrain = versions(), (request.dem, request.dem_datum)
     tasks = []
     for name in names:
         box_deg = recipe.sheets.bounds_deg(name)
         _require_possible(recipe, box_deg, mosaic.gsd_m)
         part = imagery.under(box_deg, margin_m(recipe))
-        tasks.append(
-            SheetTask(
-                sheet=name,
-                bounds_deg=box_deg,
-                atlas=url,
-                orthos=_orthos_of(orthos, mosaic, part),
-                recipe=recipe,
-                request=request_digest(recipe, part, made_by, dem, dem_datum),
-                imagery=part.describe(),
-                dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
-                made_by=made_by,
-                dem=dem,
-                dem_datum=dem_datum,
-            )
+        sheet = Sheet(
+            id=name,
+            bounds_deg=box_deg,
+            gsd_m=recipe.gsd_m,
+            tiles=0,
+            area_km2=0.0,
+            dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
+            imagery=part.describe(),
+            request=request_digest(recipe, part, made_by, *terrain),
+            made_by=made_by,
         )
+        needed = _orthos_of(request.orthos, mosaic, part)
+        tasks.append(SheetTask(sheet, request.url, needed, recipe, *terrain))
     return tasks
 
 
@@ -197,15 +204,10 @@ class Imagery:
         return np.array(boxes, np.float64)
 
 
-def _names(
-    recipe: AtlasRecipe,
-    imagery: Imagery,
-    bounds_deg: Extent | None,
-    route: Route | None,
-    band_m: float | None,
-) -> Iterable[str]:
+def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iterable[str]:
     """Names of the sheets of an area that imagery may touch."""
-    require_one_area(route, band_m, bounds_deg)
+    route, bounds_deg = request.route, request.bounds_deg
+    require_one_area(route, request.band_m, bounds_deg)
     there = imagery.sheets(recipe)
     if bounds_deg is not None:
         west, south, east, north = bounds_deg
@@ -213,7 +215,7 @@ def _names(
             raise AreaError(f"bounds are empty: {','.join(map(str, bounds_deg))}")
         asked = (west, south, east + 360 if east < west else east, north)
         return {name for name in there if _overlap(recipe.sheets.bounds_deg(name), asked)}
-    return there if route is None else set(_along(recipe, route, band_m, there))
+    return there if route is None else set(_along(recipe, route, request.band_m, there))
 
 
 def _along(
@@ -255,12 +257,7 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
     )
     CellLayout.for_tiles(grid.tile_px, grid.stride_px)
     if recipe.coarse is not None:
-        coarse = TileGrid.covering(
-            area.extent_en_m,
-            gsd_m=recipe.coarse.gsd_m,
-            tile_px=recipe.coarse.tile_px,
-            overlap=recipe.coarse.overlap,
-        )
+        coarse = coarse_grid(area, recipe.coarse)
         CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
 
 
@@ -280,18 +277,18 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
     """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
-    other = [task for task in tasks if not is_same(task, known)]
+    other = [task.sheet for task in tasks if not is_same(task, known)]
     if not other:
         return
     why = sorted(
         {
             line
-            for task in other
-            for line in version_differences(task.made_by, known[task.sheet].made_by)
+            for sheet in other
+            for line in version_differences(sheet.made_by, known[sheet.id].made_by)
             or ["their imagery has changed"]
         }
     )
-    named = ", ".join(task.sheet for task in other[:5]) + (", .." if len(other) > 5 else "")
+    named = ", ".join(sheet.id for sheet in other[:5]) + (", .." if len(other) > 5 else "")
     raise AtlasError(
         f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
         f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
@@ -300,4 +297,5 @@ def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None
 
 def is_same(task: SheetTask, known: Mapping[str, Sheet]) -> bool:
     """Whether the sheet of a task is not in the atlas, or is there as the task would make it."""
-    return task.sheet not in known or known[task.sheet].request == task.request
+    there = known.get(task.sheet.id)
+    return there is None or there.request == task.sheet.request

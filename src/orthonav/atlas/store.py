@@ -7,18 +7,19 @@ files are copied to a cache and verified; that of fsspec neither verifies nor li
 """
 
 import contextlib
+import errno
 import hashlib
 import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from orthonav.atlas.filesystems import LocalFolder, RemoteFiles
-from orthonav.atlas.storage_errors import storage_errors
-from orthonav.errors import StorageError
+from orthonav.errors import MissingExtraError, OrthonavError, StorageError
 from orthonav.files import replacing
 
 log = logging.getLogger(__name__)
@@ -32,6 +33,17 @@ GRACE_S = 600.0
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
 _PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 _PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
+_CREDENTIALS = re.compile(
+    "Credential|ClientAuthentication|NoAuthToken|ProfileNotFound|RefreshError"
+    "|TokenRetrieval|UnauthorizedSSOToken"
+)
+"""In the names of exceptions of boto, Google and Azure: there are no valid credentials."""
+_UNREACHABLE = re.compile(
+    "Connect(or|ion)|Timeout|HTTPClientError|SSLError|ServiceRe(quest|sponse)Error|gaierror"
+)
+"""In the names of exceptions: the storage cannot be reached."""
+_REFUSED = {401, 403}
+_MAX_TEXT = 300
 
 
 class Store:
@@ -41,15 +53,11 @@ class Store:
     protocol is not installed. `str()` gives the address without a password.
     """
 
-    def __init__(self, url: str, cache: Path | None = None) -> None:
-        """The store at a folder or URL, which need not exist yet.
-
-        `cache`: folder of local copies of remote files, None: see `cache_folder`.
-        """
+    def __init__(self, url: str) -> None:
+        """The store at a folder or URL, which need not exist yet."""
         match = _PROTOCOL.match(url)
         protocol = match.group(1).lower() if match else "file"
         self.is_local = protocol in ("file", "local")
-        self.cache = cache
         self._verified: set[tuple[str, int, int]] = set()
         if self.is_local:
             folder = Path(url[match.end() :] if match else url).expanduser().absolute()
@@ -61,7 +69,7 @@ class Store:
                 self._files = RemoteFiles(self.url, protocol)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.url, self.cache)
+        return type(self), (self.url,)
 
     def __str__(self) -> str:
         return self.url if self.is_local else _PASSWORD.sub(r"\1@", self.url)
@@ -113,7 +121,7 @@ class Store:
                 _require(temporary, size, sha256, self.shown(name))
 
         file = f"{sha256}{Path(checked_name(name)).suffix}"
-        return cached(self.cache, file, size, fill)
+        return cached(file, size, fill)
 
     def download(self, name: str, path: Path) -> None:
         """Copy a file of the atlas to `path`, not verified."""
@@ -196,12 +204,12 @@ def cache_limit_bytes() -> int:
         raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
 
 
-def cached(folder: Path | None, name: str, size: int, fill: Callable[[Path], None]) -> Path:
+def cached(name: str, size: int, fill: Callable[[Path], None]) -> Path:
     """The file of the cache that is named by its SHA-256; if missing, `fill` writes it, verified.
 
-    Several processes may use a cache at the same time. `folder` None: see `cache_folder`.
+    Several processes may use a cache at the same time.
     """
-    folder, limit_bytes = folder or cache_folder(), cache_limit_bytes()
+    folder, limit_bytes = cache_folder(), cache_limit_bytes()
     path = folder / name[:2] / name
     with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
         if path.is_file() and path.stat().st_size == size:
@@ -227,3 +235,58 @@ def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
             path.unlink(missing_ok=True)
             excess -= size
             log.debug("cache: removed %s", path.name)
+
+
+@contextmanager
+def storage_errors(place: str, action: str) -> Iterator[None]:
+    """Turn errors raised inside into `StorageError` with the cause.
+
+    `place`: address to show to people, without a password. `action`: what was attempted, a verb and
+    its object. Every exception is converted: the libraries behind fsspec raise many kinds.
+    """
+    try:
+        yield
+    except OrthonavError as error:
+        if isinstance(error, StorageError | MissingExtraError):
+            raise
+        raise StorageError(str(error)) from error
+    except Exception as error:
+        raise StorageError(f"cannot {action}: {_cause(error)}: {place}") from error
+
+
+def _cause(error: Exception) -> str:
+    chain = list(_chain(error))
+    names = {kind.__name__ for each in chain for kind in type(each).__mro__}
+    text = " ".join(str(error).split())[:_MAX_TEXT] or type(error).__name__
+    numbers = {each.errno for each in chain if isinstance(each, OSError)}
+    if numbers & {errno.ENOSPC, errno.EDQUOT}:
+        return "disk full; free some space"
+    if any(map(_CREDENTIALS.search, names)):
+        return f"no valid credentials ({text}); set those of the storage, see its documentation"
+    if errno.EROFS in numbers:
+        return "the file system is read-only"
+    if "PermissionError" in names or any(_status(each) in _REFUSED for each in chain):
+        return f"not permitted, or credentials refused ({text})"
+    if any(isinstance(each, FileNotFoundError) for each in chain):
+        return f"no such file, folder or bucket ({text})"
+    if any(map(_UNREACHABLE.search, names)):
+        return f"it cannot be reached ({text}); check the address and the network"
+    return f"{type(error).__name__}: {text}"
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    for _ in range(10):
+        if error is None:
+            return
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _status(error: BaseException) -> int | None:
+    """The HTTP status that an error of boto, Google or Azure carries."""
+    response = getattr(error, "response", None)
+    if isinstance(response, dict):
+        status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+    else:
+        status = getattr(error, "status_code", getattr(error, "code", None))
+    return status if isinstance(status, int) else None

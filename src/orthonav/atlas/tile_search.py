@@ -1,8 +1,7 @@
 """Searching a view among the coarse tiles of a whole atlas."""
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ MAX_LAT_DEG = 89.8
 class TileSearch:
     """The index of an atlas with its shards mapped. Not to be shared between threads.
 
-    A context manager. `unknown` names the sheets that are not in the index, which are not found.
+    `unknown` names the sheets that are not in the index, which are not found.
     """
 
     def __init__(self, atlas: Atlas) -> None:
@@ -54,25 +53,16 @@ class TileSearch:
         self.atlas = atlas
         self.recipe: CoarseRecipe = atlas.recipe.coarse
         self.unknown = stale_sheets(atlas, manifest)[0]
-        self._folder = tempfile.TemporaryDirectory(prefix="orthonav-index-")
-        folder = Path(self._folder.name)
-        for name in manifest.files:
-            (folder / name).symlink_to(index_file(atlas, manifest, name).absolute())
-        self._embedder = load_whitening(folder / WHITENING_NAME)
+        file = partial(index_file, atlas, manifest)
+        self._embedder = load_whitening(file(WHITENING_NAME))
         self._representation = make_variant(represent.TABLE, EDGES)
-        self._index = ShardedIndex(folder, manifest.shards)
+        self._index = ShardedIndex(file, manifest.shards)
         if self._embedder.dims != self._index.quantizers.recipe.dims:
             raise AtlasError(f"files of the index do not fit together: {atlas.url}")
         efforts = (effort for most, *effort in EFFORTS if len(self._index) <= most)
         share, rerank = next(efforts, MOST_EFFORT)
         self._probes = max(1, round(share * manifest.recipe.lists))
         self._rerank = int(rerank)
-
-    def __enter__(self) -> "TileSearch":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._folder.cleanup()
 
     def matches(
         self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int

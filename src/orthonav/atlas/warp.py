@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.atlas.item import Sheet
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AtlasError, MapFileError
-from orthonav.geo.area import Extent
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.mapfile.layer import GreyLayer
+from orthonav.mapfile.manifest import Manifest
+from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.prepare.blocks import Block
 from orthonav.prepare.cellparts import StoredCells
 from orthonav.represent.gradients import HARMONICS
@@ -44,14 +46,24 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True, eq=False)
 class SheetSource:
-    """Pixels and cells of a sheet; `bounds_deg` is its box in the lattice."""
+    """A sheet that a map is cut from: its item, manifest, pixels, cells and, if it has one, terrain
+    layer."""
 
-    name: str
-    bounds_deg: Extent
-    frame: LocalFrame
-    grid: TileGrid
+    sheet: Sheet
+    manifest: Manifest
     layer: GreyLayer
     cells: StoredCells
+    terrain: TerrainLayer | None
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Its local plane."""
+        return self.manifest.sheets[0].frame
+
+    @property
+    def grid(self) -> TileGrid:
+        """Its tile grid."""
+        return self.manifest.sheets[0].grid
 
     def covers(self, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
         """Which places (N,) lie on the raster of the sheet."""
@@ -60,7 +72,7 @@ class SheetSource:
 
     def outline_deg(self) -> tuple[Array, Array]:
         """Latitudes and longitudes of points around its box."""
-        west, south, east, north = self.bounds_deg
+        west, south, east, north = self.sheet.bounds_deg
         share = np.linspace(0, 1, EDGE_POINTS)[:-1]
         lon, lat = west + (east - west) * share, south + (north - south) * share
         fixed = np.ones(len(share))
@@ -158,7 +170,7 @@ class Warp:
             return read()
         except MapFileError as error:
             raise AtlasError(
-                f"sheet {self.source.name} is damaged, rebuild it ({error})"
+                f"sheet {self.source.sheet.id} is damaged, rebuild it ({error})"
             ) from error
 
     def _source_px(self, target_px: Array) -> Array:
@@ -256,10 +268,6 @@ def _corners(block: Block) -> Array:
     )
 
 
-def _applied(affine: Array, points: Array) -> Array:
-    return np.asarray(points @ affine[:, :2].T + affine[:, 2])
-
-
 def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
     """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
 
@@ -274,7 +282,7 @@ def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Top, left, height and width of the part of the sheet that `size` (w, h) pixels need."""
     cols, rows = size
     corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
-    there = _applied(matrix, corners)
+    there = corners @ matrix[:, :2].T + matrix[:, 2]
     left, top = (int(value) for value in np.floor(there.min(axis=0)) - KERNEL_PX)
     right, bottom = (int(value) for value in np.ceil(there.max(axis=0)) + KERNEL_PX)
     return top, left, bottom - top + 1, right - left + 1

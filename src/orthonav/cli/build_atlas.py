@@ -10,7 +10,6 @@ from orthonav.cli.build import add_recipe, recipe_of, reporter
 from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
 if TYPE_CHECKING:
-    from orthonav.atlas.build_report import BuildReport
     from orthonav.atlas.cluster import TaskRunner
 
 EVERYDAY = (
@@ -64,7 +63,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Build, print a summary; returns 1 where a sheet failed."""
-    from orthonav.atlas.build import AtlasRequest, build_atlas
+    from orthonav.atlas.build import build_atlas
+    from orthonav.atlas.sheet_tasks import AtlasRequest
     from orthonav.errors import AtlasError
     from orthonav.geo.route import read_route
 
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
         print_json(plain)
     else:
         print(_text(plain))
-    for line in _failures(result):
+    for line in _failures(plain):
         print(f"orthonav: error: {line}", file=sys.stderr)
     return 0 if result.is_complete else 1
 
@@ -147,12 +147,11 @@ def _text(plain: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _failures(result: "BuildReport") -> list[str]:
-    failed = sorted(result.failed)
-    lines = [" ".join(f"sheet {sheet}: {error}".split()) for sheet, error in failed]
+def _failures(plain: Mapping[str, Any]) -> list[str]:
+    lines = [" ".join(f"sheet {x['sheet']}: {x['error']}".split()) for x in plain["failed"]]
     if len(lines) > SHOWN_FAILURES:
         more = f"and {len(lines) - SHOWN_FAILURES} more sheets, see --json"
         lines = [*lines[:SHOWN_FAILURES], more]
-    if result.finish_error:
-        lines.append(f"snapshot and index could not be written: {result.finish_error}")
+    if plain["finish_error"]:
+        lines.append(f"snapshot and index could not be written: {plain['finish_error']}")
     return lines

@@ -269,7 +269,8 @@ def _on_atlas(options: argparse.Namespace) -> None:
     flight = open_source(options.flight, options)
     say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
     results = []
-    with TileSearch(Atlas.open(options.map)) as search, progress(options) as shown:
+    search = TileSearch(Atlas.open(options.map))
+    with progress(options) as shown:
         if search.unknown:
             log.warning(
                 "%d sheets are missing from the index and are not searched; update it with "

@@ -9,6 +9,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthonav.errors import AreaError
 from orthonav.geo.area import Extent
 from orthonav.geo.frames import MAX_SHEET_M
@@ -92,6 +95,15 @@ class WorldSheets:
 
     def _parallels(self, row: int) -> tuple[float, float]:
         return -90 + row * 180 / self.rows, -90 + (row + 1) * 180 / self.rows
+
+
+def in_box(
+    bounds_deg: Extent, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Which places lie in a box, its southern and western border included; of any shape."""
+    west, south, east, north = bounds_deg
+    turned = (lon_deg - west) % 360
+    return np.asarray((lat_deg >= south) & (lat_deg < north) & (turned < east - west))
 
 
 def _named(row: int, col: int) -> str:

@@ -113,15 +113,10 @@ class SheetReader:
             with self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1) as raster:
                 yield lambda job: self._cached_or_read(raster, job, cache)
 
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            with quiet():
-                for done, parts in enumerate(in_order(self._jobs, opened, workers)):
-                    self._take(self._jobs[done], parts)
-                    progress("imagery", (done + 1) / len(self._jobs))
-        finally:
-            cv2.setNumThreads(threads)
+        with one_opencv_thread(), quiet():
+            for done, parts in enumerate(in_order(self._jobs, opened, workers)):
+                self._take(self._jobs[done], parts)
+                progress("imagery", (done + 1) / len(self._jobs))
         if not self.cells.valid.any():
             raise AreaError(
                 "the area has no imagery: it lies outside the orthophotos or is all nodata"
@@ -151,12 +146,7 @@ class SheetReader:
         return variant_recipe(represent.TABLE, self.representation)
 
     def _drawn_jobs(self) -> list[Job]:
-        side_px = block_side_px(self.grid.tile_px, self._layout.micro_px)
-        blocks = [
-            block
-            for block in blocks_of(self.grid, side_px)
-            if block.may_matter(self.area, self.grid)
-        ]
+        blocks = blocks_of_area(self.area, self.grid, self._layout)
         total_px = sum(block.height * block.width for block in blocks)
         jobs = []
         for block in blocks:
@@ -238,6 +228,23 @@ class SheetReader:
         return found
 
 
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """OpenCV on one thread, where each of our threads works on a block of its own."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block]:
+    """The blocks of a grid that tiles of an area may need."""
+    side_px = _block_side_px(grid.tile_px, layout.micro_px)
+    return [block for block in blocks_of(grid, side_px) if block.may_matter(area, grid)]
+
+
 def layer_parts(
     area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> Parts:
@@ -273,7 +280,7 @@ def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
         layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
 
-def block_side_px(tile_px: int, micro_px: int) -> int:
+def _block_side_px(tile_px: int, micro_px: int) -> int:
     """Width of a block: a multiple of the micro-cell, and of the layer chunk if possible."""
     least = max(BLOCK_PX, 2 * tile_px)
     step = math.lcm(micro_px, CHUNK_PX)
