@@ -26,6 +26,7 @@ from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.images import CellPixels
 from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
 from orthonav.fetch.remote import CACHE_BYTES, MAX_RANGE, RangeCache, RemoteFile
+from orthonav.fetch.service import CellSource
 from orthonav.fetch.urls import shown
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.raster import WHOLLY_VALID
@@ -66,30 +67,23 @@ class CogLevel:
 
 
 @dataclass(frozen=True, eq=False)
-class CogSource:
+class _CogCells:
     """Cells of one or several files; where they overlap, the first valid pixel counts."""
 
-    provenance: Provenance
     grid: CellGrid
     files: list[CogLevel]
-    band_indexes: tuple[int, ...]
+    bands: tuple[int, ...]
     dtype: str
-    cell_bytes: float
-
-    @property
-    def bands(self) -> int:
-        """Number of bands that are read."""
-        return len(self.band_indexes)
 
     def address(self, row: int, col: int) -> str:
         """Files, their versions, and the window."""
         files = " ".join(f"{file.remote.url} {file.remote.identity}" for file in self.files)
-        return f"{files} {self.grid} {self.band_indexes} {row} {col}"
+        return f"{files} {self.grid} {self.bands} {row} {col}"
 
     def fetch(self, client: Client, row: int, col: int) -> bytes | None:
         """Pixels of the cell, packed; None where no file has valid pixels there."""
         shape = (self.grid.cell_h_px, self.grid.cell_w_px)
-        bands = np.zeros((self.bands, *shape), dtype=self.dtype)
+        bands = np.zeros((len(self.bands), *shape), dtype=self.dtype)
         valid = np.zeros(shape, dtype=bool)
         box = self.grid.bounds(row, col)
         for file in self.files:
@@ -150,7 +144,7 @@ class CogSource:
             "dst_crs": grid.crs,
             "resampling": Resampling.bilinear,
         }
-        resampled = np.zeros((self.bands, *shape), dtype=self.dtype)
+        resampled = np.zeros((len(self.bands), *shape), dtype=self.dtype)
         validity = np.zeros(shape, dtype=np.uint8)
         reproject(pixels, resampled, **placement)
         reproject(np.where(mask, 255, 0).astype(np.uint8), validity, **placement)
@@ -166,8 +160,8 @@ class CogSource:
         # Opened for every window: rasterio 1.4 crashes where a file of an opener is closed in
         # another thread than it was opened in. Its head is in memory, so this takes milliseconds.
         with file.remote.opened(file.level) as dataset:
-            pixels = dataset.read(list(self.band_indexes), window=window)
-            mask = _mask(dataset, self.band_indexes, window)
+            pixels = dataset.read(list(self.bands), window=window)
+            mask = _mask(dataset, self.bands, window)
         return (row0, col0), pixels, mask
 
 
@@ -177,7 +171,7 @@ def cog_source(
     options: ImageryOptions,
     frame: LocalFrame,
     provenance: Provenance,
-) -> CogSource:
+) -> CellSource:
     """The files as one source, on the grid of the first at the level that fits `options`.
 
     Raises `FetchError` where one cannot be read or they differ in pixel type or bands.
@@ -201,7 +195,9 @@ def cog_source(
         note = "; ".join(part for part in (provenance.note, note) if part)
         provenance = replace(provenance, note=note)
     cell_bytes = CELL_PX**2 * np.dtype(first.dtype).itemsize * len(bands) * _PACKED_SHARE
-    return CogSource(provenance, grid, files, bands, first.dtype, cell_bytes)
+    cells = _CogCells(grid, files, bands, first.dtype)
+    functions = cells.address, cells.fetch, cells.decode
+    return CellSource(provenance, grid, len(bands), first.dtype, cell_bytes, *functions)
 
 
 def _inspect(file: RemoteFile, options: ImageryOptions, frame: LocalFrame) -> CogLevel:

@@ -23,7 +23,7 @@ from orthonav.fetch.options import (
     choose_layer,
     choose_time,
 )
-from orthonav.fetch.service import TileSource, resolution
+from orthonav.fetch.service import CellSource, resolution, tile_source
 from orthonav.fetch.urls import with_query
 from orthonav.geo.frames import LocalFrame
 
@@ -116,7 +116,7 @@ def _max_px(root: Element) -> int:
 
 def wms_cells(
     layer: WmsLayer, options: ImageryOptions, frame: LocalFrame, provenance: Provenance
-) -> TileSource:
+) -> CellSource:
     """Cells of a layer. Raises `FetchError` with the available choices."""
     if options.style is not None:
         choose(list(layer.styles), options.style, f"layer {layer.name} has no style")
@@ -137,7 +137,7 @@ def wms_cells(
         box = (south, west, north, east) if swap else (west, south, east, north)
         return with_query(fixed, {"BBOX": ",".join(_number(value) for value in box)})
 
-    return TileSource(provenance, grid, url_of, format_, options.empty, tiled=False)
+    return tile_source(provenance, grid, url_of, format_, options.empty, tiled=False)
 
 
 def _get_map(layer: WmsLayer, options: ImageryOptions, format_: str, crs: str, cell_px: int) -> str:

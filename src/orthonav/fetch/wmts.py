@@ -30,7 +30,7 @@ from orthonav.fetch.options import (
     choose_time,
     finest_fitting,
 )
-from orthonav.fetch.service import TileSource
+from orthonav.fetch.service import CellSource, tile_source
 from orthonav.fetch.urls import carrying_key, joined, quoted, with_query
 from orthonav.geo.frames import LocalFrame
 
@@ -185,7 +185,7 @@ def _kvp_url(client: Client, service: Any, url: str) -> str | None:
 
 def wmts_tiles(
     layer: WmtsLayer, options: ImageryOptions, frame: LocalFrame, provenance: Provenance
-) -> TileSource:
+) -> CellSource:
     """The tiles of a layer. Raises `FetchError` with the available choices."""
     format_ = choose_format(layer.formats, options, f"layer {layer.name}")
     preferred = options.preferred_style if options.preferred_style in layer.styles else None
@@ -208,7 +208,7 @@ def wmts_tiles(
         "tilematrix": matrix.name,
     }
     url_of = _url_of(layer, format_, names, dimensions)
-    return TileSource(provenance, matrix.grid, url_of, format_, options.empty)
+    return tile_source(provenance, matrix.grid, url_of, format_, options.empty)
 
 
 def _url_of(
