@@ -5,6 +5,7 @@ around: limits of zooms, names of grids, rows before columns, rounded scales.
 """
 
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,8 +17,6 @@ from orthonav.fetch.crs import MERCATOR_HALF_M
 from orthonav.fetch.documents import parse_xml
 from orthonav.fetch.options import ImageryOptions, Provenance
 from orthonav.fetch.presets import presets
-from orthonav.fetch.wms import wms_cells
-from orthonav.fetch.wmts import wmts_tiles
 from orthonav.geo.frames import LocalFrame
 
 FOLDER = Path(__file__).parent / "capabilities"
@@ -37,14 +36,20 @@ def document(name):
     return parse_xml((FOLDER / f"{name}.xml").read_bytes())
 
 
+def answering(module, found):
+    """The service answers with this document."""
+    return mock.patch.object(module, "get_xml", lambda client, url: found)
+
+
 def tiles(name, options, url="https://a.example/wmts"):
-    layer = wmts.read_layer(CLIENT, document(f"{name}_wmts"), url, options.layer)
-    return wmts_tiles(layer, options, PLACES.get(name, PLACES["ign"]), PROVENANCE)
+    with answering(wmts, document(f"{name}_wmts")):
+        place = PLACES.get(name, PLACES["ign"])
+        return wmts.wmts_tiles(CLIENT, url, options, place, PROVENANCE)
 
 
 def cells(name, url, options, place):
-    layer = wms.read_layer(CLIENT, document(name), url, options.layer)
-    return wms_cells(layer, options, place, PROVENANCE)
+    with answering(wms, document(name)):
+        return wms.wms_cells(CLIENT, url, options, place, PROVENANCE)
 
 
 def of_preset(name, id_, **rest):
@@ -188,8 +193,10 @@ def test_harmful_documents_are_rejected(body, words):
 
 
 def refused(module, body, words):
-    with pytest.raises(FetchError, match=words):
-        module.read_layer(CLIENT, parse_xml(body), "http://a/b", None)
+    opened = wms.wms_cells if module is wms else wmts.wmts_tiles
+    place = PLACES["ign"]
+    with answering(module, parse_xml(body)), pytest.raises(FetchError, match=words):
+        opened(CLIENT, "http://a/b", ImageryOptions(), place, PROVENANCE)
 
 
 def test_a_deeply_nested_document_is_rejected():
