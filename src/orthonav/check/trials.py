@@ -224,7 +224,7 @@ class Trier:
         if plan.other_path is None:
             maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
             expected = float(np.mean([each.mean() for each in maps[:2]]))
-            picture = another_year(rng, picture, donor, maps, plan.severity)
+            picture = another_year(rng, picture, donor, maps)
         if plan.relief_m > 0:
             rim_px = plan.relief_m * size / 2 / plan.agl_m
             picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)
