@@ -348,7 +348,6 @@ class _Check:
             whole = np.full(len(points), np.nan)
             whole[here] = getattr(found, each.name)
             columns[each.name] = whole.reshape(grid.rows, grid.cols)
-        del columns["weight"]
         columns["changed"] = self._changed(grid)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
