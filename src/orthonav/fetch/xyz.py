@@ -53,9 +53,7 @@ def xyz_tiles(
 
 def quadkey(zoom: int, row: int, col: int) -> str:
     """Name of a tile as digits 0 to 3, one per zoom level (Bing Maps tile system)."""
-    return "".join(
-        str(((col >> bit) & 1) + 2 * ((row >> bit) & 1)) for bit in range(zoom - 1, -1, -1)
-    )
+    return str(int(f"{col:b}") + 2 * int(f"{row:b}")).zfill(zoom) if zoom else ""
 
 
 def _zoom(options: ImageryOptions, frame: LocalFrame, tile_px: int) -> int:
