@@ -5,10 +5,17 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from helpers import textured
-from orthonav.check.change import Severity, another_year, displaced
+from orthonav.check import change
+from orthonav.check.change import another_year, displaced
 
 SIZE = 192
-MILD = Severity(field=0.0, view=0.0, shift=0.0)
+
+
+@pytest.fixture(autouse=True)
+def mild(monkeypatch):
+    """No deviation from the expected persistence."""
+    monkeypatch.setattr(change, "FIELD", 0.0)
+    monkeypatch.setattr(change, "VIEW", 0.0)
 
 
 def kept(one, other):
@@ -25,7 +32,7 @@ def changed(lasting, seed=1, grey=None, donor=None):
     grey = textured((SIZE, SIZE), 5) if grey is None else grey
     donor = textured((SIZE, SIZE), 6) if donor is None else donor
     persistence = [np.full((SIZE, SIZE), lasting, np.float32)] * 3
-    return another_year(np.random.default_rng(seed), grey, donor, persistence, MILD)
+    return another_year(np.random.default_rng(seed), grey, donor, persistence)
 
 
 def test_the_more_lasts_the_more_is_kept():
@@ -45,7 +52,7 @@ def test_what_lasts_is_kept_where_it_does():
     lasting = np.where(np.arange(SIZE) < SIZE // 2, 0.9, 0.02).astype(np.float32)
     persistence = [np.broadcast_to(lasting, (SIZE, SIZE))] * 3
     donor = textured((SIZE, SIZE), 6)
-    made = another_year(np.random.default_rng(2), grey, donor, persistence, MILD)
+    made = another_year(np.random.default_rng(2), grey, donor, persistence)
     west, east = np.s_[:, : SIZE // 2], np.s_[:, SIZE // 2 :]
     assert kept(grey[west], made[west]) > 0.3 > 0.15 > kept(grey[east], made[east])
 

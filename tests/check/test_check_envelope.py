@@ -76,7 +76,7 @@ def test_heights():
     work = heights_work(PLAN, PLACES)
     assert [plan.agl_m for plan, _ in work] == [100.0 * part for part in HEIGHTS]
     shares = [0.1 * (i + 1) for i in range(len(HEIGHTS))]
-    found = heights_of(PLAN, [trials(each) for each in shares], 0.7, 0.9, 35.0)
+    found = heights_of(PLAN, trials(0.7), [trials(each) for each in shares], 0.9, 35.0)
     assert [each.value for each in found] == sorted([100.0, *(100.0 * part for part in HEIGHTS)])
     chosen = [each for each in found if each.chosen]
     assert [(each.value, each.probability) for each in chosen] == [(100.0, 0.7)]

@@ -38,7 +38,7 @@ def test_places_are_told_by_the_trials_around():
     west, east = found.at(WEST), found.at(EAST)
     assert west.probability[0] > 0.8 and east.probability[0] < 0.25
     assert west.low[0] > east.high[0]
-    assert west.weight[0] > 1 and west.wrong[0] == east.wrong[0] == 0
+    assert west.wrong[0] == east.wrong[0] == 0
 
 
 def test_doubtful_and_wrong_views_are_no_fixes():

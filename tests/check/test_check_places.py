@@ -25,7 +25,13 @@ from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
-WHOLE = MapCoverage(-1000.0, 1000.0, 2.0, np.ones((1000, 1000), np.bool_))
+
+
+def covering(west_m, north_m, pixel_m, valid):
+    return MapCoverage(CellGrid(west_m, north_m, pixel_m, *valid.shape), valid)
+
+
+WHOLE = covering(-1000.0, 1000.0, 2.0, np.ones((1000, 1000), np.bool_))
 
 
 def area_of(points_en_m, bands_m):
@@ -63,7 +69,7 @@ def test_a_point_is_drawn_in_every_cell():
 def test_pixels_are_areas():
     valid = np.zeros((2, 3), np.bool_)
     valid[1, 2] = True
-    coverage = MapCoverage(10.0, 20.0, 4.0, valid)
+    coverage = covering(10.0, 20.0, 4.0, valid)
     inside = [[18.0, 15.99], [21.99, 12.01]]
     outside = [[17.99, 14], [22.01, 14], [20, 16.01], [20, 11.99], [-1e9, 14], [20, 1e9]]
     assert coverage.covers(np.array(inside)).all() and not coverage.covers(np.array(outside)).any()
@@ -74,7 +80,7 @@ def test_covered_share_of_every_cell():
     valid = np.random.default_rng(1).random((60, 80)) < 0.5
     valid[:, 40:] = False
     valid[30:, :20] = True
-    coverage = MapCoverage(0.0, 120.0, 2.0, valid)
+    coverage = covering(0.0, 120.0, 2.0, valid)
     grid = CellGrid.over((0.0, 0.0, 160.0, 120.0), 20.0)
     expected = valid.reshape(6, 10, 8, 10).mean(axis=(1, 3))
     np.testing.assert_allclose(coverage.cell_share(grid), expected, atol=0.12)
@@ -85,7 +91,7 @@ def test_covered_share_of_every_cell():
 
 def test_a_map_that_shows_nothing():
     with pytest.raises(AreaError, match="has no imagery"):
-        checked_extent(MapCoverage(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)), None)
+        checked_extent(covering(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)), None)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +114,7 @@ def test_ground_of_a_band(points, bands, expected_m2):
 def test_a_band_outside_the_map_is_refused():
     with pytest.raises(AreaError, match=r"does not touch the map, \d\.\d km from it"):
         checked_extent(WHOLE, area_of([[5000, 0], [6000, 0]], [300.0]))
-    holes = MapCoverage(-1000.0, 1000.0, 2.0, np.zeros((1000, 1000), np.bool_))
+    holes = covering(-1000.0, 1000.0, 2.0, np.zeros((1000, 1000), np.bool_))
     with pytest.raises(AreaError, match="no imagery"):
         checked_extent(holes, area_of([[0, 0], [100, 0]], [300.0]))
 
@@ -136,7 +142,7 @@ def test_effort(effort, expected):
 def test_places_lie_in_the_band_and_on_the_map(band_m):
     valid = np.ones((1000, 1000), np.bool_)
     valid[400:600, 300:700] = False
-    coverage = MapCoverage(-1000.0, 1000.0, 2.0, valid)
+    coverage = covering(-1000.0, 1000.0, 2.0, valid)
     area = area_of([[-1500, -900], [900, 800]], [band_m])
     found = places(area, coverage)
     assert len(found) >= FEWEST_TRIALS and len(found) < 3 * MIN_TRIALS

@@ -67,7 +67,7 @@ def test_a_single_point_has_no_drift():
 def predicted(probability, error_m):
     """A prediction of these values, with an interval of no width."""
     nothing = np.zeros_like(probability)
-    return Prediction(probability, probability, probability, error_m, nothing, nothing, nothing)
+    return Prediction(probability, probability, probability, error_m, nothing, nothing)
 
 
 def even(points):

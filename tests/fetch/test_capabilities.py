@@ -5,6 +5,7 @@ around: limits of zooms, names of grids, rows before columns, rounded scales.
 """
 
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,8 +17,6 @@ from orthonav.fetch.crs import MERCATOR_HALF_M
 from orthonav.fetch.documents import parse_xml
 from orthonav.fetch.options import ImageryOptions, Provenance
 from orthonav.fetch.presets import presets
-from orthonav.fetch.wms import wms_cells
-from orthonav.fetch.wmts import wmts_tiles
 from orthonav.geo.frames import LocalFrame
 
 FOLDER = Path(__file__).parent / "capabilities"
@@ -37,14 +36,20 @@ def document(name):
     return parse_xml((FOLDER / f"{name}.xml").read_bytes())
 
 
+def answering(module, found):
+    """The service answers with this document."""
+    return mock.patch.object(module, "get_xml", lambda client, url: found)
+
+
 def tiles(name, options, url="https://a.example/wmts"):
-    layer = wmts.read_layer(CLIENT, document(f"{name}_wmts"), url, options.layer)
-    return wmts_tiles(layer, options, PLACES.get(name, PLACES["ign"]), PROVENANCE)
+    with answering(wmts, document(f"{name}_wmts")):
+        place = PLACES.get(name, PLACES["ign"])
+        return wmts.wmts_tiles(CLIENT, url, options, place, PROVENANCE)
 
 
 def cells(name, url, options, place):
-    layer = wms.read_layer(CLIENT, document(name), url, options.layer)
-    return wms_cells(layer, options, place, PROVENANCE)
+    with answering(wms, document(name)):
+        return wms.wms_cells(CLIENT, url, options, place, PROVENANCE)
 
 
 def of_preset(name, id_, **rest):
@@ -54,7 +59,7 @@ def of_preset(name, id_, **rest):
 
 def test_ign_by_parameters():
     source = tiles("ign", of_preset("ign", "2021", gsd_m=0.25))
-    assert source.url_of(363000, 265000) == (
+    assert source.address(363000, 265000) == (
         "https://data.geopf.fr/wmts?SERVICE=WMTS&REQUEST=GetTile&VERSION=1.0.0"
         "&LAYER=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLE=normal&FORMAT=image/jpeg"
         "&TILEMATRIXSET=PM_0_19&TILEMATRIX=19&TILEROW=363000&TILECOL=265000"
@@ -65,13 +70,13 @@ def test_ign_by_parameters():
 
 
 def test_ign_limits_of_zooms_and_styles():
-    assert "TILEMATRIX=18" in tiles("ign", of_preset("ign", "2000-2005")).url_of(1, 1)
+    assert "TILEMATRIX=18" in tiles("ign", of_preset("ign", "2000-2005")).address(1, 1)
     with pytest.raises(FetchError, match=r"no zoom 19; available: 6 .*18 \(0.411 m\)"):
         tiles("ign", of_preset("ign", "2000-2005", zoom="19"))
     with pytest.raises(FetchError, match=r"the finest is 0.411 m"):
         tiles("ign", of_preset("ign", "2000-2005", gsd_m=0.2))
     old = tiles("ign", of_preset("ign", "1965-1980", gsd_m=1.0))
-    assert "STYLE=BDORTHOHISTORIQUE&FORMAT=image/png" in old.url_of(1, 1)
+    assert "STYLE=BDORTHOHISTORIQUE&FORMAT=image/png" in old.address(1, 1)
     with pytest.raises(FetchError, match="no style normal; available: BDORTHOHISTORIQUE"):
         tiles("ign", of_preset("ign", "1965-1980", style="normal"))
 
@@ -88,16 +93,16 @@ def test_a_preferred_style_that_is_missing_is_ignored():
     options = ImageryOptions(
         layer="ORTHOIMAGERY.ORTHOPHOTOS2021", preferred_style="BDORTHOHISTORIQUE"
     )
-    assert "STYLE=normal" in tiles("ign", options).url_of(1, 1)
+    assert "STYLE=normal" in tiles("ign", options).address(1, 1)
 
 
 def test_pdok_by_templates_in_both_grids():
     source = tiles("pdok", of_preset("pdok", "2022"))
-    assert source.url_of(7, 5) == (
+    assert source.address(7, 5) == (
         "https://service.pdok.nl/hwh/luchtfotorgb/wmts/v1_0/2022_ortho25/EPSG:3857/18/5/7.jpeg"
     )
     national = tiles("pdok", of_preset("pdok", "2022", crs="EPSG:28992", gsd_m=0.25))
-    assert national.url_of(7, 5).endswith("/2022_ortho25/EPSG:28992/14/5/7.jpeg")
+    assert national.address(7, 5).endswith("/2022_ortho25/EPSG:28992/14/5/7.jpeg")
     assert national.grid.res_x == pytest.approx(0.21, rel=1e-9)
     assert national.grid.corner(0, 0) == (-285401.92, 903401.92)
 
@@ -105,11 +110,11 @@ def test_pdok_by_templates_in_both_grids():
 def test_swisstopo_by_time_and_on_https():
     where = "https://wmts.geo.admin.ch/EPSG/3857/1.0.0/WMTSCapabilities.xml"
     source = tiles("swisstopo", of_preset("swissimage", "2021", gsd_m=0.12), where)
-    assert source.url_of(7, 5) == (
+    assert source.address(7, 5) == (
         "https://wmts.geo.admin.ch/1.0.0/ch.swisstopo.swissimage-product/default/2021/3857/20/5/7.jpeg"
     )
     current = tiles("swisstopo", of_preset("swissimage", None), where)
-    assert "/ch.swisstopo.swissimage/default/current/3857/" in current.url_of(1, 1)
+    assert "/ch.swisstopo.swissimage/default/current/3857/" in current.address(1, 1)
     with pytest.raises(
         FetchError, match="no time 1999; available: 2020, 2021, 2022, 2023, current"
     ):
@@ -118,7 +123,7 @@ def test_swisstopo_by_time_and_on_https():
 
 def test_basemap_rows_before_columns_and_rounded_scales():
     source = tiles("basemap", of_preset("basemap-at", None, gsd_m=0.25))
-    assert source.url_of(7, 5) == (
+    assert source.address(7, 5) == (
         "https://mapsneu.wien.gv.at/basemap/bmaporthofoto30cm/normal/google3857/19/7/5.jpeg"
     )
     assert source.grid.res_x == 2 * MERCATOR_HALF_M / 256 / 2**19  # not 0.1 m off at Vienna
@@ -134,7 +139,7 @@ def test_a_grid_in_degrees_has_the_latitude_first():
 def test_ign_wms_in_lambert():
     url = "https://data.geopf.fr/wms-r/wms"
     source = cells("ign_wms", url, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"])
-    assert source.url_of(-12891, 1367) == (
+    assert source.address(-12891, 1367) == (
         "https://data.geopf.fr/wms-r/wms?SERVICE=WMS&VERSION=1.3.0&REQUEST=GetMap"
         "&LAYERS=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLES=&CRS=EPSG:2154&WIDTH=1024&HEIGHT=1024"
         "&FORMAT=image/jpeg&TRANSPARENT=FALSE&BBOX=699904,6599680,700416,6600192"
@@ -142,7 +147,7 @@ def test_ign_wms_in_lambert():
     degrees = of_preset("ign-wms", "2021", crs="EPSG:4326", format="image/png")
     source = cells("ign_wms", url, degrees, PLACES["ign"])
     south, west, _, _ = map(
-        float, source.url_of(*cell_at(source, 3.0, 46.5))[-80:].split("=")[-1].split(",")
+        float, source.address(*cell_at(source, 3.0, 46.5))[-80:].split("=")[-1].split(",")
     )
     assert west == pytest.approx(3.0, abs=0.01) and south == pytest.approx(46.5, abs=0.01)
 
@@ -158,7 +163,7 @@ def test_an_old_wms_with_times():
     url, place = "http://maps.example/wms", LocalFrame(51.5, 8.0)
     options = ImageryOptions(layer="ortho", time="2018", gsd_m=0.5)
     source = cells("old_wms", url, options, place)
-    address = source.url_of(0, 0)
+    address = source.address(0, 0)
     start = "http://maps.example/cgi?map=/srv/ortho.map&SERVICE=WMS&VERSION=1.1.1"
     assert address.startswith(start)
     assert "SRS=EPSG:25832" in address and "TIME=2018" in address
@@ -188,8 +193,10 @@ def test_harmful_documents_are_rejected(body, words):
 
 
 def refused(module, body, words):
-    with pytest.raises(FetchError, match=words):
-        module.read_layer(CLIENT, parse_xml(body), "http://a/b", None)
+    opened = wms.wms_cells if module is wms else wmts.wmts_tiles
+    place = PLACES["ign"]
+    with answering(module, parse_xml(body)), pytest.raises(FetchError, match=words):
+        opened(CLIENT, "http://a/b", ImageryOptions(), place, PROVENANCE)
 
 
 def test_a_deeply_nested_document_is_rejected():

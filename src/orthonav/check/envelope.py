@@ -22,9 +22,8 @@ HEIGHTS = (0.5, 0.7, 1.4, 2.0)
 
 def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
     """Trials at the same places for every error of heading and height."""
-    exact = replace(plan, agl_off=0.0)
     return [
-        (replace(exact, yaw_off_deg=yaw, agl_off=agl), places_en_m)
+        (replace(plan, yaw_off_deg=yaw, agl_off=agl), places_en_m)
         for yaw in YAW_OFF_DEG
         for agl in AGL_OFF
     ]
@@ -54,18 +53,17 @@ def heights_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
 
 def heights_of(
     plan: TrialPlan,
-    trials: Sequence[Sequence[Trial]],
-    planned: float,
+    planned: Sequence[Trial],
+    others: Sequence[Sequence[Trial]],
     accept: float,
     radius_m: float,
 ) -> tuple[Alternative, ...]:
-    """Alternatives from the trials of `heights_work`; `planned` is the share at `plan.agl_m`."""
-    others = [
-        Alternative("agl_m", plan.agl_m * part, accepted_share(each, accept, radius_m))
-        for part, each in zip(HEIGHTS, trials, strict=True)
-    ]
-    chosen = Alternative("agl_m", plan.agl_m, planned, chosen=True)
-    return tuple(sorted([*others, chosen], key=lambda each: each.value))
+    """Alternatives from `planned` trials at `plan.agl_m` and those of `heights_work`, by height."""
+    tried = sorted({1.0: planned, **dict(zip(HEIGHTS, others, strict=True))}.items())
+    return tuple(
+        Alternative("agl_m", plan.agl_m * part, accepted_share(each, accept, radius_m), part == 1.0)
+        for part, each in tried
+    )
 
 
 def accepted_share(trials: Sequence[Trial], accept: float, radius_m: float) -> float:

@@ -40,7 +40,7 @@ _PAIRS_AT_ONCE = 2**20
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predictions at places (N,); fields as in `Cells`. `weight` is that of nearby trials."""
+    """Predictions at places (N,); fields as in `Cells`."""
 
     probability: Array
     low: Array
@@ -48,7 +48,6 @@ class Prediction:
     error_m: Array
     wrong: Array
     persistence: Array
-    weight: Array
 
 
 class Predictor:
@@ -105,7 +104,7 @@ class Predictor:
             return np.full(len(self.right), float(mean))
         regressors = np.stack([np.log(self._persistence), self._coverage], axis=1)
         bias, slopes = fit_weights(regressors, self.right, self._weight, RIDGE)
-        return np.asarray(1 / (1 + np.exp(-(bias + regressors @ slopes))))
+        return expit(bias + regressors @ slopes)
 
     def at(self, points_en_m: Array) -> Prediction:
         """Predictions at places (N, 2)."""
@@ -142,7 +141,6 @@ class Predictor:
             error_m=np.sqrt(square_error + self._least_error_m**2),
             wrong=(near @ self.wrong + overall_wrong) / (total + 1.0),
             persistence=kind @ self._persistence,
-            weight=total,
         )
 
     def _weights(self, points: Array, bandwidth_m: float) -> Array:

@@ -53,19 +53,14 @@ class PersistenceModel:
         """Plain values for a JSON file."""
         return {name: [float(f"{x:.6g}") for x in value] for name, value in vars(self).items()}
 
-    @classmethod
-    def from_plain(cls, plain: Any) -> "PersistenceModel":
-        """Inverse of `to_plain`."""
-        return cls(
-            *(np.array(plain[name], dtype=np.float64) for name in ("mean", "spread", "weights"))
-        )
-
 
 @cache
 def default_model() -> PersistenceModel:
     """The model that is installed with the package."""
     text = resources.files(__package__).joinpath(MODEL).read_text(encoding="utf-8")
-    return PersistenceModel.from_plain(json.loads(text)["model"])
+    return PersistenceModel(
+        **{name: np.array(values, np.float64) for name, values in json.loads(text)["model"].items()}
+    )
 
 
 def terms(scaled: NDArray[Any]) -> NDArray[Any]:

@@ -32,96 +32,6 @@ _SAMPLES_PER_CELL = 4
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class MapCoverage:
-    """Where a map has imagery.
-
-    `west_m`, `north_m`: north-west corner; `pixel_m`: side of a pixel; `valid`: mask (rows, cols).
-    """
-
-    west_m: float
-    north_m: float
-    pixel_m: float
-    valid: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, layer: GreyPyramid, grid: TileGrid) -> "MapCoverage":
-        """Coverage by the registration layer of a sheet."""
-        level = 0
-        while level < layer.levels - 1 and max(layer.shape(level)) > MASK_PX:
-            level += 1
-        rows, cols = layer.shape(level)
-        _, valid = layer.read(level, 0, 0, rows, cols)
-        return cls(grid.west_m, grid.north_m, grid.gsd_m * 2**level, valid)
-
-    def without(self, changes: ChangedGround | None, frame: LocalFrame) -> "MapCoverage":
-        """The coverage without the ground that changed; `frame` is the plane of the sheet."""
-        if changes is None:
-            return self
-        rows, cols = self.valid.shape
-        pixels = CellGrid(self.west_m, self.north_m, self.pixel_m, rows, cols).centres_en_m
-        changed = changes.covers(pixels, frame).reshape(rows, cols)
-        return replace(self, valid=self.valid & ~changed)
-
-    def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
-        """Which of points (N, 2) lie on imagery."""
-        return self._at(points_en_m, self.valid).astype(np.bool_)
-
-    def seen_share(self, points_en_m: Array, side_m: float) -> Array:
-        """Share (N,) of views of a side, taken over points (N, 2), that the map covers."""
-        side = max(1, round(side_m / self.pixel_m))
-        share = cv2.blur(
-            np.pad(self.valid.astype(np.float32), side),
-            (side, side),
-            borderType=cv2.BORDER_CONSTANT,
-        )
-        return self._at(points_en_m, np.asarray(share), padding=side).astype(np.float64)
-
-    def _at(self, points_en_m: Array, values: NDArray[np.generic], padding: int = 0) -> Array:
-        """Values (N,) of a raster at points (N, 2), 0 outside it."""
-        cols = np.floor((points_en_m[:, 0] - self.west_m) / self.pixel_m).astype(int) + padding
-        rows = np.floor((self.north_m - points_en_m[:, 1]) / self.pixel_m).astype(int) + padding
-        height, width = values.shape
-        inside = (rows >= 0) & (cols >= 0) & (rows < height) & (cols < width)
-        found = np.zeros(len(points_en_m))
-        found[inside] = values[rows[inside], cols[inside]]
-        return found
-
-    def cell_share(self, cells: "CellGrid") -> Array:
-        """Share (rows, cols) of every cell that the map covers."""
-        scale, fine = cells.side_m / self.pixel_m, _SAMPLES_PER_CELL
-        left = (cells.west_m - self.west_m) / self.pixel_m
-        top = (self.north_m - cells.north_m) / self.pixel_m
-        step = scale / fine
-        matrix = np.array([[step, 0, left + step / 2 - 0.5], [0, step, top + step / 2 - 0.5]])
-        samples = cv2.warpAffine(
-            self.valid.astype(np.float32),
-            matrix,
-            (cells.cols * fine, cells.rows * fine),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        )
-        parts = np.asarray(samples).reshape(cells.rows, fine, cells.cols, fine)
-        return np.asarray(parts.mean(axis=(1, 3)), dtype=np.float64)
-
-    @property
-    def extent_en_m(self) -> Extent:
-        """West, south, east, north of the imagery."""
-        rows, cols = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
-        if not len(rows):
-            raise AreaError("the map has no imagery; build it again from an orthophoto with data")
-        return (
-            self.west_m + cols[0] * self.pixel_m,
-            self.north_m - (rows[-1] + 1) * self.pixel_m,
-            self.west_m + (cols[-1] + 1) * self.pixel_m,
-            self.north_m - rows[0] * self.pixel_m,
-        )
-
-    @property
-    def area_m2(self) -> float:
-        """Area of the imagery."""
-        return float(self.valid.sum()) * self.pixel_m**2
-
-
 @dataclass(frozen=True)
 class CellGrid:
     """Square cells of `side_m` from a north-west corner, row 0 in the north."""
@@ -151,14 +61,93 @@ class CellGrid:
         off = rng.uniform(-0.5, 0.5, (self.rows * self.cols, 2)) * self.side_m
         return np.asarray(self.centres_en_m + off)
 
+    def numbers(self, points_en_m: Array, margin: int = 0) -> NDArray[np.intp]:
+        """Number (N,) of the cell, row by row, under each of points (N, 2); -1 outside.
+
+        `margin` cells are added and counted on each side.
+        """
+        cols = np.floor((points_en_m[:, 0] - self.west_m) / self.side_m).astype(np.intp) + margin
+        rows = np.floor((self.north_m - points_en_m[:, 1]) / self.side_m).astype(np.intp) + margin
+        height, width = self.rows + 2 * margin, self.cols + 2 * margin
+        inside = (rows >= 0) & (cols >= 0) & (rows < height) & (cols < width)
+        return np.where(inside, rows * width + cols, -1)
+
     def counts(self, points_en_m: Array) -> NDArray[np.int32]:
         """Number (rows, cols) of points (N, 2) in each cell."""
-        cols = np.floor((points_en_m[:, 0] - self.west_m) / self.side_m).astype(int)
-        rows = np.floor((self.north_m - points_en_m[:, 1]) / self.side_m).astype(int)
-        inside = (rows >= 0) & (cols >= 0) & (rows < self.rows) & (cols < self.cols)
-        found = np.zeros((self.rows, self.cols), np.int32)
-        np.add.at(found, (rows[inside], cols[inside]), 1)
-        return found
+        found = np.bincount(self.numbers(points_en_m) + 1, minlength=self.rows * self.cols + 1)
+        return found[1:].astype(np.int32).reshape(self.rows, self.cols)
+
+
+@dataclass(frozen=True, eq=False)
+class MapCoverage:
+    """Where a map has imagery: `valid` (rows, cols) of the pixels of a raster."""
+
+    pixels: CellGrid
+    valid: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, layer: GreyPyramid, grid: TileGrid) -> "MapCoverage":
+        """Coverage by the registration layer of a sheet."""
+        level = 0
+        while level < layer.levels - 1 and max(layer.shape(level)) > MASK_PX:
+            level += 1
+        rows, cols = layer.shape(level)
+        _, valid = layer.read(level, 0, 0, rows, cols)
+        return cls(CellGrid(grid.west_m, grid.north_m, grid.gsd_m * 2**level, rows, cols), valid)
+
+    def without(self, changes: ChangedGround | None, frame: LocalFrame) -> "MapCoverage":
+        """The coverage without the ground that changed; `frame` is the plane of the sheet."""
+        if changes is None:
+            return self
+        changed = changes.covers(self.pixels.centres_en_m, frame).reshape(self.valid.shape)
+        return replace(self, valid=self.valid & ~changed)
+
+    def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
+        """Which of points (N, 2) lie on imagery."""
+        numbers = self.pixels.numbers(points_en_m)
+        return np.asarray((numbers >= 0) & self.valid.ravel()[numbers])
+
+    def seen_share(self, points_en_m: Array, side_m: float) -> Array:
+        """Share (N,) of views of a side, taken over points (N, 2), that the map covers."""
+        side = max(1, round(side_m / self.pixels.side_m))
+        padded = np.pad(self.valid.astype(np.float32), side)
+        share = cv2.blur(padded, (side, side), borderType=cv2.BORDER_CONSTANT)
+        numbers = self.pixels.numbers(points_en_m, side)
+        return np.where(numbers >= 0, np.asarray(share, np.float64).ravel()[numbers], 0.0)
+
+    def cell_share(self, cells: CellGrid) -> Array:
+        """Share (rows, cols) of every cell that the map covers."""
+        unit_m, fine = self.pixels.side_m, _SAMPLES_PER_CELL
+        left = (cells.west_m - self.pixels.west_m) / unit_m
+        top = (self.pixels.north_m - cells.north_m) / unit_m
+        step = cells.side_m / unit_m / fine
+        matrix = np.array([[step, 0, left + step / 2 - 0.5], [0, step, top + step / 2 - 0.5]])
+        samples = cv2.warpAffine(
+            self.valid.astype(np.float32),
+            matrix,
+            (cells.cols * fine, cells.rows * fine),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        )
+        parts = np.asarray(samples).reshape(cells.rows, fine, cells.cols, fine)
+        return np.asarray(parts.mean(axis=(1, 3)), dtype=np.float64)
+
+    @property
+    def extent_en_m(self) -> Extent:
+        """West, south, east, north of the imagery."""
+        rows, cols = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
+        if not len(rows):
+            raise AreaError("the map has no imagery; build it again from an orthophoto with data")
+        return (
+            self.pixels.west_m + cols[0] * self.pixels.side_m,
+            self.pixels.north_m - (rows[-1] + 1) * self.pixels.side_m,
+            self.pixels.west_m + (cols[-1] + 1) * self.pixels.side_m,
+            self.pixels.north_m - rows[0] * self.pixels.side_m,
+        )
+
+    @property
+    def area_m2(self) -> float:
+        """Area of the imagery."""
+        return float(self.valid.sum()) * self.pixels.side_m**2
 
 
 def checked_extent(coverage: MapCoverage, area: Area | None) -> Extent:

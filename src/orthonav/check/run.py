@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.envelope import (
-    accepted_share,
     envelope_of,
     envelope_work,
     heights_of,
@@ -37,15 +36,14 @@ from orthonav.check.places import (
 from orthonav.check.recalibrate import Recalibration
 from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
-from orthonav.check.trials import Trial, run_many
+from orthonav.check.trials import Trial, registration_of, run_many
 from orthonav.check.verdict import Findings, verdict_of
 from orthonav.check.views import MIN_VALID, TrialPlan
 from orthonav.cores import usable_cores
 from orthonav.errors import AreaError, CameraError, MapFileError
-from orthonav.files import Progress
+from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area
 from orthonav.geo.route import distance_to_polyline_m
-from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import MAP_STD_M
@@ -70,7 +68,7 @@ MAX_CELLS_AROUND = 250_000
 
 
 def check_map(
-    request: CheckRequest, progress: Progress | None = None
+    request: CheckRequest, progress: Progress = no_progress
 ) -> tuple[CheckResult, MapFile]:
     """Check a map; `progress` is called with the stage and its share done, 0..1.
 
@@ -79,56 +77,45 @@ def check_map(
     too narrow, `WorkerError` where a worker process ended unexpectedly.
     """
     opened = open_map(request.map_path)
-    return _Check(request, opened, progress or (lambda stage, share: None)).result(), opened
+    return _Check(request, opened, progress).result(), opened
 
 
-@dataclass
 class _Check:
-    request: CheckRequest
-    opened: MapFile
-    progress: Progress
-    coverage: MapCoverage = field(init=False)
-    area: Area | None = field(init=False)
-
-    def __post_init__(self) -> None:
-        if len(self.opened.manifest.sheets) != 1:
-            raise MapFileError(f"only maps of one sheet can be checked: {self.opened.path}")
-        registration = Localizer(self.opened, level_ground=True).registration
-        if registration is None:
-            raise MapFileError(
-                f"only maps with a registration layer can be checked: {self.opened.path}"
-            )
+    def __init__(self, request: CheckRequest, opened: MapFile, progress: Progress) -> None:
+        self.request, self.progress = request, progress
+        if len(opened.manifest.sheets) != 1:
+            raise MapFileError(f"only maps of one sheet can be checked: {opened.path}")
+        registration = registration_of(opened)
         self.sheet = registration.sheet
         self.coverage = MapCoverage.of(registration.pyramid, self.sheet.grid)
         self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
         self.calibrated = registration.confidence is not None
-        self.workers = self.request.workers or usable_cores()
+        self.workers = request.workers or usable_cores()
         self.plan = self._plan()
         self.conditions = Conditions(
             self.plan.width_m,
             self.plan.height_m,
             self.plan.agl_m,
-            self.request.yaw_std_deg,
-            self.request.agl_std,
-            self.request.prior_std_m,
-            self.request.accept,
+            request.yaw_std_deg,
+            request.agl_std,
+            request.prior_std_m,
+            request.accept,
             self.radius_m,
-            self.request.speed_mps,
-            self.request.drift,
-            self.request.tilt_std_deg,
-            self.request.other_sensor,
+            request.speed_mps,
+            request.drift,
+            request.tilt_std_deg,
+            request.other_sensor,
         )
         self.area = self._area()
-        if self.request.other_date is not None:
-            require_overlap(self.request.other_date, self.sheet)
+        if request.other_date is not None:
+            require_overlap(request.other_date, self.sheet)
         self.extent = checked_extent(self.coverage, self.area)
 
     def _plan(self) -> TrialPlan:
         request, camera = self.request, self.request.camera
         agl_m = request.agl_m
         if agl_m is None:
-            tile_m = self.sheet.grid.tile_m
-            agl_m = tile_m / min(camera.extent)
+            agl_m = self.sheet.grid.tile_m / min(camera.extent)
         plan = TrialPlan(
             request.map_path,
             camera,
@@ -209,14 +196,14 @@ class _Check:
         )
         cells = self._cells(predictor, own)
         along = self._along(predictor)
-        outside = changed = 0.0
+        outside = 0.0
         if along is not None:
             outside = float(1 - self.coverage.covers(along.points_en_m).mean())
         known = np.isfinite(cells.probability)
-        if known.any():
-            changed = float(cells.changed[known].mean())
-        mean = float(cells.probability[known].mean()) if known.any() else 0.0
-        low = float(cells.low[known].mean()) if known.any() else 0.0
+        mean, low, changed = (
+            float(each[known].mean()) if known.any() else 0.0
+            for each in (cells.probability, cells.low, cells.changed)
+        )
         findings = Findings(
             conditions=self.conditions,
             mean=mean if along is None else float(along.probability.mean()),
@@ -348,7 +335,6 @@ class _Check:
             whole = np.full(len(points), np.nan)
             whole[here] = getattr(found, each.name)
             columns[each.name] = whole.reshape(grid.rows, grid.cols)
-        del columns["weight"]
         columns["changed"] = self._changed(grid)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
@@ -376,9 +362,7 @@ class _Check:
     ) -> tuple[Alternative, ...]:
         found: tuple[Alternative, ...] = ()
         if heights:
-            accept, radius_m = self.request.accept, self.radius_m
-            planned = accepted_share(own, accept, radius_m)
-            found = heights_of(self.plan, heights, planned, accept, radius_m)
+            found = heights_of(self.plan, own, heights, self.request.accept, self.radius_m)
         return found + self._bands(cells)
 
     def _bands(self, cells: Cells) -> tuple[Alternative, ...]:

@@ -26,7 +26,9 @@ from orthonav.check.persistence import MARGIN_PX
 from orthonav.check.views import MapCrops, TrialPlan, reported_persistence, view_of
 from orthonav.errors import MapFileError, WorkerError
 from orthonav.localizer import Localizer
+from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile import open_map
+from orthonav.mapfile.reader import MapFile
 from orthonav.records import NoFix, Prior, View
 from orthonav.register.registrar import Levels, apart_px
 
@@ -65,7 +67,7 @@ class Trial:
 
 
 def run_many(
-    work: Sequence[Work], workers: int, progress: Callable[[float], None] | None = None
+    work: Sequence[Work], workers: int, progress: Callable[[float], None] = lambda share: None
 ) -> list[list[Trial]]:
     """Trials of several plans of one map, in the order of their places; those off it are left out.
 
@@ -82,8 +84,7 @@ def run_many(
     for done, (number, trial) in enumerate(_run_jobs(plans, jobs, workers)):
         if trial is not None:
             found[number].append(trial)
-        if progress is not None:
-            progress((done + 1) / len(jobs))
+        progress((done + 1) / len(jobs))
     return found
 
 
@@ -158,16 +159,20 @@ def _work(job: _Job) -> _Outcome:
     return _trier(job)
 
 
+def registration_of(opened: MapFile) -> RegistrationLocalizer:
+    """Registration over level ground; raises `MapFileError` where the map has no layer for it."""
+    found = Localizer(opened, level_ground=True).registration
+    if found is None:
+        raise MapFileError(f"only maps with a registration layer can be checked: {opened.path}")
+    return found
+
+
 class Trier:
     """Runs trials of plans that share a map."""
 
     def __init__(self, plans: Sequence[TrialPlan]) -> None:
-        """Open the map; raises `MapFileError` where it has no registration layer."""
-        registration = Localizer(open_map(plans[0].map_path), level_ground=True).registration
-        if registration is None:
-            raise MapFileError(
-                f"only maps with a registration layer can be checked: {plans[0].map_path}"
-            )
+        """Open the map. Raises as `registration_of` does."""
+        registration = registration_of(open_map(plans[0].map_path))
         self._registration = registration
         self._own = MapCrops(registration.pyramid, registration.grid)
         self._plans = plans
@@ -224,7 +229,7 @@ class Trier:
         if plan.other_path is None:
             maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
             expected = float(np.mean([each.mean() for each in maps[:2]]))
-            picture = another_year(rng, picture, donor, maps, plan.severity)
+            picture = another_year(rng, picture, donor, maps)
         if plan.relief_m > 0:
             rim_px = plan.relief_m * size / 2 / plan.agl_m
             picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)

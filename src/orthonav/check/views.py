@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.changes.record import ChangedGround
-from orthonav.check.change import USUAL, Severity
 from orthonav.check.persistence import MARGIN_PX, default_model, features
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
@@ -35,7 +34,6 @@ class TrialPlan:
     `yaw_std_deg`, `agl_std`, `prior_std_m`: random errors of the reported values; None: unknown.
     `relief_m`: standard deviation of the height of objects, which cause relief displacement.
     `seed`: of all random numbers, together with the number of the trial.
-    `severity`: of the simulated ageing.
     `other_path`: orthophoto of a second date to cut views from; None: the map's imagery, aged.
     `yaw_off_deg`: additional heading error, to either side at random.
     `agl_off`: additional height error, a share of the height.
@@ -50,7 +48,6 @@ class TrialPlan:
     prior_std_m: float | None = None
     relief_m: float = 0.0
     seed: int = 1
-    severity: Severity = USUAL
     other_path: Path | None = None
     yaw_off_deg: float = 0.0
     agl_off: float = 0.0

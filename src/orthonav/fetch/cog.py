@@ -8,16 +8,13 @@ import io
 import math
 import warnings
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import MaskFlags, Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import Affine
 from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
@@ -28,7 +25,8 @@ from orthonav.fetch.crs import ground_scale
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.images import CellPixels
 from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
-from orthonav.fetch.remote import CACHE_BYTES, MAX_RANGE, RangeCache, RemoteFile, RemoteFiles
+from orthonav.fetch.remote import CACHE_BYTES, MAX_RANGE, RangeCache, RemoteFile
+from orthonav.fetch.service import CellSource
 from orthonav.fetch.urls import shown
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.raster import WHOLLY_VALID
@@ -41,10 +39,6 @@ ALIGNED_PX = 0.02
 """Grids that differ by less count as one: a fiftieth of a pixel is below any error of imagery."""
 _PACKED_SHARE = 0.35
 """Size of a usual JPEG block relative to its pixels, for the estimate."""
-GDAL_OPTIONS = {
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
-    "GDAL_CACHEMAX": 64 * 2**20,
-}
 _DTYPES = ("uint8", "uint16", "int16", "float32")
 Box = tuple[float, float, float, float]
 Part = tuple[tuple[int, int], NDArray[Any], NDArray[np.bool_]]
@@ -56,8 +50,6 @@ class CogLevel:
 
     remote: RemoteFile
     """The file."""
-    name: str
-    """Its name among the remote files of the source."""
     level: int | None
     """Index of the overview; None is the full resolution."""
     transform: Affine
@@ -75,31 +67,23 @@ class CogLevel:
 
 
 @dataclass(frozen=True, eq=False)
-class CogSource:
+class _CogCells:
     """Cells of one or several files; where they overlap, the first valid pixel counts."""
 
-    provenance: Provenance
     grid: CellGrid
     files: list[CogLevel]
-    band_indexes: tuple[int, ...]
+    bands: tuple[int, ...]
     dtype: str
-    cell_bytes: float
-    _remote: RemoteFiles
-
-    @property
-    def bands(self) -> int:
-        """Number of bands that are read."""
-        return len(self.band_indexes)
 
     def address(self, row: int, col: int) -> str:
         """Files, their versions, and the window."""
         files = " ".join(f"{file.remote.url} {file.remote.identity}" for file in self.files)
-        return f"{files} {self.grid} {self.band_indexes} {row} {col}"
+        return f"{files} {self.grid} {self.bands} {row} {col}"
 
     def fetch(self, client: Client, row: int, col: int) -> bytes | None:
         """Pixels of the cell, packed; None where no file has valid pixels there."""
         shape = (self.grid.cell_h_px, self.grid.cell_w_px)
-        bands = np.zeros((self.bands, *shape), dtype=self.dtype)
+        bands = np.zeros((len(self.bands), *shape), dtype=self.dtype)
         valid = np.zeros(shape, dtype=bool)
         box = self.grid.bounds(row, col)
         for file in self.files:
@@ -160,7 +144,7 @@ class CogSource:
             "dst_crs": grid.crs,
             "resampling": Resampling.bilinear,
         }
-        resampled = np.zeros((self.bands, *shape), dtype=self.dtype)
+        resampled = np.zeros((len(self.bands), *shape), dtype=self.dtype)
         validity = np.zeros(shape, dtype=np.uint8)
         reproject(pixels, resampled, **placement)
         reproject(np.where(mask, 255, 0).astype(np.uint8), validity, **placement)
@@ -175,9 +159,9 @@ class CogSource:
         window = Window(col0, row0, col1 - col0, row1 - row0)
         # Opened for every window: rasterio 1.4 crashes where a file of an opener is closed in
         # another thread than it was opened in. Its head is in memory, so this takes milliseconds.
-        with _opened(self._remote, file.name, file.level) as dataset:
-            pixels = dataset.read(list(self.band_indexes), window=window)
-            mask = _mask(dataset, self.band_indexes, window)
+        with file.remote.opened(file.level) as dataset:
+            pixels = dataset.read(list(self.bands), window=window)
+            mask = _mask(dataset, self.bands, window)
         return (row0, col0), pixels, mask
 
 
@@ -187,17 +171,13 @@ def cog_source(
     options: ImageryOptions,
     frame: LocalFrame,
     provenance: Provenance,
-) -> CogSource:
+) -> CellSource:
     """The files as one source, on the grid of the first at the level that fits `options`.
 
     Raises `FetchError` where one cannot be read or they differ in pixel type or bands.
     """
-    remote, cache = RemoteFiles(), RangeCache(CACHE_BYTES, len)
-    files: list[CogLevel] = []
-    for number, url in enumerate(urls):
-        name = f"{number}.tif"
-        remote.files[name] = RemoteFile(client, url, cache)
-        files.append(_inspect(remote, name, options, frame))
+    cache = RangeCache(CACHE_BYTES, len)
+    files = [_inspect(RemoteFile(client, url, cache), options, frame) for url in urls]
     first = files[0]
     bands = options.bands or ((1,) if first.count < 3 else (1, 2, 3))
     for file in files:
@@ -215,23 +195,21 @@ def cog_source(
         note = "; ".join(part for part in (provenance.note, note) if part)
         provenance = replace(provenance, note=note)
     cell_bytes = CELL_PX**2 * np.dtype(first.dtype).itemsize * len(bands) * _PACKED_SHARE
-    return CogSource(provenance, grid, files, bands, first.dtype, cell_bytes, remote)
+    cells = _CogCells(grid, files, bands, first.dtype)
+    functions = cells.address, cells.fetch, cells.decode
+    return CellSource(provenance, grid, len(bands), first.dtype, cell_bytes, *functions)
 
 
-def _inspect(
-    remote: RemoteFiles, name: str, options: ImageryOptions, frame: LocalFrame
-) -> CogLevel:
+def _inspect(file: RemoteFile, options: ImageryOptions, frame: LocalFrame) -> CogLevel:
     """A file at the level that fits `options`, read from its head."""
-    file = remote.files[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with _opened(remote, name, None) as whole:
+        with file.opened() as whole:
             level = _level(whole, options, frame, file)
-        with _opened(remote, name, level) as dataset:
+        with file.opened(level) as dataset:
             _check(dataset, file)
             return CogLevel(
                 remote=file,
-                name=name,
                 level=level,
                 transform=dataset.transform,
                 width_px=dataset.width,
@@ -295,21 +273,3 @@ def _offset_px(grid: CellGrid, file: CogLevel, box: Box) -> tuple[int, int] | No
     if max(abs(col - round(col)), abs(row - round(row))) > ALIGNED_PX:
         return None
     return round(row), round(col)
-
-
-@contextmanager
-def _opened(remote: RemoteFiles, name: str, level: int | None) -> Iterator[Any]:
-    """A remote file. What went wrong on the network is raised before GDAL's error."""
-    options = {} if level is None else {"overview_level": level}
-    remote.failure.value = None
-    try:
-        with (
-            rasterio.Env(**GDAL_OPTIONS),
-            rasterio.open(name, driver="GTiff", opener=remote, **options) as dataset,
-        ):
-            yield dataset
-    except RasterioError as error:
-        remote.raise_failure()
-        reason = " ".join(str(error.__cause__ or error).split())
-        raise remote.files[name].unreadable(reason[:200]) from None
-    remote.raise_failure()

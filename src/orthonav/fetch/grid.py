@@ -94,15 +94,10 @@ def _row_cells(
 ) -> NDArray[np.int64]:
     """Cells (N, 2) of one row: those whose circumscribed circle touches the area."""
     corners_x = grid.west + np.append(cols, cols[-1] + 1) * grid.cell_w_px * grid.res_x
-    north = grid.north - row * grid.cell_h_px * grid.res_y
-    south = north - grid.cell_h_px * grid.res_y
-    back = transformers(grid.crs)[1]
-    x = np.concatenate([corners_x, corners_x])
-    y = np.concatenate([np.full(len(corners_x), north), np.full(len(corners_x), south)])
-    lon, lat = back.transform(x, y)
+    _, south, _, north = grid.bounds(row, 0)
+    lon, lat = transformers(grid.crs)[1].transform(*np.meshgrid(corners_x, [north, south]))
     with np.errstate(invalid="ignore"):
-        points = area.frame.en_from_latlon(np.asarray(lat), np.asarray(lon))
-    top, bottom = points[: len(corners_x)], points[len(corners_x) :]
+        top, bottom = area.frame.en_from_latlon(np.asarray(lat), np.asarray(lon))
     centres = (top[:-1] + top[1:] + bottom[:-1] + bottom[1:]) / 4
     radius = np.maximum(
         np.linalg.norm(top[:-1] - bottom[1:], axis=1), np.linalg.norm(top[1:] - bottom[:-1], axis=1)

@@ -80,7 +80,8 @@ def find_package(
     if not dated:
         years = sorted({package.date[:4] for package in here})
         raise FetchError(f"no {kind} package of {zone} of {year}; available: {listed(years)}")
-    return min(dated, key=_centimetres)
+    newest_first = sorted(dated, key=lambda package: package.name, reverse=True)
+    return min(newest_first, key=_centimetres)
 
 
 def package_files(client: Client, package: Package) -> list[PackageFile]:
@@ -126,10 +127,9 @@ def download_package(
     if needed > shutil.disk_usage(folder).free:
         raise OutputError(f"disk is too small: {needed / 1e9:.1f} GB are needed: {folder}")
     for number, file in enumerate(files):
-        start = number / len(files)
 
-        def shown(share: float, start: float = start) -> None:
-            progress("package", start + share / len(files))
+        def shown(share: float, number: int = number) -> None:
+            progress("package", (number + share) / len(files))
 
         if file in missing:
             _download(client, file, folder, shown)
@@ -207,11 +207,10 @@ def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Eleme
     return found
 
 
-def _centimetres(package: Package) -> tuple[int, str]:
-    """Pixel width in a name (0M20 is 20 cm), and a key that sorts newer editions first."""
+def _centimetres(package: Package) -> int:
+    """Pixel width in a name: 0M20 is 20 cm."""
     found = re.search(r"-(\d+)M(\d+)_", package.name)
-    width = int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6
-    return width, "".join(chr(255 - min(ord(letter), 255)) for letter in package.name)
+    return int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6
 
 
 def _part(folder: Path, file: PackageFile) -> Path:

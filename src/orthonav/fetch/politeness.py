@@ -47,19 +47,16 @@ class Stopped(Exception):  # noqa: N818 - not an error: the caller requested it
 
 
 @dataclass
-class _Bucket:
-    tokens: float
-    filled_s: float
-    paused_until_s: float = 0.0
-
-
-@dataclass
 class Turns:
-    """Permissions to send a request, by host, for all threads; setting `stop` ends every wait."""
+    """Permissions to send a request, by host, for all threads; setting `stop` ends every wait.
+
+    Half a second's worth of requests may start together.
+    """
 
     limits: RequestLimits
     stop: threading.Event = field(default_factory=threading.Event)
-    _buckets: dict[str, _Bucket] = field(default_factory=dict)
+    _due_s: dict[str, float] = field(default_factory=dict)
+    """When the requests of a host so far would be over at exactly its rate."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def wait(self, host: str) -> None:
@@ -70,8 +67,8 @@ class Turns:
     def pause(self, host: str, seconds: float) -> None:
         """Send nothing to this host for so long, from any thread."""
         with self._lock:
-            bucket = self._bucket(host)
-            bucket.paused_until_s = max(bucket.paused_until_s, time.monotonic() + seconds)
+            until_s = time.monotonic() + seconds + self._ahead_s
+            self._due_s[host] = max(self._due_s.get(host, 0.0), until_s)
 
     def sleep(self, seconds: float) -> None:
         """Wait. Raises `Stopped` as soon as the run is ended."""
@@ -79,28 +76,21 @@ class Turns:
             raise Stopped
 
     def _take(self, host: str) -> float:
-        """Seconds until a token may be available; 0 where one was taken."""
+        """Seconds until a request may be sent; 0 where it may now, and counts."""
         with self._lock:
             if self.stop.is_set():
                 raise Stopped
-            bucket, now_s = self._bucket(host), time.monotonic()
-            if now_s < bucket.paused_until_s:
-                return bucket.paused_until_s - now_s
-            rate = self.limits.per_second
-            refilled = bucket.tokens + (now_s - bucket.filled_s) * rate
-            bucket.tokens, bucket.filled_s = min(self._capacity, refilled), now_s
-            if bucket.tokens >= 1:
-                bucket.tokens -= 1
-                return 0.0
-            return (1 - bucket.tokens) / rate
+            now_s = time.monotonic()
+            due_s = max(self._due_s.get(host, 0.0), now_s)
+            if due_s - now_s > self._ahead_s:
+                return due_s - now_s - self._ahead_s
+            self._due_s[host] = due_s + 1 / self.limits.per_second
+            return 0.0
 
     @property
-    def _capacity(self) -> float:
-        """Half a second's worth of requests, so that parallel requests start together."""
-        return max(1.0, self.limits.per_second / 2)
-
-    def _bucket(self, host: str) -> _Bucket:
-        return self._buckets.setdefault(host, _Bucket(self._capacity, time.monotonic()))
+    def _ahead_s(self) -> float:
+        """How far requests may be ahead of the rate."""
+        return max(0.0, 0.5 - 1 / self.limits.per_second)
 
 
 def retry_policy(limits: RequestLimits) -> Retry:

@@ -113,12 +113,9 @@ def _layers(entry: dict[str, Any], shared: ImageryOptions) -> list[PresetLayer]:
             key: value.replace("{year}", str(year)) if isinstance(value, str) else value
             for key, value in entry.items()
         }
+        date, note = values["date"] or None, values.get("note")
         options = _options(values).over(shared)
-        made.append(
-            PresetLayer(
-                values["id"], values["date"] or None, values["gsd_m"], options, values.get("note")
-            )
-        )
+        made.append(PresetLayer(values["id"], date, values["gsd_m"], options, note))
     return made
 
 

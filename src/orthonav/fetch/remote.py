@@ -8,19 +8,26 @@ file changes meanwhile.
 
 import io
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from rasterio.abc import MultiByteRangeResourceContainer
+import rasterio
+from rasterio.errors import RasterioError
 
 from orthonav.caches import ByteCache
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
 from orthonav.fetch.urls import shown
 
-CHUNK = 128 * 1024
-"""Small reads (the head of a file) are rounded to this: one request holds most heads."""
+SMALL, CHUNK = 8 * 1024, 128 * 1024
+"""Reads up to the first size are rounded to the second: one request holds most heads."""
 MAX_RANGE = 64 * 2**20
 """Largest read. A block of a tiled file has at most a few megabytes."""
+GDAL_OPTIONS = {
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_CACHEMAX": 64 * 2**20,
+}
 CACHE_BYTES = 64 * 2**20
 """Ranges held in memory for all files: cells next to each other share blocks."""
 RangeCache = ByteCache[tuple[str, int, int], bytes]
@@ -48,21 +55,41 @@ class RemoteFile:
         return f"{self.size} {self._version}"
 
     def read(self, start: int, length: int) -> bytes:
-        """Bytes from `start`, fewer at the end of the file; small reads by whole chunks."""
+        """Bytes from `start`, fewer at the end of the file; those of its head by whole chunks."""
         end = min(start + length, self.size)
         if start >= end:
             return b""
-        if length > CHUNK:
+        if length > SMALL:
             return self._fetch(start, end)
         first = start // CHUNK * CHUNK
         chunks = (self._fetch(at, at + CHUNK) for at in range(first, end, CHUNK))
         return b"".join(chunks)[start - first : end - first]
 
-    def read_exactly(self, start: int, length: int) -> bytes:
-        """These bytes and no others. Raises `FetchError` where they lie beyond the end."""
-        if start + length > self.size:
-            raise self.unreadable("blocks beyond its end")
-        return self._fetch(start, start + length)
+    @contextmanager
+    def opened(self, level: int | None = None) -> Iterator[Any]:
+        """The file, or its overview `level`, as an open dataset.
+
+        Raises what went wrong on the network, else `FetchError` for what GDAL cannot read.
+        """
+        failures: list[Exception] = []
+        options = {} if level is None else {"overview_level": level}
+        try:
+            with (
+                rasterio.Env(**GDAL_OPTIONS),
+                rasterio.open(
+                    f"{id(self)}.tif",
+                    driver="GTiff",
+                    opener=lambda path, mode="rb": _Stream(self, failures),
+                    **options,
+                ) as dataset,
+            ):
+                yield dataset
+        except RasterioError as error:
+            if not failures:
+                reason = " ".join(str(error.__cause__ or error).split())
+                raise self.unreadable(reason[:200]) from None
+        if failures:
+            raise failures[0]
 
     def _fetch(self, start: int, end: int) -> bytes:
         if end - start > MAX_RANGE:
@@ -85,61 +112,12 @@ class RemoteFile:
         return FetchError(f"not a GeoTIFF that can be read ({reason}): {shown(self.url)}")
 
 
-class _Failure(threading.local):
-    value: Exception | None = None
-
-
-class RemoteFiles(MultiByteRangeResourceContainer):  # type: ignore[misc]
-    """Remote files by name, as an `opener` for rasterio; no other name can be opened.
-
-    An exception must not pass through GDAL. `failure.value` holds the first one of each thread
-    since it was reset to None, and `raise_failure` raises it once GDAL has returned.
-    """
-
-    def __init__(self) -> None:
-        self.files: dict[str, RemoteFile] = {}
-        self.failure = _Failure()
-
-    def open(self, path: str, mode: str = "r", **kwds: Any) -> "_Stream":
-        """The file of that name, to be read."""
-        return _Stream(self, self.files[path])
-
-    def isfile(self, path: str) -> bool:
-        """Whether there is such a file."""
-        return path in self.files
-
-    def isdir(self, path: str) -> bool:
-        """There are no folders."""
-        return False
-
-    def ls(self, path: str) -> list[str]:
-        """No names: GDAL finds no files belonging to the one that is open."""
-        return []
-
-    def mtime(self, path: str) -> int:
-        """Not known."""
-        return 0
-
-    def rm(self, path: str) -> None:
-        """Nothing is removed."""
-
-    def size(self, path: str) -> int:
-        """Bytes of a file."""
-        return self.files[path].size
-
-    def raise_failure(self) -> None:
-        """Raise the exception stored in this thread, if any."""
-        if self.failure.value is not None:
-            raise self.failure.value
-
-
 class _Stream(io.RawIOBase):
-    """A position in a remote file."""
+    """A position in a remote file. An exception must not pass through GDAL, so it is stored."""
 
-    def __init__(self, files: RemoteFiles, file: RemoteFile) -> None:
+    def __init__(self, file: RemoteFile, failures: list[Exception]) -> None:
         super().__init__()
-        self._files = files
-        self._file = file
+        self._file, self._failures = file, failures
         self._at = 0
 
     def readable(self) -> bool:
@@ -160,18 +138,7 @@ class _Stream(io.RawIOBase):
         try:
             data = self._file.read(self._at, self._file.size if size < 0 else size)
         except Exception as error:
-            self._files.failure.value = self._files.failure.value or error
+            self._failures.append(error)
             return b""
         self._at += len(data)
         return data
-
-    def get_byte_ranges(self, offsets: list[int], sizes: list[int]) -> list[bytes]:
-        """Several ranges at once, as GDAL asks for the blocks of a window."""
-        try:
-            return [
-                self._file.read_exactly(int(offset), int(size))
-                for offset, size in zip(offsets, sizes, strict=True)
-            ]
-        except Exception as error:
-            self._files.failure.value = self._files.failure.value or error
-            return [bytes(size) for size in sizes]  # rasterio copies these lengths, checked or not

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from orthonav.fetch.client import Client
 from orthonav.fetch.grid import CellGrid
@@ -14,94 +13,58 @@ _BYTES_PER_PX = {"image/jpeg": 0.35, "image/webp": 0.25, "image/png": 1.9, HEIGH
 """Size of usual tiles of orthophotos relative to their pixels, for the estimate."""
 
 
-class CellSource(Protocol):
-    """Cells of a service."""
-
-    @property
-    def provenance(self) -> Provenance:
-        """Origin and terms of the pixels."""
-
-    @property
-    def grid(self) -> CellGrid:
-        """Positions of the cells."""
-
-    @property
-    def bands(self) -> int:
-        """Number of bands."""
-
-    @property
-    def dtype(self) -> str:
-        """Pixel type."""
-
-    @property
-    def cell_bytes(self) -> float:
-        """Estimated bytes of a cell."""
-
-    def address(self, row: int, col: int) -> str:
-        """Unique name of the cell, without keys."""
-
-    def fetch(self, client: Client, row: int, col: int) -> bytes | None:
-        """The cell in the form that is stored, checked; None where there is no imagery.
-
-        Raises `FetchError`.
-        """
-
-    def decode(self, body: bytes) -> CellPixels:
-        """Pixels of what `fetch` returned. Raises `FetchError`."""
-
-
 @dataclass(frozen=True, eq=False)
-class TileSource:
-    """Cells that are one image, or one block of heights, per address.
-
-    `tiled`: whether 404 means that there is no imagery.
-    """
+class CellSource:
+    """Cells of a service; functions take the row and the column of a cell."""
 
     provenance: Provenance
+    """Origin and terms of the pixels."""
     grid: CellGrid
-    url_of: Callable[[int, int], str]
-    format: str
-    empty: str | None = None
-    tiled: bool = True
+    """Positions of the cells."""
+    bands: int
+    """Number of bands."""
+    dtype: str
+    """Pixel type."""
+    cell_bytes: float
+    """Estimated bytes of a cell."""
+    address: Callable[[int, int], str]
+    """Unique name of a cell, without keys."""
+    fetch: Callable[[Client, int, int], bytes | None]
+    """A cell in the form that is stored, checked; None where there is no imagery.
 
-    @property
-    def is_heights(self) -> bool:
-        """Whether cells hold heights."""
-        return self.format == HEIGHTS_FORMAT
+    Raises `FetchError`.
+    """
+    decode: Callable[[bytes], CellPixels]
+    """Pixels of what `fetch` returned. Raises `FetchError`."""
 
-    @property
-    def bands(self) -> int:
-        """Number of bands."""
-        return 1 if self.is_heights else 3
 
-    @property
-    def dtype(self) -> str:
-        """Pixel type."""
-        return "float32" if self.is_heights else "uint8"
+def tile_source(
+    provenance: Provenance,
+    grid: CellGrid,
+    url_of: Callable[[int, int], str],
+    format_: str,
+    empty: str | None,
+    *,
+    tiled: bool = True,
+) -> CellSource:
+    """Cells that are one image, or one block of heights, per address.
 
-    @property
-    def cell_bytes(self) -> float:
-        """Estimated bytes of a tile."""
-        return self.grid.cell_w_px * self.grid.cell_h_px * _BYTES_PER_PX.get(self.format, 1.0)
+    `empty` is the colour of missing imagery; `tiled`: whether 404 means that there is none.
+    """
+    shape, heights = (grid.cell_h_px, grid.cell_w_px), format_ == HEIGHTS_FORMAT
 
-    def address(self, row: int, col: int) -> str:
-        """The address of the tile, without keys."""
-        return self.url_of(row, col)
-
-    def fetch(self, client: Client, row: int, col: int) -> bytes | None:
-        """The image as sent, checked. Raises `FetchError`."""
-        shape = (self.grid.cell_h_px, self.grid.cell_w_px)
+    def fetch(client: Client, row: int, col: int) -> bytes | None:
         return client.get(
-            self.url_of(row, col),
-            lambda reply: image_or_absent(
-                reply, shape, self.empty, tiled=self.tiled, heights=self.is_heights
-            ),
+            url_of(row, col),
+            lambda reply: image_or_absent(reply, shape, empty, tiled=tiled, heights=heights),
         )
 
-    def decode(self, body: bytes) -> CellPixels:
-        """Its pixels. Raises `FetchError`."""
-        shape = (self.grid.cell_h_px, self.grid.cell_w_px)
-        return decode_heights(body, shape) if self.is_heights else decode(body, shape, self.empty)
+    def decoded(body: bytes) -> CellPixels:
+        return decode_heights(body, shape) if heights else decode(body, shape, empty)
+
+    size = math.prod(shape) * _BYTES_PER_PX.get(format_, 1.0)
+    bands, dtype = (1, "float32") if heights else (3, "uint8")
+    return CellSource(provenance, grid, bands, dtype, size, url_of, fetch, decoded)
 
 
 def resolution(wanted_m: float, metres_per_unit: float) -> float:

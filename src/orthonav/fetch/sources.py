@@ -12,8 +12,8 @@ from orthonav.fetch.presets import PROTOCOLS, find_preset
 from orthonav.fetch.service import CellSource
 from orthonav.fetch.stac import CatalogItem, date_of, find_items, sign
 from orthonav.fetch.urls import KEY, Secret, checked_url, origin_of, shown, without_literal_keys
-from orthonav.fetch.wms import open_wms, wms_cells
-from orthonav.fetch.wmts import open_wmts, wmts_tiles
+from orthonav.fetch.wms import wms_cells
+from orthonav.fetch.wmts import wmts_tiles
 from orthonav.fetch.xyz import xyz_tiles
 from orthonav.geo.area import Area
 
@@ -100,10 +100,10 @@ def open_cells(client: Client, spec: SourceSpec, area: Area) -> CellSource:
 
     Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
     """
-    url, layer, wanted = spec.url, spec.options.layer, (spec.options, area.frame, spec.provenance)
+    url, wanted = spec.url, (spec.options, area.frame, spec.provenance)
     openers: dict[str, Callable[[], CellSource]] = {
-        "wmts": lambda: wmts_tiles(open_wmts(client, url, layer), *wanted),
-        "wms": lambda: wms_cells(open_wms(client, url, layer, spec.options.version), *wanted),
+        "wmts": lambda: wmts_tiles(client, url, *wanted),
+        "wms": lambda: wms_cells(client, url, *wanted),
         "xyz": lambda: xyz_tiles(url, *wanted),
         "tms": lambda: xyz_tiles(url, *wanted, rows_from_south=True),
         "stac": lambda: _stac(client, spec, area),

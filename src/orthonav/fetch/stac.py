@@ -49,11 +49,13 @@ def find_items(
     are none.
     """
     root = get_json(client, url)
-    search, items_url = _link(root, "search", url), _link(root, "items", url)
-    if search is not None:
-        found = _searched(client, search, box_deg, options, url)
-    elif items_url is not None and not _links(root, ("child", "item"), url):
-        found = _paged(client, items_url, box_deg, options)
+    search, listing = _related(root, "search"), _related(root, "items")
+    if search:
+        found = _paged(client, _linked(url, search[0]), _query(box_deg, options))
+    elif listing and not _related(root, "child", "item"):
+        parameters = {"bbox": ",".join(f"{value:.7f}" for value in box_deg), "limit": str(PAGE)}
+        parameters |= {"datetime": options.time} if options.time else {}
+        found = _paged(client, with_query(_linked(url, listing[0]), parameters), None)
     else:
         found = _walked(client, url, root)
     items = []
@@ -96,46 +98,33 @@ def date_of(items: list[CatalogItem]) -> str | None:
     return days[0] if len(days) == 1 else f"{days[0]}/{days[-1]}"
 
 
-def _searched(
-    client: Client, search: str, box_deg: Box, options: ImageryOptions, root: str
-) -> Features:
-    """Items that a search returns (POST), page by page."""
+def _query(box_deg: Box, options: ImageryOptions) -> dict[str, Any]:
+    """What a search is asked for."""
     query: dict[str, Any] = {"bbox": list(box_deg), "limit": PAGE}
     if options.collection:
         query["collections"] = [options.collection]
     if options.time:
         query["datetime"] = options.time
-    body: dict[str, Any] | None = query
-    url = carrying_key(root, search)
+    return query
+
+
+def _paged(client: Client, url: str, body: dict[str, Any] | None) -> Features:
+    """Items of a search (POST of `body`) or of one collection (GET), page by page."""
+    start = url
     for _ in range(MAX_DOCUMENTS):
-        page = get_json(client, url, body)
-        yield from ((feature, url) for feature in _features(page, url))
-        following = next((link for link in page.get("links", []) if _rel(link) == "next"), None)
+        page, here = get_json(client, url, body), url
+        yield from ((feature, here) for feature in _features(page, here))
+        following = next(iter(_related(page, "next")), None)
         if following is None:
             return
-        url = carrying_key(root, joined(url, str(following.get("href", ""))))
+        url = _linked(here, following, start)
         more = following.get("body")
         if str(following.get("method", "GET")).upper() == "POST":
             merged = body if following.get("merge") and body else {}
             body = {**merged, **(more if isinstance(more, dict) else {})}
         else:
             body = None
-    raise FetchError(f"search does not end: {root}")
-
-
-def _paged(client: Client, items_url: str, box_deg: Box, options: ImageryOptions) -> Features:
-    """Items of one collection of an API without a search (GET), page by page."""
-    parameters = {"bbox": ",".join(f"{value:.7f}" for value in box_deg), "limit": str(PAGE)}
-    if options.time:
-        parameters["datetime"] = options.time
-    url: str | None = with_query(items_url, parameters)
-    for _ in range(MAX_DOCUMENTS):
-        if url is None:
-            return
-        page, here = get_json(client, url), url
-        yield from ((feature, here) for feature in _features(page, here))
-        url = _link(page, "next", here)
-    raise FetchError(f"list of items does not end: {items_url}")
+    raise FetchError(f"list of items does not end: {start}")
 
 
 def _walked(client: Client, url: str, root: dict[str, Any]) -> Features:
@@ -148,10 +137,10 @@ def _walked(client: Client, url: str, root: dict[str, Any]) -> Features:
         if document.get("type") == "Feature":
             yield document, where
             continue
-        for link in _links(document, ("child", "item"), where):
-            if link not in known:
-                known.add(link)
-                stack.append((link, get_json(client, link)))
+        for link in _related(document, "child", "item"):
+            if (address := _linked(where, link)) not in known:
+                known.add(address)
+                stack.append((address, get_json(client, address)))
     raise FetchError(
         f"catalogue has more than {MAX_DOCUMENTS} documents; give the address of a part: {url}"
     )
@@ -245,20 +234,13 @@ def _features(page: dict[str, Any], url: str) -> list[dict[str, Any]]:
     return features
 
 
-def _links(document: dict[str, Any], kinds: tuple[str, ...], url: str) -> list[str]:
+def _related(document: dict[str, Any], *kinds: str) -> list[dict[str, Any]]:
+    """Links of a document of these kinds."""
     links = document.get("links")
-    if not isinstance(links, list):
-        return []
-    return [
-        carrying_key(url, joined(url, str(link.get("href", ""))))
-        for link in links
-        if _rel(link) in kinds
-    ]
+    known = [link for link in links if isinstance(link, dict)] if isinstance(links, list) else []
+    return [link for link in known if link.get("rel") in kinds]
 
 
-def _link(document: dict[str, Any], kind: str, url: str) -> str | None:
-    return next(iter(_links(document, (kind,), url)), None)
-
-
-def _rel(link: Any) -> str:
-    return str(link.get("rel", "")) if isinstance(link, dict) else ""
+def _linked(base: str, link: dict[str, Any], keyed: str | None = None) -> str:
+    """Address of a link in the document at `base`, with the key of that or of `keyed`."""
+    return carrying_key(keyed or base, joined(base, str(link.get("href", ""))))

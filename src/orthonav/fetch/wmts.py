@@ -6,7 +6,6 @@ Both encodings of requests are supported: address templates (REST) and parameter
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from orthonav.errors import FetchError
@@ -19,7 +18,7 @@ from orthonav.fetch.crs import (
     metres_per_unit,
     swapped_corner,
 )
-from orthonav.fetch.documents import XmlDocument, capabilities, get_xml
+from orthonav.fetch.documents import capabilities, get_xml
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import (
     ImageryOptions,
@@ -30,7 +29,7 @@ from orthonav.fetch.options import (
     choose_time,
     finest_fitting,
 )
-from orthonav.fetch.service import TileSource
+from orthonav.fetch.service import CellSource, tile_source
 from orthonav.fetch.urls import carrying_key, joined, quoted, with_query
 from orthonav.geo.frames import LocalFrame
 
@@ -40,92 +39,91 @@ _MAX_TILE_PX = 4096
 """Largest tile that is accepted; usual ones have 256 or 512 px."""
 
 
-@dataclass(frozen=True)
-class TileMatrix:
-    """One zoom level of a tile matrix set: its `name` and the grid of its tiles."""
-
-    name: str
-    grid: CellGrid
-
-
-@dataclass(frozen=True)
-class WmtsLayer:
-    """A layer as its capabilities describe it."""
-
-    name: str
-    styles: tuple[str, ...]
-    """Styles, the default one first."""
-    formats: tuple[str, ...]
-    """Media types."""
-    sets: dict[str, list[TileMatrix]]
-    """Zoom levels by matrix set, each within the limits of the layer."""
-    limited: frozenset[str]
-    """Matrix sets of which the service lists the zooms of the layer."""
-    templates: dict[str, str]
-    """Address templates by media type."""
-    dimensions: dict[str, tuple[str, ...]]
-    """Values by name of the dimension, the default one first."""
-    kvp_url: str | None
-    """Address of GetTile, if the service takes parameters."""
-
-
-def open_wmts(client: Client, url: str, name: str | None) -> WmtsLayer:
-    """A layer of a service. Raises `FetchError` with the available layers."""
+def wmts_tiles(
+    client: Client,
+    url: str,
+    options: ImageryOptions,
+    frame: LocalFrame,
+    provenance: Provenance,
+) -> CellSource:
+    """The tiles of a layer of a service. Raises `FetchError` with the available choices."""
     if not _is_document(url):
         url = with_query(url, {"SERVICE": "WMTS", "REQUEST": "GetCapabilities", "VERSION": "1.0.0"})
-    return read_layer(client, get_xml(client, url), url, name)
-
-
-def read_layer(client: Client, document: XmlDocument, url: str, name: str | None) -> WmtsLayer:
-    """The layer of that name, or the only one. Raises `FetchError`."""
+    document = get_xml(client, url)
     with capabilities("WMTS", url):
         from owslib.wmts import WebMapTileService
 
         service = WebMapTileService(url, xml=document.body)
-        found = service.contents[choose_layer(list(service.contents), name, url)]
-        default = [name for name, style in found.styles.items() if style.get("isDefault")]
-        sets = {
-            name: _matrices(name, service.tilematrixsets[name], link.tilematrixlimits)
-            for name, link in found.tilematrixsetlinks.items()
-            if name in service.tilematrixsets
-        }
+        layer = service.contents[choose_layer(list(service.contents), options.layer, url)]
+        default = [name for name, style in layer.styles.items() if style.get("isDefault")]
+        styles = list(dict.fromkeys(name or "" for name in [*default, *layer.styles]))
         templates: dict[str, str] = {}
-        for resource in found.resourceURLs:
+        for resource in layer.resourceURLs:
             if resource["resourceType"] == "tile":
                 template = _template(client, url, resource["template"])
                 templates.setdefault(resource["format"], template)
-        dimensions = {
-            name: tuple(filter(None, dict.fromkeys([plain.get("default"), *plain["values"]])))
-            for name, plain in found.dimensions.items()
-        }
-        return WmtsLayer(
-            name=found.id,
-            styles=tuple(dict.fromkeys(name or "" for name in [*default, *found.styles])),
-            formats=tuple(filter(None, dict.fromkeys([*found.formats, *templates]))),
-            sets={name: matrices for name, matrices in sets.items() if matrices},
-            limited=frozenset(n for n, k in found.tilematrixsetlinks.items() if k.tilematrixlimits),
-            templates=templates,
-            dimensions={name: values for name, values in dimensions.items() if values},
-            kvp_url=_kvp_url(client, service, url),
-        )
+        formats = list(filter(None, dict.fromkeys([*layer.formats, *templates])))
+        format_ = choose_format(formats, options, f"layer {layer.id}")
+        set_name, matrix, grid = _matrix(service, layer, options, frame)
+        values = _dimensions(layer, options)
+        kvp_url = _kvp_url(client, service, url)
+    preferred = options.preferred_style if options.preferred_style in styles else None
+    no_style = f"layer {layer.id} has no style"
+    values = {
+        "layer": layer.id,
+        "style": choose(styles or ["default"], options.style or preferred, no_style),
+        "format": format_,
+        "tilematrixset": set_name,
+        "tilematrix": matrix,
+        **values,
+    }
+    url_of = _url_of(templates.get(format_), kvp_url, values)
+    return tile_source(provenance, grid, url_of, format_, options.empty)
+
+
+def _url_of(
+    template: str | None, kvp_url: str | None, values: dict[str, str]
+) -> Callable[[int, int], str]:
+    if template is not None:
+        filled = _filled(template, values)
+        return lambda row, col: _filled(filled, {"tilerow": str(row), "tilecol": str(col)})
+    if kvp_url is None:
+        raise FetchError(f"service offers no tiles of {values['layer']} as {values['format']}")
+    request = {"SERVICE": "WMTS", "REQUEST": "GetTile", "VERSION": "1.0.0"}
+    fixed = with_query(kvp_url, request | {name.upper(): each for name, each in values.items()})
+    return lambda row, col: f"{fixed}&TILEROW={row}&TILECOL={col}"
+
+
+def _dimensions(layer: Any, options: ImageryOptions) -> dict[str, str]:
+    """Values of the dimensions by name in lower case: the time requested, else the default."""
+    found = {}
+    for name, each in layer.dimensions.items():
+        values = list(filter(None, dict.fromkeys([each.get("default"), *each["values"]])))
+        if values and name.lower() == "time" and options.time is not None:
+            found[name.lower()] = choose_time(values, options.time, layer.id)
+        elif values:
+            found[name.lower()] = values[0]
+    if options.time is not None and "time" not in found:
+        raise FetchError(f"layer {layer.id} has no time to choose, --time was {options.time}")
+    return found
 
 
 def _is_document(url: str) -> bool:
     return url.partition("?")[0].lower().endswith(".xml")
 
 
-def _matrices(set_name: str, matrix_set: Any, limits: dict[str, Any]) -> list[TileMatrix]:
-    """The zoom levels of a set, those with `limits` if there are any, in these limits.
+def _matrices(set_name: str, matrix_set: Any, limits: dict[str, Any]) -> dict[str, CellGrid]:
+    """The zoom levels of a set by name, those with `limits` if there are any, in these limits.
 
-    None where the coordinate system is unknown.
+    Empty where the coordinate system is unknown.
     """
     try:
         crs = epsg_name(matrix_set.crs)
         swapped = swapped_corner(matrix_set.crs)
         metres = metres_per_unit(crs)
     except FetchError:
-        return []
-    matrices = []
+        return {}
+    matrices = {}
     for name, found in matrix_set.tilematrix.items():
         if limits and name not in limits:
             continue
@@ -145,9 +143,7 @@ def _matrices(set_name: str, matrix_set: Any, limits: dict[str, Any]) -> list[Ti
             of = limits[name]
             low = (max(0, of.mintilerow), max(0, of.mintilecol))
             edges = (*low, min(rows - 1, of.maxtilerow), min(cols - 1, of.maxtilecol))
-        matrices.append(
-            TileMatrix(name, CellGrid(crs, west, north, res, res, width, height, edges))
-        )
+        matrices[name] = CellGrid(crs, west, north, res, res, width, height, edges)
     return matrices
 
 
@@ -183,60 +179,6 @@ def _kvp_url(client: Client, service: Any, url: str) -> str | None:
     return None
 
 
-def wmts_tiles(
-    layer: WmtsLayer, options: ImageryOptions, frame: LocalFrame, provenance: Provenance
-) -> TileSource:
-    """The tiles of a layer. Raises `FetchError` with the available choices."""
-    format_ = choose_format(layer.formats, options, f"layer {layer.name}")
-    preferred = options.preferred_style if options.preferred_style in layer.styles else None
-    style = choose(
-        list(layer.styles) or ["default"],
-        options.style or preferred,
-        f"layer {layer.name} has no style",
-    )
-    set_name, matrix = _matrix(layer, options, frame)
-    dimensions = {name: values[0] for name, values in layer.dimensions.items()}
-    if options.time is not None:
-        time = next((name for name in dimensions if name.lower() == "time"), None)
-        if time is None:
-            raise FetchError(f"layer {layer.name} has no time to choose, --time was {options.time}")
-        dimensions[time] = choose_time(layer.dimensions[time], options.time, layer.name)
-    names = {
-        "layer": layer.name,
-        "style": style,
-        "tilematrixset": set_name,
-        "tilematrix": matrix.name,
-    }
-    url_of = _url_of(layer, format_, names, dimensions)
-    return TileSource(provenance, matrix.grid, url_of, format_, options.empty)
-
-
-def _url_of(
-    layer: WmtsLayer, format_: str, names: dict[str, str], dimensions: dict[str, str]
-) -> Callable[[int, int], str]:
-    template = layer.templates.get(format_)
-    if template is not None:
-        filled = _filled(template, names | {k.lower(): v for k, v in dimensions.items()})
-        return lambda row, col: _filled(filled, {"tilerow": str(row), "tilecol": str(col)})
-    if layer.kvp_url is None:
-        raise FetchError(f"service offers no tiles of {layer.name} as {format_}")
-    fixed = with_query(
-        layer.kvp_url,
-        {
-            "SERVICE": "WMTS",
-            "REQUEST": "GetTile",
-            "VERSION": "1.0.0",
-            "LAYER": names["layer"],
-            "STYLE": names["style"],
-            "FORMAT": format_,
-            "TILEMATRIXSET": names["tilematrixset"],
-            "TILEMATRIX": names["tilematrix"],
-            **{name.upper(): value for name, value in dimensions.items()},
-        },
-    )
-    return lambda row, col: f"{fixed}&TILEROW={row}&TILECOL={col}"
-
-
 def _filled(template: str, values: dict[str, str]) -> str:
     """A template with these parts filled in, whatever their case; others stay."""
 
@@ -247,38 +189,45 @@ def _filled(template: str, values: dict[str, str]) -> str:
     return re.sub(r"\{([^{}]+)\}", fill, template)
 
 
-def _matrix(layer: WmtsLayer, options: ImageryOptions, frame: LocalFrame) -> tuple[str, TileMatrix]:
-    """Name of the matrix set, and the zoom level."""
-    if not layer.sets:
-        raise FetchError(f"layer {layer.name} has no grid that can be read")
+def _matrix(
+    service: Any, layer: Any, options: ImageryOptions, frame: LocalFrame
+) -> tuple[str, str, CellGrid]:
+    """Names of the matrix set and of the zoom level, and the grid of its tiles."""
+    links = layer.tilematrixsetlinks
+    sets = {
+        name: matrices
+        for name, link in links.items()
+        if name in service.tilematrixsets
+        and (matrices := _matrices(name, service.tilematrixsets[name], link.tilematrixlimits))
+    }
+    if not sets:
+        raise FetchError(f"layer {layer.id} has no grid that can be read")
     if options.matrix_set is not None:
-        name = choose(list(layer.sets), options.matrix_set, f"layer {layer.name} has no grid")
+        name = choose(list(sets), options.matrix_set, f"layer {layer.id} has no grid")
     else:
-        name = _set_of_crs(layer, options.crs)
-    matrices = layer.sets[name]
-    if name not in layer.limited:
-        matrices = [m for m in matrices if not _beyond(m.name, options)]
-    if not matrices:
-        raise FetchError(f"layer {layer.name} has no zoom in its grid {name}")
-    scale = math.sqrt(math.prod(ground_scale(matrices[0].grid.crs, frame)))
-    gsds_m = [scale * m.grid.res_x for m in matrices]
-    levels = ", ".join(f"{m.name} ({g:.3g} m)" for m, g in zip(matrices, gsds_m, strict=True))
+        by_crs: dict[str, str] = {}
+        for name, matrices in sets.items():
+            by_crs.setdefault(next(iter(matrices.values())).crs, name)
+        usual = "EPSG:3857" if "EPSG:3857" in by_crs else None
+        no_crs = f"layer {layer.id} does not come in"
+        name = by_crs[choose(list(by_crs), options.crs or usual, no_crs)]
+    grids = sets[name]
+    if not links[name].tilematrixlimits:
+        grids = {zoom: grid for zoom, grid in grids.items() if not _beyond(zoom, options)}
+    if not grids:
+        raise FetchError(f"layer {layer.id} has no zoom in its grid {name}")
+    scale = math.sqrt(math.prod(ground_scale(next(iter(grids.values())).crs, frame)))
+    gsds_m = {zoom: scale * grid.res_x for zoom, grid in grids.items()}
+    levels = ", ".join(f"{zoom} ({gsd_m:.3g} m)" for zoom, gsd_m in gsds_m.items())
     if options.zoom is None:
-        return name, matrices[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {levels}")]
-    found = [m for m in matrices if _is_zoom(m.name, options.zoom)]
-    if not found:
-        raise FetchError(f"layer {layer.name} has no zoom {options.zoom}; available: {levels}")
-    return name, found[0]
-
-
-def _set_of_crs(layer: WmtsLayer, crs: str | None) -> str:
-    """The matrix set in the coordinate system requested, else in Web Mercator, else the first."""
-    by_crs: dict[str, str] = {}
-    for name, matrices in layer.sets.items():
-        by_crs.setdefault(matrices[0].grid.crs, name)
-    if crs is None and "EPSG:3857" in by_crs:
-        return by_crs["EPSG:3857"]
-    return by_crs[choose(list(by_crs), crs, f"layer {layer.name} does not come in")]
+        fit = finest_fitting(list(gsds_m.values()), options.wanted_gsd_m, f"zoom {levels}")
+        zoom = list(grids)[fit]
+    else:
+        found = next((zoom for zoom in grids if _is_zoom(zoom, options.zoom)), None)
+        if found is None:
+            raise FetchError(f"layer {layer.id} has no zoom {options.zoom}; available: {levels}")
+        zoom = found
+    return name, zoom, grids[zoom]
 
 
 def _is_zoom(name: str, zoom: str) -> bool:

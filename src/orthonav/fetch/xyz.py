@@ -12,7 +12,7 @@ from orthonav.errors import FetchError
 from orthonav.fetch.crs import MERCATOR_HALF_M, ground_scale, mercator_resolution
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
-from orthonav.fetch.service import TileSource
+from orthonav.fetch.service import CellSource, tile_source
 from orthonav.fetch.urls import checked_url
 from orthonav.geo.frames import LocalFrame
 
@@ -28,7 +28,7 @@ def xyz_tiles(
     provenance: Provenance,
     *,
     rows_from_south: bool = False,
-) -> TileSource:
+) -> CellSource:
     """The tiles of a template at the zoom that fits `options`.
 
     With `rows_from_south`, `{y}` means `{-y}`. Raises `FetchError`.
@@ -48,14 +48,12 @@ def xyz_tiles(
     res = mercator_resolution(zoom, tile_px)
     grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
     url_of = _url_of(template, zoom, options.subdomains, tile_px, rows_from_south)
-    return TileSource(provenance, grid, url_of, _format(template), options.empty)
+    return tile_source(provenance, grid, url_of, _format(template), options.empty)
 
 
 def quadkey(zoom: int, row: int, col: int) -> str:
     """Name of a tile as digits 0 to 3, one per zoom level (Bing Maps tile system)."""
-    return "".join(
-        str(((col >> bit) & 1) + 2 * ((row >> bit) & 1)) for bit in range(zoom - 1, -1, -1)
-    )
+    return str(int(f"{col:b}") + 2 * int(f"{row:b}")).zfill(zoom) if zoom else ""
 
 
 def _zoom(options: ImageryOptions, frame: LocalFrame, tile_px: int) -> int:

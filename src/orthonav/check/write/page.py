@@ -86,11 +86,10 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
         shown += [(share_text(summary.confident_share), route), _longest(summary.longest)]
     shown.append((metres_text(summary.error_m), "expected error of a correct fix"))
     prior = conditions.prior_std_m
-    shown.append(
-        ("no prior", "the whole map is searched")
-        if prior is None
-        else (metres_text(prior), "prior, standard deviation per axis")
-    )
+    if prior is None:
+        shown.append(("no prior", "the whole map is searched"))
+    else:
+        shown.append((metres_text(prior), "prior, standard deviation per axis"))
     shown.append((metres_text(conditions.agl_m), "above ground"))
     if result.along is None:
         shown.append((str(int(result.cells.trials.sum())), "trial views"))
@@ -103,9 +102,8 @@ def _longest(longest: BlindStretch | None) -> tuple[str, str]:
         return "none", "blind stretches along the route"
     duration = seconds_text(longest.end_s - longest.start_s)
     error = metres_text(longest.drift_m)
-    return metres_text(
-        longest.length_m
-    ), f"longest blind stretch: {duration}, error {error} after it"
+    text = f"longest blind stretch: {duration}, error {error} after it"
+    return metres_text(longest.length_m), text
 
 
 def _stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
@@ -117,10 +115,8 @@ def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
     return [
         (
             str(number),
-            *(
-                f"{lat:.5f}, {lon:.5f}"
-                for lat, lon in (each.place_latlon_deg, each.other_latlon_deg)
-            ),
+            "{:.5f}, {:.5f}".format(*each.place_latlon_deg),
+            "{:.5f}, {:.5f}".format(*each.other_latlon_deg),
             metres_text(each.apart_m),
             f"{each.similarity:.2f}",
             str(each.trials),

@@ -2,7 +2,7 @@
 
 import textwrap
 
-from orthonav.check.outcome import BlindStretch, CheckResult
+from orthonav.check.outcome import CheckResult
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
     better_sentence,
@@ -53,13 +53,9 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
         ("views", f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m on the ground, {dates}"),
     ]
     if result.along is not None:
-        rows += [
-            (
-                "route",
-                f"{metres_text(summary.route_m)}, {seconds_text(summary.route_s)}; "
-                f"{share_text(summary.confident_share)} of it at {CONFIDENT:g} or more",
-            )
-        ]
+        length = f"{metres_text(summary.route_m)}, {seconds_text(summary.route_s)}"
+        share = f"{share_text(summary.confident_share)} of it at {CONFIDENT:g} or more"
+        rows.append(("route", f"{length}; {share}"))
     rows.append(("error", f"{metres_text(summary.error_m)} expected for a correct fix"))
     if result.lookalikes:
         near = sum(each.within_prior for each in result.lookalikes)
@@ -72,7 +68,8 @@ def _stretches(result: CheckResult) -> list[str]:
         return []
     if not result.stretches:
         return ["", "no blind stretches"]
-    worst = sorted(result.stretches, key=_badness)[:MAX_STRETCHES]
+    worst_first = sorted(result.stretches, key=lambda each: (each.recoverable, -each.length_m))
+    worst = worst_first[:MAX_STRETCHES]
     rows: list[tuple[str, ...]] = [
         ("#", "from", "to", "length", "duration", "prob.", "drift", "allowed", "")
     ]
@@ -82,11 +79,6 @@ def _stretches(result: CheckResult) -> list[str]:
     more = len(result.stretches) - len(worst)
     head = f"blind stretches ({len(result.stretches)})" + (f", the {len(worst)} worst" * (more > 0))
     return ["", head, *_columns(rows)]
-
-
-def _badness(stretch: BlindStretch) -> tuple[bool, float]:
-    """Sort key: worst first."""
-    return stretch.recoverable, -stretch.length_m
 
 
 def _rows(rows: list[tuple[str, str]]) -> list[str]:

@@ -47,11 +47,6 @@ def share_text(value: float) -> str:
     return f"{99 if percent == 100 and value < 0.9995 else percent} %"
 
 
-def place_text(value: float) -> str:
-    """A distance from the start of the route, in kilometres to ten metres."""
-    return f"{value / 1000:.2f} km"
-
-
 def seconds_text(value: float) -> str:
     """A time in seconds, from two minutes on as `M:SS min`, from an hour on as `H:MM h`."""
     whole = round(value)
@@ -65,16 +60,17 @@ def seconds_text(value: float) -> str:
 def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
     """A blind stretch as a row of a table: number, ends, length, duration, probability, drift,
     allowed drift and outcome."""
+    outcome = "recovers" if stretch.recoverable else "lost"
     return (
         str(number),
-        place_text(stretch.start_m),
-        place_text(stretch.end_m),
+        f"{stretch.start_m / 1000:.2f} km",
+        f"{stretch.end_m / 1000:.2f} km",
         metres_text(stretch.length_m),
         seconds_text(stretch.end_s - stretch.start_s),
         share_text(stretch.probability),
         metres_text(stretch.drift_m),
         metres_text(stretch.allowed_m),
-        outcome_text(stretch),
+        "the route ends in it" if stretch.ends_lost else outcome,
     )
 
 
@@ -94,13 +90,6 @@ def lookalike_sentence(number: int, pair: Lookalike) -> str:
         f"Lookalikes {number}: {metres_text(pair.apart_m)} apart, similarity "
         f"{pair.similarity:.2f}, {pair.trials} trials, {where} the prior."
     )
-
-
-def outcome_text(stretch: BlindStretch) -> str:
-    """What happens after a blind stretch."""
-    if stretch.ends_lost:
-        return "the route ends in it"
-    return "recovers" if stretch.recoverable else "lost"
 
 
 def tolerance_sentence(envelope: Envelope) -> str:
