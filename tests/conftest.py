@@ -52,7 +52,17 @@ def pytest_collection():
         gc.enable()
 
 
-LONGEST = ("test_in_browser.py", "test_cli.py", "test_check_page.py", "test_tracker.py")
+LONGEST = (
+    "test_in_browser.py",
+    "test_cli.py",
+    "test_platforms.py",
+    "test_tracker.py",
+    "test_check_page.py",
+    "test_demo.py",
+    "test_ros2.py",
+    "test_build.py",
+    "test_mixture.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

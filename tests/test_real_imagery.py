@@ -32,7 +32,13 @@ PAIRS = {
 }
 
 
-@pytest.mark.parametrize("past, present, least", PAIRS.values(), ids=PAIRS.keys())
+@pytest.mark.parametrize(
+    "past, present, least",
+    [
+        pytest.param(*pair, marks=pytest.mark.slow if name == "szada" else (), id=name)
+        for name, pair in PAIRS.items()
+    ],
+)
 def test_views_of_another_year_are_placed(tmp_path, monkeypatch, past, present, least):
     for name in (past, present):
         if not (DATA / name).is_file():

@@ -86,7 +86,7 @@ def test_ellipses_cover_what_they_state(px, tilt_deg):
     """The middle of the view is measured, the camera follows from it."""
     rng = np.random.default_rng(4)
     tilted, middle = telemetry(tilt_deg), np.array([[320.0, 240.0]])
-    heading_std, scale_std, count, inside = math.radians(0.8), 0.01, 600, 0
+    heading_std, scale_std, count, inside = math.radians(0.8), 0.01, 300, 0
 
     def ground(pixel, heading_deg, agl_m):
         return ground_en_m(CAMERA, np.array([pixel]), heading_deg, tilt_deg, 0.0, agl_m)[0]

@@ -17,7 +17,7 @@ STALL_S = 20.0
 def test_an_undisturbed_flight_sends_everything_after_its_start(flown):
     flight = ComputedFlight(flown, 0.12, lambda at_s: 0.12)
     first = sent(flight.fly(START_S))
-    images = flight.fly(40)
+    images = flight.fly(28)
     assert first[0][0] < START_S
     assert len(sent(images)) == len(images)
 
@@ -62,7 +62,7 @@ def test_a_step_without_a_gap_is_noticed_by_the_position(flown, late_s):
     flight.fly(START_S)
     images = flight.fly(25)
     assert len(sent(images)) >= len(images) - 1
-    wrong = [error_m for _, error_m in sent(flight.fly(45)) if error_m > FAR_M]
+    wrong = [error_m for _, error_m in sent(flight.fly(38)) if error_m > FAR_M]
     assert wrong == []
 
 

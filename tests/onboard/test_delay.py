@@ -68,7 +68,7 @@ def test_a_constant_delay_is_found(delay_s):
 
 
 def test_no_velocity_is_needed():
-    seen = Measured(Flown(40, seed=2), lambda _: 0.5, known=False)
+    seen = Measured(Flown(40, seed=2), lambda _: 0.5, known=False, seconds=30)
     errors = seen.errors(seen.whole)
     assert len(errors) > 5 and np.abs(errors).max() < 0.15
 
@@ -90,7 +90,7 @@ def test_a_step_is_found_within_the_recent_pictures():
 
 def test_straight_flight_gives_no_number():
     straight = Flown(45, turns=False, turbulence_deg=0.05, seed=5)
-    seen = Measured(straight, lambda _: 0.12)
+    seen = Measured(straight, lambda _: 0.12, seconds=26)
     assert not any(each.found or each.contradicted for each in seen.whole)
 
 
@@ -122,7 +122,7 @@ def clouded(grey, rng):
     ids=["mirrored", "noise", "blank", "frozen"],
 )
 def test_wrong_images_give_no_delay(change):
-    seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=24, change=change)
+    seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=16, change=change)
     assert not any(each.found for each in seen.whole + seen.recent)
 
 
@@ -133,7 +133,7 @@ def test_a_rotated_camera_contradicts_the_autopilot():
 
 
 def test_clouds_over_a_part_do_no_harm():
-    seen = Measured(Flown(40, seed=7), lambda _: 0.12, change=clouded)
+    seen = Measured(Flown(40, seed=7), lambda _: 0.12, change=clouded, seconds=30)
     errors = seen.errors(seen.whole)
     assert len(errors) > 5 and np.abs(errors).max() < 0.15
 

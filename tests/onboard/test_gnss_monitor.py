@@ -64,7 +64,7 @@ def test_agreement_is_reached_and_the_displacement_learnt():
     air = Air()
     errors = {"gnss_m": (12.0, -5.0), "map_m": (12.0 - 25.0, -5.0 + 10.0)}
     assert air.fly(30, **errors).state is State.WAITING
-    status = air.fly(900, **errors)
+    status = air.fly(600, **errors)
     assert (status.state, status.reason, status.code) == (State.GOOD, None, 0)
     learnt = air.monitor.learnt
     assert learnt.en_m == pytest.approx([25, -10], abs=2.5)

@@ -54,23 +54,23 @@ def test_a_wrong_heading_is_found(registering, views):
 
 
 def test_a_wrong_height_is_found_with_its_ratio(registering, views):
-    high = [told(view, agl_m=view.telemetry.agl_m * 1.9) for view in views]
+    high = [told(view, agl_m=view.telemetry.agl_m * 1.9) for view in views[:1]]
     *failed, found = tried(registering, high, heading_known=False)
     assert found.setup.name == "half the height" and found.explains
     assert found.height_ratio == pytest.approx(1 / 1.9, rel=0.06)
     assert [each.setup.name for each in failed] == ["twice the height"]
     said, others = setup_text([*failed, found], on_map=True)
     assert "times the reported height (or 1." in said and "check the height column" in said
-    assert others == f"also tried: twice the height ({failed[0].confident} of 2)"
+    assert others == f"also tried: twice the height ({failed[0].confident} of 1)"
 
 
 def test_mirrored_images_are_found(registering, views):
     flipped = [
         View(np.ascontiguousarray(v.grey[:, ::-1]), mirrored_camera(v.camera), v.telemetry)
-        for v in views
+        for v in views[:1]
     ]
     found = tried(registering, flipped)[-1]
-    assert found.setup.mirrored and found.confident == 2
+    assert found.setup.mirrored and found.confident == 1
 
 
 def test_a_map_of_another_area_is_not_explained(views):

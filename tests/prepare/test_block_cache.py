@@ -32,7 +32,7 @@ from orthonav.prepare.pictures import SheetPictures
 from orthonav.prepare.sheet import SheetReader
 from orthonav.represent.gray import Gray
 
-BLOCKS = 16
+BLOCKS = 9
 SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 
 
@@ -48,8 +48,8 @@ def small_blocks(monkeypatch):
 
 @pytest.fixture(scope="module")
 def ortho(make_ortho, tmp_path_factory):
-    grey = textured((400, 400))
-    grey[100:230, 130:190] = 0
+    grey = textured((300, 300))
+    grey[75:172, 98:142] = 0
     return make_ortho(tmp_path_factory.mktemp("ortho") / "2019.tif", grey, nodata=0)
 
 
@@ -143,7 +143,7 @@ def test_images_for_networks_are_cached_too(ortho, tmp_path, reads):
         )
         with reader.block_cache(tmp_path / "beside", kept_in) as kept:
             reader.read(report, workers, kept)
-        tiles = pictures.tiles(np.array([[0, 0], [100, 130], [300, 301]]))
+        tiles = pictures.tiles(np.array([[0, 0], [100, 130], [200, 201]]))
         return tiles.batch(np.arange(3)), len(sampler.crops)
 
     whole, crops = read(1)

@@ -34,6 +34,13 @@ def ortho(make_ortho, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def small_ortho(make_ortho, tmp_path_factory):
+    """One of 220 x 220 m, where the area does not matter: its maps are built in less time."""
+    grey = textured((220, 220))
+    return make_ortho(tmp_path_factory.mktemp("small") / "2019-06.tif", grey)
+
+
+@pytest.fixture(scope="module")
 def frame(ortho):
     """The plane of a map of the whole of it."""
     outline = Mosaic.open([ortho]).outline_latlon_deg
@@ -103,32 +110,32 @@ REQUESTS = {
 
 
 @pytest.mark.parametrize("request_", REQUESTS.values(), ids=REQUESTS.keys())
-def test_the_same_request_gives_the_same_bytes(ortho, tmp_path, names_in, request_):
-    first = built(ortho, tmp_path, "a.onav", **request_)
-    again = built(ortho, tmp_path, "b.onav", **request_)
+def test_the_same_request_gives_the_same_bytes(small_ortho, tmp_path, names_in, request_):
+    first = built(small_ortho, tmp_path, "a.onav", **request_)
+    again = built(small_ortho, tmp_path, "b.onav", **request_)
     assert first.path.read_bytes() == again.path.read_bytes()
     assert names_in(tmp_path) == ["a.onav", "b.onav"]
     recipe = first.manifest.recipe
     assert recipe["overlap"] == 0.75 and recipe["seed"] == request_.get("seed", 0)
 
 
-def test_the_recipe_is_in_the_map(ortho, tmp_path):
-    recipe = built(ortho, tmp_path, **REQUESTS["both"]).manifest.recipe
+def test_the_recipe_is_in_the_map(small_ortho, tmp_path):
+    recipe = built(small_ortho, tmp_path, **REQUESTS["both"]).manifest.recipe
     assert recipe["embed"] == {"name": "gradient", "cells": 16, "dims": 32, "floor": 0.6}
     assert recipe["represent"] == {"name": "canny", "low": 100.0, "high": 200.0, "kernel": 3}
 
 
 @pytest.mark.parametrize("edges", ["gray", "canny", "gradient"])
-def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
-    chosen = built(ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
+def test_one_channel_is_compared_on_finer_cells(small_ortho, tmp_path, edges):
+    chosen = built(small_ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
     assert chosen == (8 if edges == "gradient" else 16)
-    stated = built(ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
+    stated = built(small_ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
     assert stated.manifest.recipe["embed"]["cells"] == 4
 
 
-def test_another_seed_changes_the_calibration_only(ortho, tmp_path, calibrated):
-    a = built(ortho, tmp_path, "a.onav", **WITH_LAYER)
-    b = built(ortho, tmp_path, "b.onav", **WITH_LAYER, seed=1)
+def test_another_seed_changes_the_calibration_only(small_ortho, tmp_path, calibrated):
+    a = built(small_ortho, tmp_path, "a.onav", **WITH_LAYER)
+    b = built(small_ortho, tmp_path, "b.onav", **WITH_LAYER, seed=1)
     assert a.manifest.confidence and b.manifest.confidence
     for name, part in a.arrays.items():
         np.testing.assert_array_equal(part, b.arrays[name])
@@ -203,10 +210,10 @@ def test_the_finest_orthophoto_gives_the_resolution(make_ortho, tmp_path):
     assert [source["name"] for source in opened.manifest.imagery] == ["coarse.tif", "fine.tif"]
 
 
-def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
-    whole = built(ortho, tmp_path, "a.onav")
-    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 150)
-    blocks = built(ortho, tmp_path, "b.onav")
+def test_blocks_do_not_matter(small_ortho, tmp_path, monkeypatch):
+    whole = built(small_ortho, tmp_path, "a.onav")
+    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 90)
+    blocks = built(small_ortho, tmp_path, "b.onav")
     scores = np.einsum(
         "nd,nd->n",
         *(m.array("sheet0/embeddings", np.float16, 2).astype(float) for m in (whole, blocks)),
@@ -215,17 +222,17 @@ def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
     np.testing.assert_array_equal(centres_en_m(whole), centres_en_m(blocks))
 
 
-def test_the_manifest(ortho, tmp_path):
+def test_the_manifest(small_ortho, tmp_path):
     calls, lines = [], []
     out = tmp_path / "deep" / "map.onav"
-    request = BuildRequest([ortho], out, tile_px=64, calibration_views=4)
+    request = BuildRequest([small_ortho], out, tile_px=64, calibration_views=4)
     result = build_map(request, lambda stage, share: calls.append((stage, share)), lines.append)
     manifest = open_map(request.out).manifest
     (line,) = lines
     tiles = int(line.partition(" tiles of 64 px")[0].split(", ")[1].replace(",", ""))
-    assert tiles == pytest.approx(manifest.sheets[0].tiles, rel=0.03)
+    assert tiles == pytest.approx(manifest.sheets[0].tiles, rel=0.05)
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
-    assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == ortho.name
+    assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == "2019-06.tif"
     assert manifest.radius_m == RADIUS_STRIDES * manifest.sheets[0].grid.stride_m
     assert list(dict.fromkeys(stage for stage, _ in calls)) == [
         "imagery",
@@ -239,8 +246,8 @@ def test_the_manifest(ortho, tmp_path):
     )
 
 
-def test_the_preview_shows_the_area(ortho, tmp_path):
-    opened = built(ortho, tmp_path)
+def test_the_preview_shows_the_area(small_ortho, tmp_path):
+    opened = built(small_ortho, tmp_path)
     picture = cv2.imdecode(opened.array("sheet0/preview_jpeg", np.uint8, 1), cv2.IMREAD_GRAYSCALE)
     grid = opened.manifest.sheets[0].grid
     assert picture.shape[0] / picture.shape[1] == pytest.approx(
@@ -324,7 +331,7 @@ def test_a_small_map_states_confidence(make_ortho, tmp_path, side_px):
 
 
 @pytest.mark.parametrize("old", [None, b"an older map"])
-def test_a_full_disk_leaves_nothing_new(ortho, tmp_path, names_in, monkeypatch, old):
+def test_a_full_disk_leaves_nothing_new(small_ortho, tmp_path, names_in, monkeypatch, old):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -334,24 +341,24 @@ def test_a_full_disk_leaves_nothing_new(ortho, tmp_path, names_in, monkeypatch, 
         out.write_bytes(old)
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OutputError, match="disk full"):
-        built(ortho, out.parent, **WITH_LAYER)
+        built(small_ortho, out.parent, **WITH_LAYER)
     assert names_in(out.parent) == ([] if old is None else ["map.onav"])
     assert old is None or out.read_bytes() == old
 
 
 @pytest.mark.parametrize("stage", ["imagery", "learn", "calibrate"])
-def test_an_interrupt_leaves_nothing(ortho, tmp_path, names_in, stage):
+def test_an_interrupt_leaves_nothing(small_ortho, tmp_path, names_in, stage):
     def progress(now, share):
         if now == stage and share > 0.3:
             raise KeyboardInterrupt
 
-    request = BuildRequest([ortho], tmp_path / "out" / "map.onav", tile_px=64)
+    request = BuildRequest([small_ortho], tmp_path / "out" / "map.onav", tile_px=64)
     with pytest.raises(KeyboardInterrupt):
         build_map(request, progress)
     assert names_in(tmp_path) == []
 
 
-def own_views(localizer, path, mirrored=False, count=20):
+def own_views(localizer, path, mirrored=False, count=14):
     """Fixes of views cut from the imagery of a map, mirrored or not, with their true places."""
     grid, rng = localizer.grid, np.random.default_rng(3)
     width_m, height_m = grid.width_px * grid.gsd_m, grid.height_px * grid.gsd_m
@@ -385,7 +392,7 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     places = [localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) for fix in fixes]
     errors_m = np.abs(np.array(places) - truth).max(axis=1)
     own = np.array([fix.confidence for fix in fixes])
-    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True, 10)[0]])
+    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True, 7)[0]])
     assert (errors_m <= localizer.grid.stride_m).mean() >= 0.95
     assert np.median(own) > 0.8 and np.median(false) < 0.4
     assert (false[:, None] < own).mean() > 0.97  # nearly every pair is separated
@@ -406,7 +413,7 @@ def test_the_stated_error_is_of_the_order_of_the_grid(map_path, ortho, tmp_path,
         assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
 
 
-def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, monkeypatch):
+def test_slow_representations_are_calibrated_on_fewer_crops(small_ortho, tmp_path, monkeypatch):
     """For representations that take minutes; counted by the reported progress."""
     crops = {}
     for name in ("canny", "slow"):
@@ -421,7 +428,7 @@ def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, mon
                 shares.append(share)
 
         request = BuildRequest(
-            [ortho], tmp_path / f"{name}.onav", tile_px=64, edges="canny", registration=False
+            [small_ortho], tmp_path / f"{name}.onav", tile_px=64, edges="canny", registration=False
         )
         build_map(request, progress)
         crops[name] = len(shares)

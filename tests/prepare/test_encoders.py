@@ -20,7 +20,7 @@ from orthonav.variants import make_variant
 
 SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
 METHODS = {
-    "autoencoder:width=16,dims=64,epochs=2": NetworkEmbedder,
+    "autoencoder:width=16,dims=64,epochs=1": NetworkEmbedder,
     "caevl:width=16,dims=64,epochs=1,tuning_epochs=1,batch=16,projector=32": NetworkEmbedder,
     "triplet:width=4,epochs=1,batch=64": NetworkEmbedder,
     "bovw:words=256": WordsEmbedder,
@@ -49,7 +49,7 @@ def built(area, tmp_path_factory):
 @pytest.mark.parametrize(
     "method",
     [
-        pytest.param(each, marks=pytest.mark.slow if each.startswith("caevl") else ())
+        pytest.param(each, marks=pytest.mark.slow if each.startswith(("caevl", "triplet")) else ())
         for each in METHODS
     ],
 )

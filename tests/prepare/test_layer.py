@@ -211,9 +211,9 @@ def test_memory_does_not_grow_with_the_sheet():
 
 @pytest.fixture(scope="module")
 def ortho(make_ortho, tmp_path_factory):
-    """An orthophoto of 400 x 400 m with a hole."""
-    grey = textured()
-    grey[150:230, 170:260] = 0
+    """An orthophoto of 260 x 260 m with a hole."""
+    grey = textured((260, 260))
+    grey[90:140, 100:160] = 0
     return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif", grey, nodata=0)
 
 
@@ -221,6 +221,14 @@ def built(ortho, folder, name="map.onav", **request):
     request = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2, **request}
     build_map(BuildRequest([ortho], folder / name, **request))
     return open_map(folder / name)
+
+
+@pytest.fixture(scope="module")
+def small_map(ortho, tmp_path_factory):
+    """A map of it, for tests that only read one; not to be changed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+        return built(ortho, tmp_path_factory.mktemp("map"))
 
 
 @pytest.mark.parametrize("block_px", [1024, 150])
@@ -239,8 +247,8 @@ def test_a_map_carries_its_imagery(ortho, tmp_path, monkeypatch, block_px):
     assert max(layer.shape(layer.levels - 1)) <= 64
 
 
-def test_levels_are_aligned(ortho, tmp_path):
-    layer = GreyLayer.of(built(ortho, tmp_path))
+def test_levels_are_aligned(small_map):
+    layer = GreyLayer.of(small_map)
     grey, valid = layer.read(0, 0, 0, *layer.shape(0))
     for level in range(1, layer.levels):
         grey, valid = halved(grey, valid)
@@ -252,17 +260,17 @@ def test_levels_are_aligned(ortho, tmp_path):
 
 
 def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
-    grey = textured((1200, 1200))
+    grey = textured((900, 900))
     wide = make_ortho(tmp_path / "wide.tif", grey)
     outline = Mosaic.open([wide]).outline_latlon_deg
     frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
-    ends = frame.latlon_from_en(np.array([[-550.0, -550.0], [550.0, 550.0]]))
+    ends = frame.latlon_from_en(np.array([[-400.0, -400.0], [400.0, 400.0]]))
     route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
     opened = built(wide, tmp_path, route=route, band_m=100.0)
     layer = GreyLayer.of(opened)
     rows, cols = layer.shape(0)
     middle = layer.read(0, rows // 2 - 100, cols // 2 - 100, 200, 200)[1]
-    assert middle.all() and not layer.read(0, 0, 0, 400, 400)[1].any()
+    assert middle.all() and not layer.read(0, 0, 0, 250, 250)[1].any()
     sheet = opened.manifest.sheets[0]
     assert sheet.grey.valid_px < 0.7 * rows * cols
     half = sheet.grid.tile_px // 2
@@ -271,16 +279,16 @@ def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
         assert layer.read(0, row - half, col - half, 2 * half, 2 * half)[1].mean() > 0.4
 
 
-def test_without_a_layer(ortho, tmp_path):
-    with_it, without = built(ortho, tmp_path), built(ortho, tmp_path, "b.onav", registration=False)
+def test_without_a_layer(ortho, small_map, tmp_path):
+    with_it, without = small_map, built(ortho, tmp_path, registration=False)
     assert GreyLayer.of(without) is None
     assert set(with_it.arrays) - set(without.arrays) == set(NAMES.values())
     for name, part in without.arrays.items():
         np.testing.assert_array_equal(part, with_it.arrays[name])
 
 
-def test_info_describes_the_layer(ortho, tmp_path, capsys):
-    opened = built(ortho, tmp_path)
+def test_info_describes_the_layer(small_map, capsys):
+    opened = small_map
     grey = opened.manifest.sheets[0].grey
     assert main(["info", str(opened.path), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)["registration"]

@@ -170,7 +170,7 @@ def test_a_terrain_places_views_that_level_ground_does_not(
     monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other set-ups are not tried
     few, found = shutil.copytree(flown, tmp_path / "flight"), {}
     header, *lines = (few / "telemetry.csv").read_text().splitlines()
-    (few / "telemetry.csv").write_text("\n".join([header, *lines[::2]]) + "\n")
+    (few / "telemetry.csv").write_text("\n".join([header, *lines[::3]]) + "\n")
     for name, arguments in {
         "level": [map_path],
         "terrain": [map_path, "--dem", dem, "--dem-datum", "msl"],
@@ -265,11 +265,11 @@ def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
     assert done.code == 1 and "the terrain lies outside the map" in done.err
 
 
-def test_random_views_report_heights_above_sea_only(run, area, dem, tmp_path, monkeypatch):
+def test_random_views_report_heights_above_sea_only(run, area, flown, dem, tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
     done = run(
         "simulate", "--ortho", area.present, "--random", 3, "--agl-m", 250, "--dem", dem,
-        "--dem-datum", "msl", "--out", tmp_path / "flight",
+        "--dem-datum", "msl", "--camera", flown / "flight.json", "--out", tmp_path / "flight",
     )  # fmt: skip
     assert done.code == 0
     reported = rows(tmp_path / "flight")

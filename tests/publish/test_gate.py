@@ -175,7 +175,7 @@ def test_noise_within_the_covariance_is_no_reset() -> None:
     rng = np.random.default_rng(3)
     cov = np.array([[25.0, 12.0], [12.0, 16.0]])
     gate = Gate()
-    for step, noise in enumerate(rng.multivariate_normal([0, 0], cov, 2000)):
+    for step, noise in enumerate(rng.multivariate_normal([0, 0], cov, 800)):
         east, north = 25.0 * step * 0.2 + noise[0], noise[1]
         at = estimate_at(0.2 * step, east, north, cov_en_m2=cov, vel_en_mps=(25.0, 0.0))
         assert gate.admit(at, now(0.2 * step)) is not None

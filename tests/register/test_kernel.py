@@ -48,7 +48,7 @@ def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
 
     def work():
         found = []
-        for made, near in views(25, 5, level, view_valid):
+        for made, near in views(12, 5, level, view_valid):
             fresh = template.Template(made.level, made.values, made.weights, made.recipe)
             found.append(Refiner(fresh, reference).place(near, with_covariance=True))
         return found
@@ -70,7 +70,7 @@ def test_views_that_touch_the_map_with_a_few_pixels_are_placed(reference, monkey
             monkeypatch.setattr(module, "KERNEL", None)
     rng = np.random.default_rng(8)
     made = templates_of(GROUND, Pose(160, 128, 0, 0)).at(0)
-    for _ in range(150):
+    for _ in range(60):
         inside_px = rng.uniform(0, 3)
         pose = Pose(SHAPE[1] + 64 - inside_px, rng.uniform(0, SHAPE[0]), rng.normal(0, 0.02), 0.0)
         placed = Refiner(made, reference).place(pose, with_covariance=True)

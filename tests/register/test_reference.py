@@ -82,7 +82,7 @@ def test_threads_make_a_level_once(holes):
     assert all(each is made[0] for each in made) and len(reference.pyramid.read_px) == 1
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     level=st.integers(0, 2),
     row=st.integers(-120, 220),

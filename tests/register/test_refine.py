@@ -70,7 +70,7 @@ def noisy(ground, pose, rng, noise=8.0, clutter=0.0, shape=VIEW):
 
 @pytest.mark.parametrize("level", [0, 1])
 def test_a_view_is_placed_to_a_fraction_of_a_pixel(reference, level):
-    for pose in random_poses(30, SHAPE, REACH_PX, seed=1, log_scale=0.1):
+    for pose in random_poses(15, SHAPE, REACH_PX, seed=1, log_scale=0.1):
         placed = Refiner(templates_of(GROUND, pose).at(level), reference).place(pose)
         off = errors(placed, pose)
         assert np.hypot(*off[:2]) / 2**level < 0.05
@@ -97,7 +97,7 @@ def test_what_a_search_leaves_is_made_up_for(reference, level, away_px, turn_deg
 @pytest.mark.parametrize("level", [0, 1])
 def test_noise_and_clutter_move_it_little(reference, level):
     rng = np.random.default_rng(3)
-    for pose in random_poses(30, SHAPE, REACH_PX, seed=3, log_scale=0.1):
+    for pose in random_poses(15, SHAPE, REACH_PX, seed=3, log_scale=0.1):
         start = moved(pose, 1.0, pose.x_px, 1.0, 1.01)
         view = noisy(GROUND, pose, rng, noise=12.0, clutter=10.0).at(level)
         placed = Refiner(view, reference).place(start)
@@ -333,7 +333,7 @@ def normalized_squares(off, covariances, part=np.s_[:2]):
 @pytest.mark.parametrize("view", [{"noise": 12.0}, {"noise": 8.0, "clutter": 24.0}], ids=str)
 def test_errors_are_as_large_as_the_covariance_says(reference, level, view):
     """Squared errors over the covariance average 2 where it is right, on two axes."""
-    off, covariances = many_placed(reference, level, 100, 10 + level, **view)
+    off, covariances = many_placed(reference, level, 50, 10 + level, **view)
     squares = normalized_squares(off, covariances)
     assert 0.75 < squares.mean() < 3.0
     assert np.mean(squares < 9.21) > 0.95  # 99 % of a true one's

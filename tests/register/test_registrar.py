@@ -108,7 +108,7 @@ SAME_AGAIN = Pose(336.0, 192.0, 0.3, 0.0)
 
 @pytest.mark.parametrize("level", [LEVELS.look, LEVELS.coarse])
 def test_a_view_is_found_and_stands_out(registrar, level):
-    for pose in random_poses(6, SHAPE, 90, seed=1, log_scale=0.08):
+    for pose in random_poses(4, SHAPE, 90, seed=1, log_scale=0.08):
         found = registered(registrar, templates_of(GROUND, pose), prior_of(pose), level)
         assert apart_px(found.placed.pose, pose) < 0.1
         assert abs(turned_rad(found.placed.pose, pose)) < math.radians(0.2)
@@ -427,7 +427,7 @@ def test_a_part_over_the_border_of_the_sheet(registrar, centre):
 
 def test_threads_may_share_it():
     registrar = Registrar(reference_of(GROUND, SHAPE))
-    poses = random_poses(8, SHAPE, 90, seed=3, log_scale=0.05)
+    poses = random_poses(4, SHAPE, 90, seed=3, log_scale=0.05)
     alone = [registered(registrar, templates_of(GROUND, pose), prior_of(pose)) for pose in poses]
     cold = Registrar(reference_of(GROUND, SHAPE))
     with ThreadPoolExecutor(4) as pool:

@@ -57,7 +57,7 @@ def test_a_roof_stands_out_and_hides_the_ground_behind():
 
 
 def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
-    size = {"size_m": (420.0, 400.0), "dates": (AUTUMN,), "seed": 2}
+    size = {"size_m": (340.0, 320.0), "dates": (AUTUMN,), "seed": 2}
     (ortho,) = generate_area(tmp_path, **size)
     dem, dsm = (open_dem(p, None) for p in generate_heights(tmp_path, slope=0.1, **size))
     request = {"random": 2, "agl_m": 50.0, "camera": CAMERA, "effects": PLAIN, "seed": 5}
@@ -81,7 +81,7 @@ def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
 
 
 def test_objects_of_the_landscape_stand_where_they_are_drawn(tmp_path):
-    size = {"size_m": (400.0, 400.0), "dates": (AUTUMN,), "seed": 1}
+    size = {"size_m": (260.0, 260.0), "dates": (AUTUMN,), "seed": 1}
     dem, dsm = generate_heights(tmp_path, slope=0.0, **size)
     assert (dem.name, dsm.name) == ("dem.tif", "2021-10_dsm.tif")
     import rasterio
@@ -96,7 +96,7 @@ def test_objects_of_the_landscape_stand_where_they_are_drawn(tmp_path):
 
 def test_heights_show_progress_and_an_interrupt_leaves_none(tmp_path, monkeypatch):
     shares = []
-    size = {"size_m": (400.0, 300.0), "dates": (AUTUMN,), "seed": 1}
+    size = {"size_m": (200.0, 150.0), "dates": (AUTUMN,), "seed": 1}
     made = generate_heights(tmp_path / "whole", slope=0.1, progress=shares.append, **size)
     assert sorted(each.name for each in (tmp_path / "whole").iterdir()) == sorted(
         each.name for each in made
