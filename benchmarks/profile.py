@@ -96,7 +96,7 @@ def _watched(account: _Account) -> Iterator[_Account]:
 
     clocked = [
         (locate, "prepared", lambda *a, **k: "rectify"),
-        (candidates.ViewCandidates, "found", lambda _, run: "search, " + _kind(run)),
+        (candidates.ViewCandidates, "found", _kind),
         (registrar.Registrar, "judged", lambda *a, **k: VERIFY),
         (registrar.Registrar, "finished", lambda *a, **k: VERIFY),
         (refiner, "place", lambda self, *a, **k: f"refine, level {self.template.level}"),
@@ -109,8 +109,8 @@ def _watched(account: _Account) -> Iterator[_Account]:
         yield account
 
 
-def _kind(run: plan.Search) -> str:
-    return "tiles" if run.from_tiles else f"level {run.level}"
+def _kind(_: Any, run: plan.Search) -> str:
+    return "search, " + ("tiles" if run.from_tiles else f"level {run.level}")
 
 
 def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:

@@ -96,7 +96,7 @@ def peak_poses(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> NDArr
     off = poses - poses[:, None]
     off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
     best, tiles = scores.argmax(axis=1), np.arange(len(scores))
-    peaks = poses[best]
+    peaks: NDArray[np.float64] = poses[best]
     for axis in (0, 1):
         other = np.isclose(off[..., 1 - axis], 0.0)
         beside = []
