@@ -24,7 +24,9 @@ def test_a_pose_lies_between_those_that_were_tried(turn_std_rad, turn_deg, log_s
     made = bank(turn_std_rad, 0.1, turn_step_rad=STEP_RAD, scale_step=SCALE_STEP, sigmas=3.0)
     poses = np.array(made.poses)
     scores = scores_around(poses, math.radians(turn_deg), log_scale)
-    found, first = peak_poses(poses, np.stack([scores, scores_around(poses, 0.0, 0.0)]))
+    found, first = peak_poses(
+        poses, np.stack([scores, scores_around(poses, 0.0, 0.0)]), np.ones(len(poses), np.float32)
+    )
     np.testing.assert_allclose(first, 0.0, atol=1e-3)
     assert abs(math.remainder(found[0] - math.radians(turn_deg), 2 * math.pi)) < 1e-3
     assert found[1] == pytest.approx(log_scale, abs=1e-3)
@@ -32,5 +34,5 @@ def test_a_pose_lies_between_those_that_were_tried(turn_std_rad, turn_deg, log_s
 
 def test_at_the_rim_of_what_was_tried_it_is_the_pose_tried():
     poses = np.array([(0.0, 0.0), (STEP_RAD, 0.0)])
-    assert not peak_poses(poses, np.float32([[1.0, 0.9]])).any()
-    assert not peak_poses(poses[:1], np.float32([[0.5]])).any()
+    assert not peak_poses(poses, np.float32([[1.0, 0.9]]), np.ones(2, np.float32)).any()
+    assert not peak_poses(poses[:1], np.float32([[0.5]]), np.ones(1, np.float32)).any()

@@ -2,7 +2,7 @@
 
 import math
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -101,15 +101,18 @@ class ViewCandidates:
 
     def found(self, run: Search) -> list[Candidate]:
         """Candidates of one search, best first."""
-        if run.from_tiles and self.propose is not None:
-            return self._from_tiles(run, self.propose)
-        return self._by_fft(run)
+        return self._from_tiles(run) if run.from_tiles else self._by_fft(run)
 
-    def _from_tiles(self, run: Search, propose: TileProposer) -> list[Candidate]:
+    def _from_tiles(self, run: Search) -> list[Candidate]:
         """The most similar tiles, each at its best place near by."""
+        assert self.propose is not None
         plan, view, grid = self.plan, self.view, self.sheet.grid
-        nats = np.array([view.prior.nats(*pose) for pose in run.poses], np.float32)
-        tiles = propose.candidates(
+        # Over a terrain the telemetry predicts another scale at every place.
+        expected = view.prior
+        if expected.scale_map is not None:
+            expected = replace(expected, log_scale_std=math.inf)
+        nats = np.array([expected.nats(*pose) for pose in run.poses], np.float32)
+        tiles = self.propose.candidates(
             view.rectified_at(0),
             run.poses,
             1 - np.float32(plan.tile_share_per_nat) * nats,

@@ -53,7 +53,7 @@ class GroundSeen:
 
 
 class ViewOnLevelGround:
-    """One view on level ground."""
+    """One view on level ground. Not to be shared between threads."""
 
     is_level = True
     """Whether candidates stay as they were found; else they are placed again on the terrain."""
@@ -110,13 +110,15 @@ class ViewOnLevelGround:
 
 
 class ViewOverRelief(ViewOnLevelGround):
-    """One view on the ground of a sheet. Not to be shared between threads."""
+    """One view on the ground of a sheet. Not to be shared between threads.
 
-    is_level = False
+    What a candidate is finished on depends on the best one before it; it is finished once.
+    """
 
     def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
         super().__init__(registrar, view)
         self.seen = ReliefView(relief, view)
+        self.is_level = isinstance(relief.terrain, LevelTerrain)
         # By the pose of a finalist: score on the terrain at the judged level over that on level
         # ground; None: finished on level ground.
         self._gains: dict[Pose, float | None] = {}

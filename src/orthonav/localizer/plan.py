@@ -14,7 +14,7 @@ stages, the most likely first, so that an ordinary view ends after the first sta
 heading and scale are known so well that the *final level*, one below, is cheap too, it comes last:
 weak texture, such as that of bare ground, is only seen there.
 
-This file decides; `registration` executes.
+This file decides; `view_search` executes.
 """
 
 import math
@@ -147,6 +147,9 @@ class SearchPlan:
     """Before a search that costs more than a trial, so many of the best candidates are placed on
     the terrain, finished and compared one level finer. The search ends if that proves one;
     docs/decisions/registration.md, 14."""
+    trial_doubt: float = 0.002
+    """A trial proves a place with a confidence above one minus this: its rivals were not all
+    searched."""
     trial_ms: float = 25.0
     terrain_trial_ms: float = 60.0
     """Estimated cost of a trial, on level ground and on a terrain."""

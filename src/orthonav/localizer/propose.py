@@ -69,13 +69,12 @@ class TileProposer:
         queries = embed_poses(
             self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
         )
-        queries *= weights[:, None]
-        scores = self.index.best(queries, rows)
+        scores = self.index.best(queries * weights[:, None], rows)
         centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
         chosen = top_tiles(scores, centres, count, apart_strides * self.grid.stride_m)
         tiles = chosen if rows is None else rows[chosen]
         by_pose = self.index.scores(queries, tiles)
-        peaks = peak_poses(np.array(poses), by_pose)
+        peaks = peak_poses(np.array(poses), by_pose, weights)
         found = []
         for place, tile, (turn_rad, log_scale) in zip(chosen, tiles, peaks.tolist(), strict=True):
             shift = self.neighbours.peak_offset(scores, int(tile), rows)
@@ -87,15 +86,18 @@ class TileProposer:
         return found
 
 
-def peak_poses(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> NDArray[np.float64]:
+def peak_poses(
+    poses: NDArray[np.float64], scores: NDArray[np.float32], weights: NDArray[np.float32]
+) -> NDArray[np.float64]:
     """Headings and log scales (N, 2) where the scores (N, Q) of poses (Q, 2) on a grid have their
     peak.
 
-    By a parabola along each, or those of the best pose where one of its neighbours is missing.
+    By a parabola along each, or those of the best pose where one of its neighbours is missing. The
+    best one has the highest score times its weight (Q,); weights do not move the parabola.
     """
     off = poses - poses[:, None]
     off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
-    best, tiles = scores.argmax(axis=1), np.arange(len(scores))
+    best, tiles = (scores * weights).argmax(axis=1), np.arange(len(scores))
     peaks: NDArray[np.float64] = poses[best]
     for axis in (0, 1):
         other = np.isclose(off[..., 1 - axis], 0.0)

@@ -154,12 +154,11 @@ class RegistrationLocalizer:
             prepared = replace(prepared, prior=pose_prior)
         if self.relief is not None:
             prepared = replace(prepared, prior=self.relief.expected(prepared))
-        candidates = self._candidates(prepared, prior)
-        if not candidates.touches_map:
+        if not self._candidates(prepared, prior).touches_map:
             outside = NoFix("outside_map", "the map does not reach to where the prior says")
             return RegisteredView(prepared, outside)
         ground = self.on_ground(prepared)
-        found = ViewSearch(candidates, ground, self.confidence).best()
+        found = self.best(prepared, prior, ground)
         if found is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
@@ -172,10 +171,15 @@ class RegistrationLocalizer:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
         return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
 
-    def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
-        """The best place after all searches that had to be run; None where nothing was found."""
-        search = ViewSearch(self._candidates(view, prior), self.on_ground(view), self.confidence)
-        return search.best()
+    def best(
+        self, view: PreparedView, prior: Prior | None, ground: ViewOnLevelGround | None = None
+    ) -> Registered | None:
+        """The best place after all searches that had to be run; None where nothing was found.
+
+        `ground`: the view on the ground of the map; None: made here.
+        """
+        candidates = self._candidates(view, prior)
+        return ViewSearch(candidates, ground or self.on_ground(view), self.confidence).best()
 
     def _candidates(self, view: PreparedView, prior: Prior | None) -> ViewCandidates:
         return ViewCandidates(

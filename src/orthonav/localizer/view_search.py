@@ -1,4 +1,4 @@
-"""The search for one view: runs the searches of the plan until one place stands out.
+"""The search for one view: runs the searches of the plan until one place stands out or is proven.
 
 `plan` decides which searches to run, `candidates` runs them, the registrar judges what they find.
 """
@@ -31,6 +31,7 @@ class ViewSearch:
         self._judged: list[Placed] = []
         self._direct: list[Placed] = []
         self._count = 0
+        self._last: Search | None = None
 
     def best(self) -> Registered | None:
         """The best place after all searches that had to be run; None where nothing was found."""
@@ -52,6 +53,7 @@ class ViewSearch:
         view = self._view
         found = self._candidates.found(each)
         self._count += len(found)
+        self._last = each
         if each.level < self._levels.look:
             self._direct = self._registrar.direct(view.templates, self._levels, found)
             return
@@ -73,18 +75,21 @@ class ViewSearch:
         """The best place so far, if a trial proves it that costs less than the next search.
 
         `cost_ms`: that of the next search. The best few candidates are placed on the terrain, where
-        there is one, and compared one level finer.
+        there is one, and compared one level finer. Where only a part of all places was compared, or
+        only a few on the terrain, the best must stand out as well.
         """
-        plan, ground = self._plan, self._ground
+        plan, ground, last = self._plan, self._ground, self._last
         trial_ms = plan.trial_ms if ground.is_level else plan.terrain_trial_ms
+        if last is None or self._confidence is None or self._levels.final == 0:
+            return None
         if not self._judged or cost_ms <= trial_ms or not self._budget.allows(trial_ms):
             return None
         placed = ground.placed_on_terrain(self._judged, plan.trials)
-        best, _ = self._registrar.standing(self._view.templates, placed, self._view.prior)
-        if best <= self._chances.look:
-            return None
         found = self._finished(placed, plan.trials, finer=True)
-        return found if self._is_proven(found) else None
+        compared_all = ground.is_level and last.level == self._levels.look and not last.from_tiles
+        if not compared_all and not self._is_clear(found, plan.enough(last, self._levels)):
+            return None
+        return found if self._confidence(found.evidence()) > 1 - plan.trial_doubt else None
 
     def _concluded(self) -> Registered:
         """The best place after all searches, none of which ended with one that stands out.
@@ -92,7 +97,7 @@ class ViewSearch:
         While it is not proven, more candidates are finished and compared one level finer.
         """
         plan, judged = self._plan, self._judged
-        if self._budget.allows(0.0):
+        if not self._ground.is_level and self._budget.allows(0.0):
             judged = self._ground.placed_on_terrain(judged, plan.terrain_candidates)
         found = self._finished(judged)
         for kept, cost_ms in plan.finer if self._levels.final > 0 else ():
@@ -131,7 +136,7 @@ class ViewSearch:
         return best.look_ratio > margin.look_ratio and best.peak_ratio > margin.peak_ratio
 
     def _is_proven(self, best: Registered) -> bool:
-        """Whether a place is so confident that no further search could change the verdict."""
+        """Whether a place is so confident that the search ends."""
         if self._confidence is None:
             return False
         return self._confidence(best.evidence()) > 1 - self._plan.doubt
