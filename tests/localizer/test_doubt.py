@@ -57,11 +57,14 @@ class Confidence:
         return evidence["confidence"]
 
 
-def searched(monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math.inf):
+def searched(
+    monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math.inf, *,
+    level=LOOK, from_tiles=False, learnt=True,
+):  # fmt: skip
     """Searches that were run, candidates finished and whether they were compared one level finer,
     and the place found, where one finishing after the other has these confidences."""
     registrar, ran = Registrar(confidences), []
-    searches = [Search(LOOK, [(0.0, 0.0)], False, 8, cost_ms) for cost_ms in costs_ms]
+    searches = [Search(level, [(0.0, 0.0)], from_tiles, 8, cost_ms) for cost_ms in costs_ms]
     monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
     view = SimpleNamespace(
         levels=Levels(LOOK + 1, LOOK, final), prior=PosePrior(0.0, 0.1, 0.1), templates=None
@@ -74,7 +77,7 @@ def searched(monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math
         is_level=True, finish=None, finer_score=lambda finalist: 0.0,
         placed_on_terrain=lambda judged, at_most: judged,
     )  # fmt: skip
-    found = ViewSearch(candidates, ground, Confidence()).best()
+    found = ViewSearch(candidates, ground, Confidence() if learnt else None).best()
     return ran, registrar.kept, found
 
 
@@ -102,18 +105,31 @@ def test_a_budget_leaves_it_out(monkeypatch):
 
 
 def test_a_trial_before_an_expensive_search_can_make_it_needless(monkeypatch):
-    ran, finished, found = searched(monkeypatch, [0.995], costs_ms=(50.0, 300.0))
-    assert (ran, finished, found) == ([50.0], [(3, True)], Found(0.995))
+    ran, finished, found = searched(monkeypatch, [0.999], costs_ms=(50.0, 300.0))
+    assert (ran, finished, found) == ([50.0], [(3, True)], Found(0.999))
 
 
-def test_where_it_proves_nothing_the_search_goes_on(monkeypatch):
-    ran, finished, _ = searched(monkeypatch, [0.95, 0.995], costs_ms=(50.0, 300.0))
+@pytest.mark.parametrize("confidence", [0.5, 0.995])
+def test_where_it_proves_too_little_the_search_goes_on(monkeypatch, confidence):
+    ran, finished, _ = searched(monkeypatch, [confidence, 0.995], costs_ms=(50.0, 300.0))
     assert (ran, finished) == ([50.0, 300.0], [(3, True), (3, False)])
+
+
+@pytest.mark.parametrize("changes", [{"from_tiles": True}, {"level": LOOK + 1}])
+def test_where_few_places_were_compared_it_must_stand_out_too(monkeypatch, changes):
+    ran, *_ = searched(monkeypatch, [0.999, 0.999], costs_ms=(50.0, 300.0), **changes)
+    assert ran == [50.0, 300.0]
 
 
 def test_before_a_cheap_search_there_is_no_trial(monkeypatch):
     ran, finished, _ = searched(monkeypatch, [0.995], costs_ms=(50.0, 10.0))
     assert (ran, finished) == ([50.0, 10.0], [(3, False)])
+
+
+@pytest.mark.parametrize("changes", [{"final": 0}, {"learnt": False}])
+def test_without_a_finer_level_or_a_confidence_there_is_no_trial(monkeypatch, changes):
+    ran, finished, _ = searched(monkeypatch, [0.999] * 3, costs_ms=(50.0, 300.0), **changes)
+    assert ran == [50.0, 300.0] and finished[0] == (3, False)
 
 
 def test_other_places_are_less_confident_than_the_one_that_won_in_detail():

@@ -232,7 +232,7 @@ def test_a_place_that_stands_out_on_the_terrain_ends_the_search(opened, grey, re
     early = looking(opened, relief).locate(view)
     whole, doubtful, limited = (
         looking(opened, relief, **changes).locate(view)
-        for changes in ({"terrain_trial_ms": math.inf}, {"doubt": 0.0}, {"budget_ms": 1e6})
+        for changes in ({"terrain_trial_ms": math.inf}, {"trial_doubt": 0.0}, {"budget_ms": 1e6})
     )
     assert early.evidence["candidates"] < whole.evidence["candidates"]
     assert error_m(looking(opened, relief), early, place) < 1.0 and early.confidence > 0.99

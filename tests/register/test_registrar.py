@@ -18,13 +18,13 @@ from scenes import (
     turned_rad,
 )
 
+import orthonav.register.registrar as registrar_module
 from orthonav.register.evidence import COARSE, FINE
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Refiner
 from orthonav.register.registrar import (
     EXCLUSION_SHARE,
-    KEPT_TO_LOOK,
     LOOK_PX,
     MAX_KEPT_WINDOWS,
     MAX_RATIO,
@@ -312,7 +312,9 @@ def test_a_place_found_at_the_final_level_competes_with_the_judged_ones(registra
     assert found.rival == missed.score and found.look_rival == missed.look_score
 
 
-def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(registrar):
+def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(
+    registrar, monkeypatch
+):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     templates, prior = templates_of(GROUND, pose), prior_of(pose)
     rng = np.random.default_rng(0)
@@ -321,8 +323,9 @@ def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(reg
     assert len(judged) == 21 and apart_px(judged[0].pose, pose) < 0.3
     scores = [each.score - prior.cost(each.pose) for each in judged]
     assert scores == sorted(scores, reverse=True)
+    monkeypatch.setattr(registrar_module, "KEPT_TO_LOOK", 8)
     coarser = registrar.judged(templates, LEVELS, [*away, near(pose, 2.0)], LEVELS.coarse, prior)
-    assert MIN_HOPEFUL <= len(coarser) <= KEPT_TO_LOOK
+    assert MIN_HOPEFUL <= len(coarser) <= 8
     assert apart_px(coarser[0].pose, pose) < 0.3
 
 
