@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -185,6 +186,12 @@ def test_an_untrusted_index_is_checked(atlas, change, words):
     change(plain)
     with pytest.raises(AtlasError, match=f"cannot be read.*{words}"):
         IndexManifest.from_json(canonical(plain) + b"\n")
+
+
+def test_an_infinite_number_of_rows_is_refused(atlas):
+    data = re.sub(rb'"rows":\d+', b'"rows":1e999', atlas.store.read(MANIFEST))
+    with pytest.raises(AtlasError, match="cannot be read"):
+        IndexManifest.from_json(data)
 
 
 def _asset(plain):

@@ -75,3 +75,5 @@ def test_references_stay_on_https_of_the_same_server():
     assert urls.joined("https://a/b/caps.xml", "../tiles") == "https://a/tiles"
     with pytest.raises(FetchError):
         urls.joined("https://a/caps", "file:///etc/passwd")
+    with pytest.raises(FetchError, match="not an address"):
+        urls.joined("https://a/caps", "http://[::1/map")

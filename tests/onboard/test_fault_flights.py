@@ -51,7 +51,6 @@ def test_pictures_that_show_nothing_of_the_map_give_no_wrong_message(world, name
     assert report.wrong() == [] and len(report.during()) <= 3
 
 
-@pytest.mark.slow  # of the suite itself, not of what flies
 def test_the_suite_notices_a_wrong_message(world):
     """A map that is displaced by 60 m cannot be noticed: its messages count as wrong."""
     fault = Fault("shifted", "map", 8.0, from_start=True, ground_en_m=(60.0, 0.0))

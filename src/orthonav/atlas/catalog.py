@@ -65,10 +65,10 @@ class Atlas:
         holds other files.
         """
         store = Store(str(url))
-        if _is_free(store):
+        if store.size(CATALOG) is None:
+            if not _is_free(store):
+                raise AtlasError(f"the folder holds other files; name another: {store}")
             store.write(CATALOG, _catalog(recipe))
-        elif store.size(CATALOG) is None:
-            raise AtlasError(f"the folder holds other files; name another: {store}")
         return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:

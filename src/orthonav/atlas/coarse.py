@@ -171,7 +171,7 @@ def _metadata(recipe: CoarseRecipe, bounds_deg: Extent) -> str:
         "recipe": asdict(recipe),
         "edges": EDGES,
         "cells": POOLING.cells,
-        "bounds_deg": bounds_deg,
+        "bounds_deg": list(map(float, bounds_deg)),
     }
     return canonical(plain).decode()
 
@@ -183,13 +183,16 @@ def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
         raise AtlasError(
             f"coarse tiles of schema {plain['schema']!r:.20}, this program reads {SCHEMA}"
         )
+    if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
+        raise AtlasError(
+            f"coarse tiles show {plain['edges']!r:.20} in {plain['cells']!r:.20} cells, this "
+            f"program compares {EDGES} in {POOLING.cells}: build the sheet again"
+        )
     recipe = CoarseRecipe(**plain["recipe"])
     west, south, east, north = map(float, plain["bounds_deg"])
     bounds_deg = west, south, east, north
     if _metadata(recipe, bounds_deg) != metadata or recipe.tile_px % MICRO:
-        raise AtlasError(
-            f"altered, or not coarse tiles of an atlas ({EDGES} in {POOLING.cells} cells)"
-        )
+        raise AtlasError("altered, or not coarse tiles of an atlas")
     return recipe, bounds_deg
 
 

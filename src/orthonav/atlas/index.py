@@ -7,7 +7,7 @@ after many changes the whole index is rebuilt.
 
 import hashlib
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,7 +121,8 @@ class _IndexBuilder:
             )
         embedder, quantizers = self._learnt(sheets, total)
         empty = IndexManifest(quantizers.recipe, (), {})
-        return self._extended(empty, embedder, quantizers, _groups(sheets, counts))
+        rows = {sheet.id: count for sheet, count in zip(sheets, counts, strict=True)}
+        return self._extended(empty, embedder, quantizers, _groups(sheets, counts), rows)
 
     def _learnt(self, sheets: Sequence[Sheet], total: int) -> tuple[WhitenedEmbedder, Quantizers]:
         """Whitening and quantizers of an index of `total` tiles, written to the folder."""
@@ -159,7 +160,8 @@ class _IndexBuilder:
             for shard in before.shards
         )
         left = replace(before, shards=shards)
-        return self._extended(left, embedder, quantizers, [new] if new else [])
+        rows = {sheet.id: count for sheet, count in zip(new, self._counts(new), strict=True)}
+        return self._extended(left, embedder, quantizers, [new] if new else [], rows)
 
     def _extended(
         self,
@@ -167,9 +169,13 @@ class _IndexBuilder:
         embedder: WhitenedEmbedder,
         quantizers: Quantizers,
         groups: Sequence[Sequence[Sheet]],
+        counts: Mapping[str, int],
     ) -> IndexManifest:
         """The index with a further shard for each group of sheets, put into the atlas: the manifest
-        after the files; then files that are not used any more are removed."""
+        after the files; then files that are not used any more are removed.
+
+        `counts`: tiles of each sheet, by its id.
+        """
         shards, files, store = list(index.shards), dict(index.files), self._atlas.store
         shares = _shares(sum(map(len, groups)))
         for group in groups:
@@ -181,7 +187,7 @@ class _IndexBuilder:
             rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
             write_shard(self._folder, name, quantizers, rows)
             ids = [sheet.id for sheet in group]
-            parts = tuple(map(Part, ids, digests, self._counts(group)))
+            parts = tuple(map(Part, ids, digests, [counts[each] for each in ids]))
             shards.append(ShardInfo(name, base, parts))
         for path in sorted(self._folder.iterdir()):
             name = f"{FOLDER}/{path.name}"

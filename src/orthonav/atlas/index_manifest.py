@@ -121,7 +121,7 @@ class IndexManifest:
             )
             if not possible:
                 raise ValueError("damaged or altered")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise AtlasError(f"index of the atlas cannot be read ({reason(error)})") from error
         return made
 

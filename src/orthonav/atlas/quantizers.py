@@ -156,10 +156,14 @@ class Quantizers:
         rotated queries (Q, D), in the order of list numbers, and those products (Q, probes)."""
         half = self.recipe.dims // 2
         low, high = rotated[:, :half] @ self.halves[0].T, rotated[:, half:] @ self.halves[1].T
-        sums = (high[:, :, None] + low[:, None, :]).reshape(len(rotated), -1)
-        probes = min(probes, sums.shape[1])
-        lists = np.sort(np.argpartition(sums, -probes, axis=1)[:, -probes:], axis=1)
-        return lists, np.take_along_axis(sums, lists, axis=1)
+        probes = min(probes, low.shape[1] * high.shape[1])
+        lists = np.empty((len(rotated), probes), np.int64)
+        products = np.empty(lists.shape, np.float32)
+        for number in range(len(rotated)):  # one at a time: 2^16 sums each
+            sums = (high[number, :, None] + low[number]).ravel()
+            lists[number] = np.sort(np.argpartition(sums, -probes)[-probes:])
+            products[number] = sums[lists[number]]
+        return lists, products
 
     def empty_index(self) -> Any:
         """An empty FAISS index (IndexIVFPQFastScan) with these quantizers."""

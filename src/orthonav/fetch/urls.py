@@ -122,7 +122,10 @@ def joined(base: str, reference: str) -> str:
 
     Documents of services behind a proxy often refer to themselves with `http://`.
     """
-    url = urljoin(base, reference.strip())
+    try:
+        url = urljoin(base, reference.strip())
+    except ValueError as error:
+        raise FetchError(f"not an address ({error}): {reference!r:.200}") from error
     if base.startswith("https://") and url.startswith("http://"):
         secure = "https://" + url[len("http://") :]
         if host_of(secure) == host_of(base):
