@@ -136,8 +136,8 @@ def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:
         "not confident after one search is searched again, so the mean is more useful than the "
         "median; share: of the time of all views",
         "level n: pixels of 2^n m; rectify: checks, thinning, rectification; search, tiles: "
-        "candidates from embeddings; refine: all candidates that reach the level; templates: "
-        "evidence of the view and its derivatives; stages do not overlap",
+        "candidates from embeddings, and their best places near by; refine: all candidates that "
+        "reach the level; templates: evidence of the view and its derivatives; stages do not overlap",
     )
     return Table("Stages of a registered view", header, rows, notes)
 

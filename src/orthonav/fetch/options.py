@@ -66,6 +66,8 @@ class ImageryOptions:
     def over(self, preset: "ImageryOptions") -> "ImageryOptions":
         """These options where they are set, else those of the preset."""
         given = {name: value for name, value in vars(self).items() if value is not None}
+        if self.subdomains == ImageryOptions.subdomains:
+            given.pop("subdomains")
         return replace(preset, **given)
 
     @property

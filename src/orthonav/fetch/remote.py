@@ -55,7 +55,7 @@ class RemoteFile:
         return f"{self.size} {self._version}"
 
     def read(self, start: int, length: int) -> bytes:
-        """Bytes from `start`, fewer at the end of the file; those of its head by whole chunks."""
+        """Bytes from `start`, fewer at the end of the file; small reads by whole chunks."""
         end = min(start + length, self.size)
         if start >= end:
             return b""
