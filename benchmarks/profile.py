@@ -137,7 +137,7 @@ def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:
         "median; share: of the time of all views",
         "level n: pixels of 2^n m; rectify: checks, thinning, rectification; search, tiles: "
         "candidates from embeddings, and their best places near by; refine: all candidates that "
-        "reach the level; templates: evidence of the view and its derivatives; stages do not overlap",
+        "reach the level; templates: evidence of the view and its derivatives; no overlap",
     )
     return Table("Stages of a registered view", header, rows, notes)
 
