@@ -21,11 +21,16 @@ LOOK = 2
 
 @dataclass(frozen=True)
 class Found:
-    """A place with a confidence, which never stands out."""
+    """A place with a confidence, which stands out by a ratio."""
 
     confidence: float
     cut_short: bool = False
-    score: float = 0.0
+    look_ratio: float = 1.0
+    score: float = 3 * USUAL_CHANCES.total
+
+    @property
+    def peak_ratio(self):
+        return self.look_ratio
 
     def evidence(self):
         return {"confidence": self.confidence}
@@ -34,8 +39,8 @@ class Found:
 class Registrar:
     """Finishes candidates with given confidences, one time after the other, and notes `kept`."""
 
-    def __init__(self, confidences):
-        self.kept, self._left = [], iter(confidences)
+    def __init__(self, confidences, ratio):
+        self.kept, self._left, self._ratio = [], iter(confidences), ratio
 
     def judged(self, *_):
         return ["a place"]
@@ -45,7 +50,7 @@ class Registrar:
 
     def finished(self, *_, finer, kept, **__):
         self.kept.append((kept, finer is not None))
-        return Found(next(self._left))
+        return Found(next(self._left), look_ratio=self._ratio)
 
 
 class Confidence:
@@ -59,11 +64,11 @@ class Confidence:
 
 def searched(
     monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math.inf, *,
-    level=LOOK, from_tiles=False, learnt=True,
+    level=LOOK, from_tiles=False, learnt=True, ratio=1.0,
 ):  # fmt: skip
     """Searches that were run, candidates finished and whether they were compared one level finer,
     and the place found, where one finishing after the other has these confidences."""
-    registrar, ran = Registrar(confidences), []
+    registrar, ran = Registrar(confidences, ratio), []
     searches = [Search(level, [(0.0, 0.0)], from_tiles, 8, cost_ms) for cost_ms in costs_ms]
     monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
     view = SimpleNamespace(
@@ -117,8 +122,11 @@ def test_where_it_proves_too_little_the_search_goes_on(monkeypatch, confidence):
 
 @pytest.mark.parametrize("changes", [{"from_tiles": True}, {"level": LOOK + 1}])
 def test_where_few_places_were_compared_it_must_stand_out_too(monkeypatch, changes):
-    ran, *_ = searched(monkeypatch, [0.999, 0.999], costs_ms=(50.0, 300.0), **changes)
-    assert ran == [50.0, 300.0]
+    costs_ms = 50.0, 300.0
+    ran, *_ = searched(monkeypatch, [0.999, 0.999], costs_ms=costs_ms, ratio=1.2, **changes)
+    assert ran == list(costs_ms)
+    ran, *_ = searched(monkeypatch, [0.999], costs_ms=costs_ms, ratio=1.3, **changes)
+    assert ran == [50.0]
 
 
 def test_before_a_cheap_search_there_is_no_trial(monkeypatch):

@@ -42,6 +42,7 @@ class ClearMargin(NamedTuple):
 
 CLEAR = ClearMargin(2.2, 1.9, 1.9)
 CLEAR_AT_JUDGED = ClearMargin(1.8, 1.5, 1.5)
+CLEAR_AFTER_TRIAL = ClearMargin(1.8, 1.25, 1.25)
 
 Pose = tuple[float, float]
 """Heading (rad, clockwise from north) and natural logarithm of the scale."""
@@ -150,6 +151,9 @@ class SearchPlan:
     trial_doubt: float = 0.002
     """A trial proves a place with a confidence above one minus this: its rivals were not all
     searched."""
+    trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
+    """Where a trial compares only a part of all places, or only a few on the terrain, the place
+    must also stand out so far; docs/decisions/registration.md, 14."""
     trial_ms: float = 25.0
     terrain_trial_ms: float = 60.0
     """Estimated cost of a trial, on level ground and on a terrain."""

@@ -68,7 +68,7 @@ class ViewSearch:
             return None
         found = self._finished(self._judged)
         # Candidates from tiles are not all places: their rivals alone prove too little.
-        proven = not run.from_tiles or self._is_proven(found)
+        proven = not run.from_tiles or self._is_proven(found, self._plan.doubt)
         return found if proven and self._is_clear(found, margin) else None
 
     def _proven_before(self, cost_ms: float) -> Registered | None:
@@ -87,9 +87,9 @@ class ViewSearch:
         placed = ground.placed_on_terrain(self._judged, plan.trials)
         found = self._finished(placed, plan.trials, finer=True)
         compared_all = ground.is_level and last.level == self._levels.look and not last.from_tiles
-        if not compared_all and not self._is_clear(found, plan.enough(last, self._levels)):
+        if not compared_all and not self._is_clear(found, plan.trial_clear):
             return None
-        return found if self._confidence(found.evidence()) > 1 - plan.trial_doubt else None
+        return found if self._is_proven(found, plan.trial_doubt) else None
 
     def _concluded(self) -> Registered:
         """The best place after all searches, none of which ended with one that stands out.
@@ -101,7 +101,7 @@ class ViewSearch:
             judged = self._ground.placed_on_terrain(judged, plan.terrain_candidates)
         found = self._finished(judged)
         for kept, cost_ms in plan.finer if self._levels.final > 0 else ():
-            if self._is_proven(found) or not self._budget.allows(cost_ms):
+            if self._is_proven(found, plan.doubt) or not self._budget.allows(cost_ms):
                 break
             found = self._finished(judged, kept, finer=True)
         return replace(found, cut_short=self._budget.cut_short)
@@ -119,7 +119,7 @@ class ViewSearch:
             self._count,
             finish=ground.finish,
             direct=self._direct,
-            finer=ground.finer_score if finer and self._levels.final > 0 else None,
+            finer=ground.finer_score if finer else None,
             kept=kept,
         )
 
@@ -135,11 +135,9 @@ class ViewSearch:
             return False
         return best.look_ratio > margin.look_ratio and best.peak_ratio > margin.peak_ratio
 
-    def _is_proven(self, best: Registered) -> bool:
-        """Whether a place is so confident that the search ends."""
-        if self._confidence is None:
-            return False
-        return self._confidence(best.evidence()) > 1 - self._plan.doubt
+    def _is_proven(self, best: Registered, doubt: float) -> bool:
+        """Whether a place has a confidence above 1 - `doubt`."""
+        return self._confidence is not None and self._confidence(best.evidence()) > 1 - doubt
 
     @property
     def _chances(self) -> Chances:
