@@ -71,10 +71,11 @@ def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
 def lost_in(cells, mask):
     """The same cells, unknown where `mask` is set."""
     hole = np.where(mask, np.nan, 1.0)
-    names = ("probability", "low", "high", "error_m", "wrong", "persistence", "changed")
+    names = ("probability", "low", "high", "error_m", "wrong", "persistence")
     values = {name: getattr(cells, name) * hole for name in names}
-    trials = np.where(mask, 0, cells.trials).astype(np.int32)
-    return Cells(cells.west_m, cells.north_m, cells.side_m, trials=trials, **values)
+    values["trials"] = np.where(mask, 0, cells.trials).astype(np.int32)
+    values["changed"] = np.where(mask, 0.0, cells.changed)
+    return Cells(cells.west_m, cells.north_m, cells.side_m, **values)
 
 
 def stretches_of(distance_m, probability, speed_mps, drift):

@@ -19,7 +19,7 @@ from matplotlib.colors import to_rgb
 from orthonav.check.outcome import CELL_VALUES
 from orthonav.check.write import imagery, write_check
 from orthonav.check.write.imagery import MAX_SIDE_PX, jpeg, map_image, visible_box
-from orthonav.check.write.page import _known_cells
+from orthonav.check.write.page import ZERO_IF_UNKNOWN, _known_cells
 from orthonav.check.write.plain import to_plain
 from orthonav.check.write.risk import RISKS, segments
 from orthonav.check.write.wording import share_text
@@ -129,10 +129,10 @@ def test_the_policy_names_each_script_and_style(page):
 
 
 def all_cells(cells):
-    """The cells of the page as in `check.json`: unknown ones are None, without trials."""
+    """The cells of the page as in `check.json`: unknown ones are None, or 0 of what was counted."""
     known = cells.pop("known")
     for name in CELL_VALUES:
-        grid = [0 if name == "trials" else None] * (cells["rows"] * cells["cols"])
+        grid = [0 if name in ZERO_IF_UNKNOWN else None] * (cells["rows"] * cells["cols"])
         for number, value in zip(known, cells[name], strict=True):
             grid[number] = value
         starts = range(0, len(grid), cells["cols"])
@@ -145,7 +145,8 @@ def test_cells_around_a_band_cost_nothing(frame):
     empty = [[None] * cells["cols"]] * 300
     wide = {**cells, "rows": cells["rows"] + 300}
     for name in CELL_VALUES:
-        wide[name] = [*cells[name], *([[0] * cells["cols"]] * 300 if name == "trials" else empty)]
+        zero = [[0] * cells["cols"]] * 300
+        wide[name] = [*cells[name], *(zero if name in ZERO_IF_UNKNOWN else empty)]
     assert {**_known_cells(wide), "rows": cells["rows"]} == known
 
 

@@ -44,6 +44,8 @@ LAYERS = {
     "changed": "changed since the map was made",
 }
 """Layers of cells that the map can show."""
+ZERO_IF_UNKNOWN = frozenset({"trials", "changed"})
+"""Values that are 0, not None, in cells of which nothing is known."""
 
 
 def page_of(result: CheckResult, image: Background, figures: list[Figure], leaflet: Leaflet) -> str:
@@ -214,7 +216,7 @@ def _known_cells(cells: Plain) -> Plain:
         number
         for number, values in enumerate(zip(*grids.values(), strict=True))
         if any(
-            value is not None and (value > 0 or name != "trials")
+            value is not None and (value > 0 or name not in ZERO_IF_UNKNOWN)
             for name, value in zip(CELL_VALUES, values, strict=True)
         )
     ]
