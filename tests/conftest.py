@@ -123,7 +123,7 @@ def map_path(area, made_once):
 
     def make(folder):
         out = folder / "area.onav"
-        build_map(BuildRequest([area.past], out, tile_px=128, gsd_m=2.5, calibration_views=24))
+        build_map(BuildRequest([area.past], out, tile_px=128, gsd_m=2.5, calibration_views=14))
 
     return made_once("map", make) / "area.onav"
 

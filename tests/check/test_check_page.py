@@ -327,7 +327,7 @@ def test_the_panel_says_what_is_in_the_cell(visit, frame):
 
 @pytest.mark.parametrize(
     "options",
-    [TABLET, {"viewport": {"width": 390, "height": 800}}],
+    [TABLET, pytest.param({"viewport": {"width": 390, "height": 800}}, marks=pytest.mark.slow)],
     ids=["tablet", "phone"],
 )
 def test_other_screens(visit, options):

@@ -57,7 +57,14 @@ def source(server):
     return f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
 
 
-@pytest.mark.parametrize("name", FAULTS)
+SLOW = {"half a picture", "cut short", "500", "reset"}
+"""Faults that a test of temporary faults has in every run."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in FAULTS],
+)
 def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name):
     with servers.serving(tiles_but(FAULTS[name])) as server:
         with pytest.raises(FetchError, match=r"\d of \d+ tiles failed .*--allow-holes") as raised:
