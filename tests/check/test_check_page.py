@@ -357,9 +357,9 @@ def test_scripts_write_numbers_as_python_does(browser):
     assert percents == [share_text(each) for each in shares]
 
 
-def test_rules_of_accessibility(visit):
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+def test_rules_of_accessibility(visit, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    for options in ({}, {"color_scheme": "dark"}):
-        page = visit("small_route", bypass_csp=True, **options)
-        found = axe.run(page).response["violations"]
-        assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+    page = visit("small_route", bypass_csp=True, color_scheme=scheme)
+    found = axe.run(page).response["violations"]
+    assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
