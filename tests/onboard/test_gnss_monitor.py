@@ -88,7 +88,7 @@ def test_agreement_is_reached_and_the_displacement_learnt():
 )
 def test_a_fault_is_named_in_time(text, seconds, names):
     """Delays of the requirement; positions of the map come once a second."""
-    first_s, last_s, name = delay(text, 2, MAPS["usual"], at_s=150.0, for_s=seconds + 15)
+    first_s, last_s, name = delay(text, 10, MAPS["usual"], at_s=100.0, for_s=seconds + 15)
     assert 0 <= first_s <= last_s and first_s <= seconds
     assert name in names
 
