@@ -815,7 +815,10 @@ def test_an_interrupt_leaves_nothing(run, writing, out, monkeypatch, name, stage
 
 @pytest.mark.parametrize(
     "name, stage, number",
-    [("build", "calibrate", signal.SIGTERM), ("localize", "localize", signal.SIGINT)],
+    [
+        ("build", "calibrate", signal.SIGTERM),
+        pytest.param("localize", "localize", signal.SIGINT, marks=pytest.mark.slow),
+    ],
 )
 def test_a_signal_is_an_interrupt(writing, out, name, stage, number):
     popen = process(stage, *writing[name], script=HOLD)

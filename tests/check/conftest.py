@@ -30,7 +30,7 @@ def half_blank(made_once):
         for seed, path in enumerate(dates):
             blank_east(path, seed)
         out = folder / "half.onav"
-        request = BuildRequest(dates[:1], out, tile_px=128, overlap=0.75, calibration_views=14)
+        request = BuildRequest(dates[:1], out, tile_px=128, overlap=0.75, calibration_views=10)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("orthonav.prepare.calibrate.CROPS", 48)
             patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 4)

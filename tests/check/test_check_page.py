@@ -328,7 +328,7 @@ def test_the_panel_says_what_is_in_the_cell(visit, frame):
 
 @pytest.mark.parametrize(
     "options",
-    [TABLET, {"viewport": {"width": 390, "height": 800}}],
+    [TABLET, pytest.param({"viewport": {"width": 390, "height": 800}}, marks=pytest.mark.slow)],
     ids=["tablet", "phone"],
 )
 def test_other_screens(visit, options):
@@ -358,9 +358,9 @@ def test_scripts_write_numbers_as_python_does(browser):
     assert percents == [share_text(each) for each in shares]
 
 
-def test_rules_of_accessibility(visit):
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+def test_rules_of_accessibility(visit, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    for options in ({}, {"color_scheme": "dark"}):
-        page = visit("small_route", bypass_csp=True, **options)
-        found = axe.run(page).response["violations"]
-        assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+    page = visit("small_route", bypass_csp=True, color_scheme=scheme)
+    found = axe.run(page).response["violations"]
+    assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []

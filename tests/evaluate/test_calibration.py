@@ -390,7 +390,7 @@ def test_a_file_with_an_impossible_confidence_is_refused() -> None:
         flown(OFFSETS, 1.5)
 
 
-@pytest.mark.parametrize("n", [0, 1, 40])
+@pytest.mark.parametrize("n", [0, pytest.param(1, marks=pytest.mark.slow), 40])
 def test_pictures_are_drawn(n: int, coarse) -> None:
     random = np.random.default_rng(9)
     offsets = [(float(e), float(k)) for e, k in random.normal(0.0, 8.0, (n, 2))]
@@ -403,7 +403,7 @@ def test_pictures_are_drawn(n: int, coarse) -> None:
         assert drawing.png.startswith(b"\x89PNG")
 
 
-def test_errors_beyond_all_measure_can_be_drawn() -> None:
+def test_errors_beyond_all_measure_can_be_drawn(coarse) -> None:
     cov = np.tile(np.eye(2), (2, 1, 1)) * np.array([1e-12, 5e-324])[:, None, None]
     found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
     assert found.nees.tolist()[1] == math.inf

@@ -114,13 +114,13 @@ def test_errors_of_their_own_covariance_are_consistent_and_of_a_quarter_over_con
 @pytest.mark.parametrize("alike", [0.0, 0.9])
 def test_of_twenty_consistent_tracks_about_one_is_called_otherwise(alike: float) -> None:
     found = [
-        check_consistency(drawn(300, seed, alike), np.tile(COV, (300, 1, 1))) for seed in range(100)
+        check_consistency(drawn(300, seed, alike), np.tile(COV, (300, 1, 1))) for seed in range(60)
     ]
-    assert sum(each.verdict == "consistent" for each in found) >= 88
+    assert sum(each.verdict == "consistent" for each in found) >= 53
     independent = sum(
         each.independent_low <= each.nees_mean <= each.independent_high for each in found
     )
-    assert (independent >= 88) == (alike == 0.0)  # neighbours that are alike deceive these bounds
+    assert (independent >= 53) == (alike == 0.0)  # neighbours that are alike deceive these bounds
     mean = np.mean([each.nees_mean for each in found])
     assert mean == pytest.approx(2.0, abs=0.15)
     small = check_consistency(drawn(300, 1, alike), np.tile(COV / 4, (300, 1, 1)))

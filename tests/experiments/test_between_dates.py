@@ -65,6 +65,7 @@ def test_targets_are_edges_that_all_dates_have():
     assert 0.9 < found[:30].max() <= 1 and not found[42:, :20].any()
 
 
+@pytest.mark.slow  # an experiment
 def test_a_batch_holds_the_same_ground_at_two_dates(monkeypatch):
     monkeypatch.setattr(between, "PAIRS", 3)
     monkeypatch.setattr(between, "CROP_PX", 32)

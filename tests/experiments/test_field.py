@@ -241,6 +241,7 @@ def test_rows_of_the_field_are_flown_in_one_order():
     assert "caevl-canny" in {each.key for each in methods(FULL, "D", 900)}
 
 
+@pytest.mark.slow  # an experiment
 def test_learnt_edges_are_tuned_on_generated_landscapes():
     rows = {each.key: each for each in methods(REDUCED, "B", 900)}
     learnt = rows["autoencoder-onnx"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthonav.errors import FlightError, MissingFileError
@@ -83,6 +83,7 @@ def refuse(constant: str) -> None:
     raise AssertionError(f"{constant} is not strict JSON")
 
 
+@settings(max_examples=25)
 @given(view_results)
 def test_a_result_survives_the_round_trip(result: ViewResult) -> None:
     assert fields(result_from_json(result_to_json(result))) == fields(result)

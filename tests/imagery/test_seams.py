@@ -35,16 +35,17 @@ def cut(folder, scene, transform, side, make=write, **more):
     return paths
 
 
-@pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
 @pytest.mark.parametrize(
-    "source_gsd_m, gsd_m, side",
+    "frame, source_gsd_m, gsd_m, side",
     [
-        (1.0, 1.0, 50),
-        (1.0, 1.7, 50),
-        (0.2, 1.0, 220),  # cells of 5 pixels end where the files do
-        (0.2, 0.5, 220),  # of 3 pixels they would not: 2 are taken
-        (0.2, 1.0, 223),  # nothing fits
-        (0.25, 1.3, 187),
+        (FRAME, 1.0, 1.0, 50),
+        (FRAME, 0.2, 1.0, 223),
+        (BREST, 1.0, 1.0, 50),
+        (BREST, 1.0, 1.7, 50),
+        (BREST, 0.2, 1.0, 220),  # cells of 5 pixels end where the files do
+        (BREST, 0.2, 0.5, 220),  # of 3 pixels they would not: 2 are taken
+        (BREST, 0.2, 1.0, 223),  # nothing fits
+        (BREST, 0.25, 1.3, 187),
     ],
 )
 def test_a_raster_cut_into_files_is_read_as_the_whole(tmp_path, frame, source_gsd_m, gsd_m, side):
@@ -62,9 +63,8 @@ def test_a_raster_cut_into_files_is_read_as_the_whole(tmp_path, frame, source_gs
     assert both.mean() > 0.65
 
 
-@pytest.mark.parametrize("window", [(0, 0, 90, 90), (0, 40, 80, 9)])
-@pytest.mark.parametrize("side, gsd_m", [(220, 1.0), (223, 1.0)])
-def test_holes_and_bit_depths_survive_the_seams(tmp_path, window, side, gsd_m):
+@pytest.mark.parametrize("window, side", [((0, 0, 90, 90), 220), ((0, 40, 80, 9), 223)])
+def test_holes_and_bit_depths_survive_the_seams(tmp_path, window, side):
     size = 650
     transform = placed(LAMBERT, 0.2, size, frame=BREST)
     scene = rough_scene(size).astype(np.uint16) * 200
@@ -73,7 +73,7 @@ def test_holes_and_bit_depths_survive_the_seams(tmp_path, window, side, gsd_m):
     parts = cut(tmp_path / "cut", scene, transform, side, nodata=0)
     found = []
     for paths in (whole, parts):
-        with sheet_of(paths, 90, gsd_m, BREST) as sheet:
+        with sheet_of(paths, 90, 1.0, BREST) as sheet:
             found.append(sheet.read(*window))
     one, many = found
     assert (one.valid != many.valid).mean() < 0.01

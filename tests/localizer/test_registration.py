@@ -208,7 +208,7 @@ def test_the_principal_point_need_not_be_the_middle(localizer):
     assert error_m(localizer, fix, (-40.0, 22.0)) < 0.15
 
 
-@pytest.mark.parametrize("yaw_deg", [3.0, 125.0, 257.0])
+@pytest.mark.parametrize("yaw_deg", [3.0, pytest.param(125.0, marks=pytest.mark.slow), 257.0])
 def test_unknown_heading(localizer, yaw_deg):
     place = np.array([-60.0, 50.0])
     grey = rendered(GROUND, place, (yaw_deg, 5.0, -4.0))

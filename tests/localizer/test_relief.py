@@ -240,7 +240,9 @@ def test_a_place_that_stands_out_on_the_terrain_ends_the_search(opened, grey, re
     assert limited.evidence["candidates"] == early.evidence["candidates"]
 
 
-@pytest.mark.parametrize("attitude", [(70.0, 60.0, 0.0), (70.0, 30.0, 0.0)])
+@pytest.mark.parametrize(
+    "attitude", [(70.0, 60.0, 0.0), pytest.param((70.0, 30.0, 0.0), marks=pytest.mark.slow)]
+)
 def test_ground_of_another_place_does_not_end_the_search_with_confidence(
     opened, grey, relief, attitude
 ):

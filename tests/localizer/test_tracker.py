@@ -247,7 +247,9 @@ def tracking(localizer):
     return tracker, seen[12:]
 
 
-@pytest.mark.parametrize("picture", ["mirrored", "noise", "cloud", "turned"])
+@pytest.mark.parametrize(
+    "picture", ["mirrored", pytest.param("noise", marks=pytest.mark.slow), "cloud", "turned"]
+)
 def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, tracking, picture):
     """The views overlap, and the reported velocity is reversed."""
     before, ahead = tracking
@@ -382,7 +384,9 @@ def tilt_estimated_twice(localizer, grey, telemetry):
     return found
 
 
-@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (7.0, 0.0), (-5.0, 4.0)])
+@pytest.mark.parametrize(
+    "tilt_deg", [pytest.param((0.0, 0.0), marks=pytest.mark.slow), (7.0, 0.0), (-5.0, 4.0)]
+)
 def test_tilt_is_estimated_from_perspective(localizer, tilt_deg):
     places = np.random.default_rng(5).uniform(-100, 100, (8, 2))
     means, offs = [], []

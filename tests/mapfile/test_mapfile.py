@@ -126,7 +126,7 @@ def test_no_flipped_bit_goes_unnoticed(path, content):
         assert same_as_written(opened), f"byte {place}"  # such as 1e-05 become 1E-05
 
 
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(data=st.data())
 def test_whatever_is_done_to_a_map_only_our_errors_come_out(tmp_path_factory, content, data):
     path = tmp_path_factory.getbasetemp() / "mutated.onav"

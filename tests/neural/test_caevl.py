@@ -113,6 +113,7 @@ def test_learning_and_what_flies(tmp_path):
     np.testing.assert_allclose(flown.views(sheet().batch(np.arange(4))), embedded, atol=1e-5)
 
 
+@pytest.mark.slow  # auto-encoders resume in every run
 def test_fine_tuning_changes_the_encoder_and_resumes(tmp_path):
     whole = learn(tmp_path / "whole").embedder.onnx
     shorter = dataclasses.replace(RECIPE, tuning_epochs=1)

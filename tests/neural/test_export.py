@@ -77,6 +77,7 @@ def test_reduced_precisions_are_smaller_and_close_to_float32(kind, precision, mo
     assert least_cosine_between(seen, expected) == pytest.approx(made.cosine[precision], abs=1e-5)
 
 
+@pytest.mark.slow  # a whole training gives the same bytes in every run
 def test_the_same_weights_give_the_same_bytes():
     for precision in export.LEAST_COSINE:
         encoder, recipe = encoder_and_recipe("triplet", 32, precision=precision)

@@ -145,7 +145,10 @@ def test_an_interrupted_training_resumes_with_the_same_result(recipe, tmp_path):
 
 @pytest.mark.parametrize(
     ("recipe", "at"),
-    [(AUTO, "epoch 1 of 3, batch 2"), (TRIPLET, "epoch 2 of 3, batch 3")],
+    [
+        (AUTO, "epoch 1 of 3, batch 2"),
+        pytest.param(TRIPLET, "epoch 2 of 3, batch 3", marks=pytest.mark.slow),
+    ],
     ids=["autoencoder", "triplet"],
 )
 def test_a_training_killed_within_an_epoch_resumes_within_it(recipe, at, tmp_path, monkeypatch):

@@ -652,7 +652,7 @@ def test_a_subscriber_whose_qos_cannot_match_is_named(env, peer, publishing):
 # The whole command in a process of its own, over the loopback.
 
 HEADING, SPEED_MPS, COUNT, EVERY_S = 60.0, 14.0, 30, 0.4
-ENOUGH = 5
+ENOUGH = 3
 
 
 @pytest.fixture(scope="module")

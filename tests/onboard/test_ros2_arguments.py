@@ -1,7 +1,7 @@
 """Names, remapping rules and parameters as a ROS 2 node resolves them."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthonav.errors import VariantError
@@ -79,6 +79,7 @@ def test_an_invalid_domain_is_refused(text):
 token = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 
 
+@settings(max_examples=20)
 @given(st.lists(token, max_size=3), st.lists(token, min_size=1, max_size=3), token)
 def test_expansion_is_absolute_and_idempotent(space, name, node):
     made = RosArguments(node=node, namespace="/" + "/".join(space))

@@ -191,7 +191,7 @@ CHANGES = {
     "change",
     [
         CHANGES["seed"],
-        CHANGES["edges"],
+        pytest.param(CHANGES["edges"], marks=pytest.mark.slow),
         pytest.param(CHANGES["tiles"], marks=pytest.mark.slow),
     ],
     ids=CHANGES.keys(),

@@ -171,7 +171,7 @@ def test_views_of_crops_are_vertical_with_telemetry_errors(localizer):
     [
         ((0, 0), FLOOR_LIMITS_PX[0]),
         ((-2, 1), 5**0.5 / 1.1774),
-        ((6, 3), FLOOR_LIMITS_PX[1]),
+        pytest.param((6, 3), FLOOR_LIMITS_PX[1], marks=pytest.mark.slow),
     ],
 )
 def test_the_floor_is_the_offset_of_the_other_date(localizer, moved_px, expected):

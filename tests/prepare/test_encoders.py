@@ -25,6 +25,8 @@ METHODS = {
     "triplet:width=4,epochs=1,batch=64": NetworkEmbedder,
     "bovw:words=256": WordsEmbedder,
 }
+TRAINED = ("autoencoder", "caevl", "triplet")
+"""Networks: a map of one is flown in the tests of networks in every run."""
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,7 @@ def built(area, tmp_path_factory):
 @pytest.mark.parametrize(
     "method",
     [
-        pytest.param(each, marks=pytest.mark.slow if each.startswith(("caevl", "triplet")) else ())
+        pytest.param(each, marks=pytest.mark.slow if each.startswith(TRAINED) else ())
         for each in METHODS
     ],
 )

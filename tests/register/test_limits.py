@@ -18,7 +18,7 @@ from orthonav.register.search import search
 
 
 @pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
-@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("level", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_errors_on_a_part_of_the_map_are_as_large_as_the_covariance_says(hole, level):
     valid = np.ones(SHAPE, bool)
     valid[hole] = False

@@ -375,6 +375,7 @@ def test_guesses_have_a_colour_of_their_own(visit, small, tmp_path):
         assert painted(page.picture(), page.colour("low"), place) > 15
 
 
+@pytest.mark.slow  # the contrast of dark colours is tried in every run
 def test_in_the_dark(visit, server, columns):
     """Other colours, and also those of the canvases, and changed while the page is open."""
     page = visit(server, color_scheme="dark")
