@@ -265,6 +265,7 @@ def rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (package / "__init__.py").write_text("")
     (package / "templates" / "page.html").write_text(PAGE)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, package.name, raising=False)  # of another test's folder
 
     def render_page(text: str, **more) -> str:
         drawn = Figure("map", text, text, figure("map").drawing)
