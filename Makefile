@@ -15,7 +15,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 EXTRAS ?= dev
 DEPENDS := pyproject.toml constraints.txt
 
-.PHONY: demo test test-slow lint format bench paper docs clean
+.PHONY: demo test test-long test-slow lint format bench paper docs clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
@@ -23,9 +23,13 @@ demo: $(VENV)/.run-installed
 test: $(VENV)/.$(EXTRAS)-installed
 	$(PYTEST)
 
-# Minutes each: their limits are longer.
+# Seconds each.
+test-long: $(VENV)/.$(EXTRAS)-installed
+	$(PYTEST) -m "long and not slow"
+
+# All, those of minutes too: the limits are longer.
 test-slow: $(VENV)/.dev-installed
-	$(PYTEST) -m "slow or not slow" -o timeout=1800 -o faulthandler_timeout=1900
+	$(PYTEST) -m "" -o timeout=1800 -o faulthandler_timeout=1900
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .

@@ -53,14 +53,16 @@ def pytest_collection():
 
 
 LONGEST = (
-    "test_in_browser.py",
     "test_cli.py",
-    "test_platforms.py",
-    "test_tracker.py",
-    "test_check_page.py",
-    "test_demo.py",
+    "test_in_browser.py",
     "test_ros2.py",
+    "test_demo.py",
+    "test_check_command.py",
+    "test_tracker.py",
+    "test_platforms.py",
+    "test_check_page.py",
     "test_build.py",
+    "test_fly.py",
     "test_mixture.py",
 )
 

@@ -217,6 +217,7 @@ def test_localize_without_heading(run, map_path, flight_path, out):
     assert json.loads(known.out)["n_none"] == 3 and json.loads(unknown.out)["n_none"] == 0
 
 
+@pytest.mark.long
 def test_localize_as_a_track(run, map_path, flight_path, out):
     """Views of places that have nothing to do with each other: each is searched for."""
     few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
@@ -234,6 +235,7 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
     refused(off, "registration layer")
 
 
+@pytest.mark.long
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out, monkeypatch):
     monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other set-ups are not tried
     mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
@@ -308,6 +310,7 @@ def test_a_map_of_another_area_is_named(run, map_path, flight_path, out):
         )
 
 
+@pytest.mark.long
 def test_a_wrong_heading_is_no_success(run, map_path, flight_path, out):
     """Turned by 180 deg, and in radians."""
     few = shorten(shutil.copytree(flight_path, out / "flight"), 5)
@@ -813,6 +816,7 @@ def test_an_interrupt_leaves_nothing(run, writing, out, monkeypatch, name, stage
     assert nothing_in(out)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name, stage, number",
     [
@@ -845,6 +849,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.long
 def test_a_killed_build_leaves_the_old_map(writing, out, names_in):
     (out / "map.onav").write_bytes(b"an older map")
     popen = process(*writing["build"], script=KILLED)

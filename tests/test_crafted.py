@@ -21,6 +21,8 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map, write_map
 from orthonav.sources.cameras import read_camera_file
 
+pytestmark = pytest.mark.long
+
 GOLDEN = Path(__file__).parent / "data" / "golden_v1.onav"
 MEMORY_BYTES = 3 * 2**29
 """Address space of a command that refuses; a picture of 2^30 pixels needs more."""

@@ -35,6 +35,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr("orthonav.prepare.BuildRequest", quicker)
 
 
+@pytest.mark.long
 def test_the_demo(small_demo, tmp_path, capsys, names_in):
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out)]) == 0

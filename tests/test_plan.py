@@ -162,6 +162,7 @@ def test_help_loads_no_heavy_library():
     assert done.stdout.startswith("usage: orthonav plan") and done.stdout.endswith("set()\n")
 
 
+@pytest.mark.long
 def test_the_bands_of_a_route_are_built_and_it_is_flown(run, make_ortho, tmp_path):
     """The tiles of the map are those that the plan counted; `simulate` reads the same file."""
     ortho = make_ortho(tmp_path / "past.tif", gsd_m=2.0)  # 800 m across

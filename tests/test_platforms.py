@@ -64,6 +64,7 @@ def test_a_fix_elsewhere_and_a_missing_one_are_differences():
     assert fixes.digest({**there, "a": [1.01, 2.0]}) != fixes.digest(there)
 
 
+@pytest.mark.long
 def test_odd_folders_and_a_poor_environment(odd_folder):
     """Placed and reported, with nothing on stderr."""
     environment = NO_LOCALE | NO_HOME
@@ -89,6 +90,7 @@ def test_imagery_whose_name_the_locale_lacks_is_refused(tmp_path, make_ortho):
     assert done.code == 1 and done.err.count("\n") == 1 and "PYTHONUTF8=1" in done.err
 
 
+@pytest.mark.long
 def test_no_network_is_needed(odd_folder, tmp_path):
     alone = ["unshare", "--map-root-user", "--net"]
     if subprocess.run([*alone, "true"], capture_output=True).returncode:

@@ -219,6 +219,7 @@ def test_a_worker_that_sees_other_imagery_refuses(ortho, tmp_path):
         build_sheet(task)
 
 
+@pytest.mark.long
 def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     ortho, tmp_path, monkeypatch, run, built
 ):

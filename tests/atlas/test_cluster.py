@@ -140,6 +140,7 @@ def fake_ray(monkeypatch):
     return made
 
 
+@pytest.mark.long
 def test_an_atlas_built_by_tasks_of_ray_is_the_same(fake_ray, ortho, tmp_path):
     bounds_deg = two_sheets(ortho)
     alone = plain(tmp_path / "alone", ortho, SMALL, bounds_deg)

@@ -65,6 +65,7 @@ def _truth(flown):
     return {line.split(",")[0]: tuple(map(float, line.split(",")[1:3])) for line in lines}
 
 
+@pytest.mark.long
 def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, run):
     """The whole command, once."""
     out = tmp_path / "fixes.jsonl"

@@ -182,6 +182,7 @@ def shares(found: ChangedGround, crs, corners):
     return found.changed[seen & inside].mean(), found.changed[seen & beyond].mean()
 
 
+@pytest.mark.long
 def test_localize_and_evaluate_report_what_was_built(run, built_over, map_path, tmp_path):
     folder, crs, corners = built_over
     fixes, out, again = (tmp_path / name for name in ("fixes.jsonl", "a.geojson", "b.geojson"))

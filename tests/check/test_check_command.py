@@ -72,6 +72,7 @@ def tried(half_blank):
     return result, said
 
 
+@pytest.mark.long
 def test_the_half_that_shows_something_is_where_views_are_placed(tried):
     result, said = tried
     west, east = halves(result.cells)
@@ -80,6 +81,7 @@ def test_the_half_that_shows_something_is_where_views_are_placed(tried):
     assert {what for what, _ in said} == {"trials"} and said[-1][1] == 1.0
 
 
+@pytest.mark.long
 def test_the_values_of_a_check(tried):
     result, _ = tried
     cells = result.cells
@@ -353,6 +355,7 @@ def route_path(frame, tmp_path):
 VIEWS = ("--agl-m", "170", "--prior-std-m", "50", "--workers", "1")
 
 
+@pytest.mark.long
 def test_command(run, untried, half_blank, route_path, tmp_path):
     out = tmp_path / "report"
     done = run(

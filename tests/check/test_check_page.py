@@ -277,6 +277,7 @@ def test_the_page_comes_alive(visit, name):
         page.select_option("#layer", name)
 
 
+@pytest.mark.long
 def test_profile_and_map_are_linked(visit):
     page = visit("small_route")
     page.locator("#profile").scroll_into_view_if_needed()
@@ -358,6 +359,7 @@ def test_scripts_write_numbers_as_python_does(browser):
     assert percents == [share_text(each) for each in shares]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_rules_of_accessibility(visit, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()

@@ -112,6 +112,7 @@ def test_a_prior_far_from_the_map(plan):
     assert len(run_trials(none, WEST[:1])) == 1
 
 
+@pytest.mark.long
 def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
     """And of another date: what is beside a trial changes nothing."""
     monkeypatch.setattr(trials, "AT_ONCE", 2)
@@ -128,6 +129,7 @@ def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["killed", pytest.param("interrupted", marks=pytest.mark.slow)])
 def test_workers_always_end(plan, how):
     def stop(_):

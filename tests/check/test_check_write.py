@@ -75,6 +75,7 @@ def tree(folder):
     return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.long
 def test_the_same_check_gives_the_same_bytes(written, opened, tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.report.canvas.DPI", 20)
     result, folder = written

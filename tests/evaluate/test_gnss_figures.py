@@ -84,6 +84,7 @@ def test_codes_of_faults_are_read_safely():
     assert fault_of({"gnss_fault": STEP}) == "gnss_step"
 
 
+@pytest.mark.long
 def test_the_report_has_the_figure(tmp_path, run, only_new):
     fixes, true = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
     write_results(fixes, RESULTS)

@@ -250,6 +250,7 @@ def test_pictures_leave_the_users_settings_alone() -> None:
     matplotlib.rcParams["font.size"] = 10.0
 
 
+@pytest.mark.long
 def test_matplotlib_is_imported_for_drawing_and_pyplot_never() -> None:
     code = (
         "import sys, orthonav.evaluate.report\n"

@@ -61,6 +61,7 @@ def test_every_figure_of_the_page_is_a_file(drawn: Path) -> None:
         assert re.match(r'<img alt="one: [^"]{20,}" width="\d+" height="\d+" src="data:', tag)
 
 
+@pytest.mark.long
 def test_reports_are_reproducible(drawn: Path, tmp_path: Path, coarse) -> None:
     write_report(tmp_path / "again", [flown("one")])
     first, second = (

@@ -288,6 +288,7 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
         assert "nan" not in text.lower() and "inf" not in text.lower()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("errors", "states", "named"),
     [
@@ -398,6 +399,7 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
     return bool((np.abs(image - wanted).max(axis=2) < 25).sum() > 8)
 
 
+@pytest.mark.long
 def test_pictures_tell_states_apart_by_colour(monkeypatch) -> None:
     monkeypatch.setattr("orthonav.report.canvas.DPI", 80)
     states = ["searching"] * 10 + ["tracking"] * 10 + ["coasting"] * 5 + ["lost"] * 5

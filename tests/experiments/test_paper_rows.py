@@ -49,6 +49,7 @@ def test_the_page_is_made_of_the_rows_in_the_repository():
     assert PAGE.read_text(encoding="utf-8") == page(stored.stored(), stored.tried())
 
 
+@pytest.mark.long
 def test_a_row_of_todays_code_is_current():
     assert stored.older(row()) == []
     assert stored.older(row("gradient-gradient-registration")) == []

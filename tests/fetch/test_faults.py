@@ -188,6 +188,7 @@ def command_for(server, bounds, out):
     return [sys.executable, "-c", KILLED, "fetch", *area, "--source", source(server), "--out", out]
 
 
+@pytest.mark.long
 def test_a_killed_fetch_resumes(take, tmp_path, names_below):
     """SIGKILL after some tiles; the same fetch then asks only for the rest."""
     out = tmp_path / "ortho.tif"

@@ -76,6 +76,7 @@ def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_below):
     assert names_below(tmp_path) == []
 
 
+@pytest.mark.long
 def test_keys_never_appear(command, area, tmp_path, monkeypatch):
     """Not in messages, tags, names of the cache, nor with -v in what libraries say."""
     monkeypatch.setenv("MY_KEY", SECRET)

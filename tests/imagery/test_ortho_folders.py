@@ -253,6 +253,7 @@ def test_tile_stores_are_read_at_their_finest(tmp_path, driver, suffix):
     assert off.mean() < 6  # GDAL resamples into the store's own zoom levels
 
 
+@pytest.mark.long
 def test_all_tables_of_a_geopackage(tmp_path):
     if "gpkg" not in raster_driver_extensions():
         pytest.skip("this GDAL has no GPKG driver")
@@ -299,6 +300,7 @@ def test_naip_swissimage_and_drones(tmp_path):
     assert len(mixed.sources) == 3 and len(mixed.describe()) == 3
 
 
+@pytest.mark.long
 def test_build_from_a_folder(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
     folder = tmp_path / "ortho_2019"

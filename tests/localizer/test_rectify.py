@@ -185,6 +185,7 @@ def test_a_picture_beyond_the_horizon_is_not_valid():
     assert not view.valid[np.broadcast_to(north, east.shape) < -AGL_M / math.tan(0.767)].any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "lens, size", [pytest.param("pinhole", (800, 600), marks=pytest.mark.slow), ("all", (803, 599))]
 )

@@ -224,6 +224,7 @@ def looking(opened, relief, **changes):
     return localizer
 
 
+@pytest.mark.long
 def test_a_place_that_stands_out_on_the_terrain_ends_the_search(opened, grey, relief):
     """Unless it is doubtful; also where the time is limited."""
     attitude, place = (70.0, 60.0, 0.0), np.array([-60.0, -120.0])
@@ -240,6 +241,7 @@ def test_a_place_that_stands_out_on_the_terrain_ends_the_search(opened, grey, re
     assert limited.evidence["candidates"] == early.evidence["candidates"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "attitude", [(70.0, 60.0, 0.0), pytest.param((70.0, 30.0, 0.0), marks=pytest.mark.slow)]
 )

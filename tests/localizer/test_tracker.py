@@ -119,6 +119,7 @@ def test_a_flight_is_followed(usual):
     assert last.evidence["vel_north_mps"] == pytest.approx(SPEED_MPS * math.cos(0.61), abs=3)
 
 
+@pytest.mark.long
 def test_biases_of_heading_height_and_mount_are_estimated(localizer):
     """Uncorrected, 5 deg of pitch are 13 m from 150 m."""
     tracker = Tracker(localizer)
@@ -186,6 +187,7 @@ def out_and_back():
         place = place + np.array([20.0 if number < 16 else -20.0, 0.0])
 
 
+@pytest.mark.long
 def test_a_flight_that_leaves_the_map_is_dead_reckoned_and_found_again(localizer):
     tracker = Tracker(localizer)
     rows = followed(tracker, localizer, views(0, where=out_and_back()))
@@ -197,6 +199,7 @@ def test_a_flight_that_leaves_the_map_is_dead_reckoned_and_found_again(localizer
     assert rows[-1][2] == "tracking" and errors[-1] < 8
 
 
+@pytest.mark.long
 def test_without_usable_views_the_track_is_lost_and_found_again(localizer):
     tracker = Tracker(localizer)
     followed(tracker, localizer, views(9))
@@ -214,6 +217,7 @@ def test_without_usable_views_the_track_is_lost_and_found_again(localizer):
     assert rows[-1][2] == "tracking" and rows[-1][0] < 8
 
 
+@pytest.mark.long
 def test_views_that_show_nothing_are_bridged(localizer):
     tracker = Tracker(localizer)
     rows = []
@@ -289,6 +293,7 @@ def test_a_reported_start_needs_no_search(localizer):
     assert all(each.parent == -1 for each in unused.mixture.hypotheses)
 
 
+@pytest.mark.long
 def test_a_start_that_was_reported_wrongly_is_left(localizer):
     tracker, seen = Tracker(localizer), list(views(19))
     lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, 30.0))  # 150 m from the true place
@@ -506,6 +511,7 @@ def test_odometry_refuses_views_without_common_ground():
     assert blank is None or displacement(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
 
 
+@pytest.mark.long
 def test_a_fixed_lag_uses_the_views_after_each(localizer, usual):
     seen, whole, _ = usual
     lagged = Tracker(localizer, smooth=True, lag=3)
@@ -548,6 +554,7 @@ def test_the_radius_grows_with_the_height(localizer):
     assert low.radius_m == localizer.registration.radius_m
 
 
+@pytest.mark.long
 def test_a_reversed_heading_confirms_no_track(localizer):
     """Ground looks alike when rotated by 180 deg: single views fit somewhere, no track follows."""
     tracker = Tracker(localizer)
@@ -556,6 +563,7 @@ def test_a_reversed_heading_confirms_no_track(localizer):
     assert all(row[2] == "searching" for row in rows)
 
 
+@pytest.mark.long
 def test_a_wrong_place_found_after_a_loss_does_not_bias_the_search(localizer):
     """Heading and height of a wrong place must not keep the true one from being found."""
     tracker, seen = Tracker(localizer), list(views(22, year=lit))

@@ -86,6 +86,7 @@ def mutations(part, rng):
     yield np.concatenate([part, part])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(golden()[1]))
 def test_any_values_of_a_part_give_our_errors(tmp_path, name, caplog):
     rng = np.random.default_rng(len(name))
@@ -135,6 +136,7 @@ print([main(arguments) for arguments in json.loads(sys.argv[1])], file=sys.stder
 """
 
 
+@pytest.mark.long
 def test_crafted_maps_print_no_traceback(tmp_path, flight_path):
     """Commands in a process of its own, whose memory is limited."""
 

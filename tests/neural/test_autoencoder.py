@@ -43,6 +43,7 @@ def test_invalid_sizes_are_refused(bad):
         AutoEncoder(**{"tile_px": 64, "width": 8, "dims": 8, **bad})
 
 
+@pytest.mark.long
 def test_only_binary_inputs_end_in_a_sigmoid():
     pictures = []
     for binary in (True, False):

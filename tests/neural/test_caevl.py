@@ -101,6 +101,7 @@ def test_an_augmented_tile_shows_what_it_says(seed):
     assert (weights * y).sum() / weights.sum() == pytest.approx(32, abs=0.7)
 
 
+@pytest.mark.long
 def test_learning_and_what_flies(tmp_path):
     said = []
     trained = learn(tmp_path, report=lambda text, share: said.append((text, share)))

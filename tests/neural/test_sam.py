@@ -594,6 +594,7 @@ def test_the_environment_may_name_the_weights(weights, monkeypatch):
         variant("")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("per", [pytest.param("sheet", marks=pytest.mark.slow), "tile"])
 def test_a_network_learns_from_the_boundaries_of_sheets_or_tiles(
     per, weights, area, tmp_path, monkeypatch

@@ -91,6 +91,7 @@ def kill_at(beginning):
     return report
 
 
+@pytest.mark.long
 def test_the_auto_encoder_learns_to_reconstruct_the_area(tmp_path):
     messages = []
     learn(
@@ -127,6 +128,7 @@ def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
     assert found[1] > 0.75  # rounding differs between machines and numbers of threads
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "recipe",
     [AUTO, pytest.param(TRIPLET, marks=pytest.mark.slow)],

@@ -5,6 +5,8 @@ import pytest
 from computed_flights import FAR_M, ComputedFlight, sent, straight
 from flown import Flown
 
+pytestmark = pytest.mark.long
+
 START_S = 6.0
 STALL_S = 20.0
 

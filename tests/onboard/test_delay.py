@@ -55,6 +55,7 @@ class Measured:
         return np.array([each.delay_s - true for each, true in pairs if each.found])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "delay_s",
     [pytest.param(0.0, marks=pytest.mark.slow), 0.12, pytest.param(8.0, marks=pytest.mark.slow)],
@@ -85,6 +86,7 @@ def test_a_drift_is_followed():
     )
 
 
+@pytest.mark.long
 def test_a_step_is_found_within_the_recent_pictures():
     seen = Measured(Flown(70, seed=4), lambda at: 0.1 if at < 40 else 2.1, seconds=56)
     after = [each for each in seen.recent if each.last_ns > 49 * S and each.found]
@@ -135,6 +137,7 @@ def test_a_rotated_camera_contradicts_the_autopilot():
     assert not any(each.found for each in seen.whole + seen.recent)
 
 
+@pytest.mark.long
 def test_clouds_over_a_part_do_no_harm():
     seen = Measured(Flown(40, seed=7), lambda _: 0.12, change=clouded, seconds=30)
     errors = seen.errors(seen.whole)

@@ -12,6 +12,8 @@ from blots import AGL_M, GROUND, as_grey, known_map, rendered
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 
+pytestmark = pytest.mark.long
+
 FAULTS = {each.name: each for each in (*CAMERA_FAULTS, *TELEMETRY_FAULTS, *COMBINED_FAULTS)}
 LEAD_S = 9.0
 

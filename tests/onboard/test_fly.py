@@ -724,6 +724,7 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
     assert states.load(state).lat_deg == pytest.approx(confident[-1][1].outcome.lat_deg)
 
 
+@pytest.mark.long
 def test_gnss_of_a_recording_is_compared(flown, paced, run, tmp_path):
     """A receiver that jumps away at the middle of the flight; views carry its position."""
     path, recorded, frame, truth = flown
@@ -759,6 +760,7 @@ def test_gnss_of_a_recording_is_compared(flown, paced, run, tmp_path):
     assert b"/orthonav/gnss" in log
 
 
+@pytest.mark.long
 def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp_path):
     """A process is killed in flight; the next one starts from the position that it saved."""
     path, folder, _, _ = flown
@@ -789,6 +791,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     assert code == 0  # a clean stop
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [

@@ -92,6 +92,7 @@ def begin(tmp_path):
         each.runner._publisher.close()
 
 
+@pytest.mark.long
 def test_agreement_is_no_reason(begin):
     flight = begin()
     flight.views(160, wait_s=0.5)
@@ -107,6 +108,7 @@ def test_agreement_is_no_reason(begin):
     assert last["gnss_fault"] == 0 and last["gnss_std_m"] == 1.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("receiver", ["gps_raw_int", "gps2_raw"])
 def test_a_step_is_reported_everywhere(begin, receiver):
     flight = begin(receiver=receiver)
@@ -137,6 +139,7 @@ def test_named_values_are_sent_once_a_second(begin):
     assert "gnss_lost" in flight.reasons()
 
 
+@pytest.mark.long
 def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
     begin, tmp_path, monkeypatch
 ):

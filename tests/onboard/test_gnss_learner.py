@@ -103,6 +103,7 @@ def test_constant_airspeed_does_not_separate_mount_and_latency():
     assert found.stds[3] < 0.015  # across it there is nothing but the mount
 
 
+@pytest.mark.long
 def test_stated_deviations_are_those_of_the_errors():
     """Correlated errors, two flights: errors squared over their covariance are about 1."""
     nees = []

@@ -72,6 +72,7 @@ def test_agreement_is_reached_and_the_displacement_learnt():
     assert status.difference_en_m == pytest.approx([25, -10], abs=2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "seconds", "names"),
     [
@@ -136,6 +137,7 @@ def test_a_drag_off_that_was_learnt_is_named_and_undone():
     assert air.fly(90).state is State.GOOD  # it agrees with what was known before
 
 
+@pytest.mark.long
 def test_a_latency_does_not_make_a_step_where_the_aircraft_rolls():
     """Turns at 25 m/s and 300 m with images 0.3 s late displace views by 20 m for seconds."""
     errors = replace(MAPS["usual"], late_s=0.3, gaps_per_hour=0.0, outlier_share=0.0)
@@ -167,6 +169,7 @@ def test_a_constant_offset_from_the_start_counts_as_displacement_of_an_unknown_m
     assert not air.monitor.learnt.is_plausible  # but it is named
 
 
+@pytest.mark.long
 def test_a_return_is_announced_after_agreement_only():
     air = Air()
     air.fly(400)

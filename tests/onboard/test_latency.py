@@ -173,6 +173,7 @@ def test_without_a_stated_latency_a_straight_flight_sends_nothing():
     assert flight.fly(15) == []
 
 
+@pytest.mark.long
 def test_a_stream_that_is_late_from_the_start():
     """The stated latency is compared with the first images before it is used; then it is
     measured, and positions are withheld as stale."""
@@ -185,6 +186,7 @@ def test_a_stream_that_is_late_from_the_start():
     assert flight.gate.withheld["stale"] > 31
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("late_s", "stamps"), [(0.7, False), pytest.param(8.0, True, marks=pytest.mark.slow)]
 )
@@ -212,6 +214,7 @@ def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     assert flight.monitor.plain()["latency"] == "stated"
 
 
+@pytest.mark.long
 def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
     straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12))
@@ -256,6 +259,7 @@ def test_mirrored_and_rotated_images_give_no_latency(change):
     assert flight.reasons() & {"latency_unknown", "motion_mismatch"}
 
 
+@pytest.mark.long
 def test_a_camera_that_freezes_with_noise_is_noticed():
     flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
     flight.fly(8)

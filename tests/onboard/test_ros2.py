@@ -362,6 +362,7 @@ def test_simulated_time_is_that_of_the_clock(peer, reading):
     assert then_ns <= flying.reader.now_ns() < then_ns + 60 * S
 
 
+@pytest.mark.long
 def test_a_missing_clock_is_logged_and_images_are_ignored(peer, reading, caplog):
     advertised(peer, "/cam/image_raw", "/imu/data", "/range")
     flying = reading("-p", "use_sim_time:=true")
@@ -381,6 +382,7 @@ def test_a_camera_that_is_not_calibrated_is_refused(peer, reading):
         flying.reader.wait_for_camera()
 
 
+@pytest.mark.long
 def test_the_wait_for_camera_info_is_logged(reading, caplog):
     flying = reading()
     flying.deadline = time.monotonic() + 1.5
@@ -743,6 +745,7 @@ def replayed(peer, bag, lines, sim_time):
     return begin_ns + shift_ns
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sim_time", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_replayed_bag_is_flown(flown, env, peer, tmp_path, sim_time):
     path, bag, frame, truth = flown
@@ -789,6 +792,7 @@ def test_a_replayed_bag_is_flown(flown, env, peer, tmp_path, sim_time):
     assert (first.latitude, first.longitude) == (10.0, 20.0)
 
 
+@pytest.mark.long
 def test_sigterm_ends_the_wait_for_camera_info(flown, env, peer, tmp_path):
     """On the loopback by ROS_LOCALHOST_ONLY, as ROS users ask for it."""
     errors = tmp_path / "errors"

@@ -64,6 +64,7 @@ def test_a_wrong_height_is_found_with_its_ratio(registering, views):
     assert others == f"also tried: twice the height ({failed[0].confident} of 1)"
 
 
+@pytest.mark.long
 def test_mirrored_images_are_found(registering, views):
     flipped = [
         View(np.ascontiguousarray(v.grey[:, ::-1]), mirrored_camera(v.camera), v.telemetry)

@@ -171,6 +171,7 @@ KILLED = """
 """
 
 
+@pytest.mark.long
 def test_a_killed_build_resumes(ortho, tmp_path, reads, names_in, whole):
     out = tmp_path / "killed.onav"
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), ortho, out], check=False)
@@ -207,6 +208,7 @@ def test_another_request_uses_nothing(ortho, tmp_path, reads, names_in, change):
     assert names_in(out.parent) == ["map.onav"]
 
 
+@pytest.mark.long
 def test_changed_imagery_is_read_again_where_it_is_needed(make_ortho, tmp_path, reads):
     """Two files side by side; one of them is replaced after the build was interrupted."""
     grey = textured((300, 800))

@@ -133,6 +133,7 @@ def test_one_channel_is_compared_on_finer_cells(small_ortho, tmp_path, edges):
     assert stated.manifest.recipe["embed"]["cells"] == 4
 
 
+@pytest.mark.long
 def test_another_seed_changes_the_calibration_only(small_ortho, tmp_path, calibrated):
     a = built(small_ortho, tmp_path, "a.onav", **WITH_LAYER)
     b = built(small_ortho, tmp_path, "b.onav", **WITH_LAYER, seed=1)

@@ -243,6 +243,7 @@ def small(make_ortho, tmp_path, monkeypatch):
     return build
 
 
+@pytest.mark.long
 def test_a_second_date_sets_the_floor_of_a_map(small):
     """The other picture is the same ground, three pixels to the west and one to the south."""
     grey = small.grey

@@ -48,6 +48,7 @@ def built(area, tmp_path_factory):
     return build
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method",
     [

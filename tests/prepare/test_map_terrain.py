@@ -95,6 +95,7 @@ def test_info_shows_the_terrain(run, hill_map, map_path):
     assert json.loads(run("info", map_path, "--json").out)["terrain"] is None
 
 
+@pytest.mark.long
 def test_terrain_of_a_corridor_is_small_and_holes_are_named(tmp_path, caplog):
     def holed(heights):
         heights[100:104, 100:104] = -9999
@@ -164,6 +165,7 @@ def test_a_flight_reports_heights_above_sea_and_take_off(flown):
     assert max(amsl) == pytest.approx(250 + hill(-350, -250), abs=1)
 
 
+@pytest.mark.long
 def test_a_terrain_places_views_that_level_ground_does_not(
     run, flown, map_path, dem, tmp_path, monkeypatch
 ):

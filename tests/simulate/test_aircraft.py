@@ -140,6 +140,7 @@ def test_biases_are_constant(fly):
         assert (a == b).all()
 
 
+@pytest.mark.long
 def test_the_mount_tilt_is_not_reported(fly, ortho, frame):
     """A view shows the ground at the truth if it is levelled with the bias too."""
     bias = Errors(attitude_std_deg=1.0, pitch_bias_deg=4.0, roll_bias_deg=-3.0)

@@ -178,6 +178,7 @@ def test_noise_has_the_promised_spread():
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
 
 
+@pytest.mark.long
 def test_geotiff_has_position_and_date(tmp_path: Path):
     rasterio = pytest.importorskip("rasterio")
     seen: list[float] = []

@@ -56,6 +56,7 @@ def test_a_roof_stands_out_and_hides_the_ground_behind():
     assert beyond.min() == pytest.approx(37.5, abs=1.2)
 
 
+@pytest.mark.long
 def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
     size = {"size_m": (340.0, 320.0), "dates": (AUTUMN,), "seed": 2}
     (ortho,) = generate_area(tmp_path, **size)

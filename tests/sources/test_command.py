@@ -107,6 +107,7 @@ MAKERS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", MAKERS)
 def test_a_source_is_localized_as_its_import_is(run, kind, tmp_path, camera):
     source = MAKERS[kind](tmp_path)

@@ -167,6 +167,7 @@ def lines(results):
     return [result_to_json(replace(result, latency_ms=0.0)) for result in results]
 
 
+@pytest.mark.long
 def test_the_same_fixes_bit_for_bit(full, flight, map_path, tmp_path, run):
     results = flown(full, flight, tmp_path / "log", mount=MOUNT, segment_bytes=200_000)
     assert len(list((tmp_path / "log").iterdir())) > 1

@@ -16,6 +16,8 @@ from orthonav.flight.fixes import result_to_json
 from orthonav.report import metres_text
 from orthonav.web.opening import ViewRequest, open_run
 
+pytestmark = pytest.mark.long
+
 COUNT = len(PLACES_EN_M)
 MANY = 10_000
 MOST_ELEMENTS = 1500
