@@ -124,6 +124,7 @@ def cut(folder, middle, tmp_path_factory):
     return open_map(out)
 
 
+@pytest.mark.long
 def test_a_map_cut_in_memory_is_the_one_that_is_written(folder, middle, cut):
     area = Area.from_bounds(bounds_around(middle, 150))
     made = cut_in_memory(Atlas.open(str(folder)), area)

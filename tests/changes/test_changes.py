@@ -202,6 +202,7 @@ def test_localize_and_evaluate_report_what_was_built(run, built_over, map_path, 
     assert again.read_bytes() == out.read_bytes()
 
 
+@pytest.mark.long
 def test_changes_need_views_and_a_map_that_shows_the_ground(run, built_over, map_path, tmp_path):
     folder, _, _ = built_over
     out = tmp_path / "changes.geojson"

@@ -266,6 +266,7 @@ def visit(browser, folder):
     assert wrong == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["evil", "nearly_empty"])
 def test_the_page_comes_alive(visit, name):
     page = visit(name)
@@ -301,6 +302,7 @@ def test_profile_and_map_are_linked(visit):
     assert abs(int(page.locator("#along").input_value()) - int(there)) <= 1
 
 
+@pytest.mark.long
 def test_keys_reach_everything(visit):
     page = visit("small_route")
     page.focus("#map")

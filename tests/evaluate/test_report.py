@@ -106,6 +106,7 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, only_new) -> None
     assert "Lowe&#39;s ratio" in html
 
 
+@pytest.mark.long
 def test_text_is_escaped(tmp_path: Path, coarse, no_calibration_plots) -> None:
     nasty = '<img src=x onerror="1">&$\\frac'
     flight = made_flight(12, name=nasty)

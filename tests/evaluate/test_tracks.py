@@ -598,6 +598,7 @@ def evaluated(golden_flight, *more, capsys) -> tuple[int, str, str]:
     return code, said.out, said.err
 
 
+@pytest.mark.long
 def test_evaluate_a_track(golden_flight, tmp_path: Path, capsys, only_new) -> None:
     flight = shutil.copytree(golden_flight[0], tmp_path / "flight")
     (flight / "frames" / "0002.jpg").write_bytes(b"no picture")  # said in its row

@@ -55,6 +55,7 @@ def test_a_row_of_todays_code_is_current():
     assert stored.older(row("gradient-gradient-registration")) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "key, path",
     [

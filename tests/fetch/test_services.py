@@ -48,6 +48,7 @@ def test_wmts_in_other_grids(mapproxy, take, crs, gsd_m):
         assert data.res == pytest.approx((gsd_m, gsd_m), abs=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "crs, version",
     [

@@ -71,6 +71,7 @@ def test_marks_lie_where_proj_puts_them(tmp_path, crs, frame, source_gsd_m, turn
     assert np.abs(off.mean(axis=0)).max() < 0.03
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "source_gsd_m, window", [pytest.param(0.3, 200, marks=pytest.mark.slow), (0.2, 63)]
 )

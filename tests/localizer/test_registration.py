@@ -407,6 +407,7 @@ NEGATIVES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name, heading_known", [*((name, True) for name in NEGATIVES), ("another place", False)]
 )

@@ -77,6 +77,7 @@ def test_no_velocity_is_needed():
     assert len(errors) > 5 and np.abs(errors).max() < 0.15
 
 
+@pytest.mark.long
 def test_a_drift_is_followed():
     seen = Measured(Flown(50, seed=3), lambda at: 0.2 + 0.02 * at, seconds=45)
     errors = seen.errors(seen.recent)
@@ -131,6 +132,7 @@ def test_wrong_images_give_no_delay(change):
     assert not any(each.found for each in seen.whole + seen.recent)
 
 
+@pytest.mark.long
 def test_a_rotated_camera_contradicts_the_autopilot():
     seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=32, change=rotated)
     assert sum(each.contradicted for each in seen.whole) >= 3

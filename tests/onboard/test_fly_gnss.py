@@ -253,6 +253,7 @@ def test_neither_heading_nor_mount_is_learnt_from_a_position_without_heading(beg
     assert flight.watch._monitors
 
 
+@pytest.mark.long
 def test_spoofing_never_moves_what_is_sent(begin):
     """Not even one from the first second on, over a long time, where positions are corrected."""
     known = {"d": known_biases(0.0, 0.0, 2.0, 3600.0)}

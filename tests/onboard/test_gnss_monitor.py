@@ -182,6 +182,7 @@ def test_a_return_is_announced_after_agreement_only():
     assert np.hypot(*status.difference_en_m) < 3
 
 
+@pytest.mark.long
 def test_an_outage_needs_agreement_too():
     air = Air()
     air.fly(400)

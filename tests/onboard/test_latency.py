@@ -154,6 +154,7 @@ def test_a_straight_flight_with_a_stated_latency_is_undisturbed():
     assert len(flight.fly(10)) >= 0.98 * (len(flight.results) - before)
 
 
+@pytest.mark.long
 def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
     flight = LateFlight(Flown(70, seed=1), None, constant(0.25))
     assert flight.fly(10) == []

@@ -265,6 +265,7 @@ def test_imagery_with_marks_all_over_calibrates_its_map(small):
     assert small(grey, nodata=0)["confidence"] != USUAL_CONFIDENCE.to_plain()
 
 
+@pytest.mark.long
 def test_a_second_date_without_texture_gives_a_warning(small, caplog):
     with caplog.at_level(logging.WARNING):
         plain = small(small.grey[20:220, 20:220], np.full((200, 200), 99, np.uint8))

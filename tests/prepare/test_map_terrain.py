@@ -157,6 +157,7 @@ def rows(flight):
         return list(csv.DictReader(stream))
 
 
+@pytest.mark.long
 def test_a_flight_reports_heights_above_sea_and_take_off(flown):
     reported = rows(flown)
     assert {row["agl_m"] for row in reported} == {row["home_m"] for row in reported} == {"250"}

@@ -482,6 +482,7 @@ def twins(changed):
     return view, pose, lambda finalist: refiner.place(finalist.pose, 2).score
 
 
+@pytest.mark.long
 def test_one_finer_level_tells_what_coarser_ones_cannot():
     view, pose, finer = twins(changed=0.0)
     found, deep = verified(*view), verified(*view, finer)
@@ -490,6 +491,7 @@ def test_one_finer_level_tells_what_coarser_ones_cannot():
     assert deep.fine_score / deep.fine_rival > found.peak_ratio + 0.1
 
 
+@pytest.mark.long
 def test_the_finer_level_sets_right_what_coarser_ones_take_for_its_twin():
     view, pose, finer = twins(changed=0.9)
     assert apart_px(verified(*view).placed.pose, pose) > 300
