@@ -40,6 +40,20 @@ def test_a_small_view_is_finished_where_it_is_judged():
     assert {each.candidates for each in searches} == {DEFAULT_PLAN.stage_candidates}
 
 
+def test_where_the_coarse_level_takes_too_long_the_level_above_is_searched():
+    pose_ms = {3: 1.0, 2: 1e3, 1: 1e4, 0: 1e5}
+    (search,) = DEFAULT_PLAN.searches(
+        LEVELS, TRACKED, lambda level, poses: poses * pose_ms[level], lambda: (0, 0)
+    )
+    assert search.level == 3 and search.candidates == DEFAULT_PLAN.far_candidates
+    pose_ms[3] = math.inf  # there is no such level
+    assert not list(
+        DEFAULT_PLAN.searches(
+            LEVELS, TRACKED, lambda level, poses: poses * pose_ms[level], lambda: (0, 0)
+        )
+    )
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that only moves when advanced, s."""
@@ -71,9 +85,8 @@ def test_nothing_is_begun_after_the_budget_is_spent(clock):
 
 def test_more_tiles_give_more_candidates_within_bounds():
     least, most = DEFAULT_PLAN.tile_candidates
-    counts = [DEFAULT_PLAN.candidates_from(tiles, True) for tiles in (1, 8_000, 10**6)]
+    counts = [DEFAULT_PLAN.candidates_from(tiles) for tiles in (1, 8_000, 10**6)]
     assert counts == [least, 8_000 // DEFAULT_PLAN.tiles_per_candidate, most]
-    assert DEFAULT_PLAN.candidates_from(10**6, False) == DEFAULT_PLAN.tile_candidates_any_heading
 
 
 @pytest.mark.parametrize("tiles, from_tiles", [(10_000, True), (0, False)])
@@ -83,5 +96,5 @@ def test_tiles_come_first_where_they_are_the_cheaper_way(tiles, from_tiles):
     )
     assert first.from_tiles == from_tiles and first.level == LEVELS.coarse
     if from_tiles:
-        assert first.candidates == DEFAULT_PLAN.candidates_from(tiles, True)
+        assert first.candidates == DEFAULT_PLAN.candidates_from(tiles)
         assert DEFAULT_PLAN.enough(first, LEVELS) == DEFAULT_PLAN.clear_at_judged

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.register import refine, template
+from orthonav.register import refine, search, template
 from orthonav.register.kernel import KERNEL
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Refiner
+from orthonav.register.scale_map import ScaleMap
+from orthonav.register.search import SearchWindow, bank, best_near
 
 SHAPE = (256, 320)
 GROUND = Ground()
@@ -27,7 +29,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (refine, template):
+    for module in (refine, search, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -138,3 +140,69 @@ def test_other_arrays_are_refused(damage):
         view = view[:, ::2]
     with pytest.raises(ValueError, match=r"expected|contiguous"):
         KERNEL.refine(window, view, slopes, numbers, (0, 0, 0, 0), (0,) * 9)
+
+
+SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
+"""Heights and widths of windows, searched in transforms of all factors and odd lengths."""
+
+
+@needs_kernel
+@pytest.mark.parametrize("with_scales", [False, True])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_a_search_finds_the_same_scores_and_poses(reference, monkeypatch, size, with_scales):
+    made, _ = next(views(1, 7, 1))
+    poses = bank(None, 0.1, turn_step_rad=0.6, scale_step=0.13, sigmas=2).poses
+    values = np.random.default_rng(2).uniform(-0.3, 0.3, (9, 11)).astype(np.float32)
+    scales = ScaleMap(values, 40.0, 0.05) if with_scales else None
+
+    def work():
+        window = SearchWindow(reference.window(1, 10, -20, *size), 1, 10, -20, 60)
+        window.prepare()
+        return search._best_of(made, window, poses, range(2, len(poses)), scales)
+
+    (scores, numbers), (plain_scores, plain_numbers) = both(monkeypatch, work)
+    assert scores.shape == size
+    assert np.isfinite(scores).tolist() == np.isfinite(plain_scores).tolist()
+    seen = np.isfinite(scores)
+    assert scores[seen] == pytest.approx(plain_scores[seen], rel=1e-5, abs=1e-4)
+    # Where two poses score alike, rounding decides.
+    differs = (numbers != plain_numbers) & (abs(plain_scores) > 1e-3)
+    assert differs[seen].sum() <= 1e-3 * seen.sum()
+
+
+@needs_kernel
+@pytest.mark.parametrize("reach_px", [0.0, 3.0, 14.0])
+def test_the_best_place_near_by_is_the_same(reference, monkeypatch, reach_px):
+    made, _ = next(views(1, 7, 1))
+    window = SearchWindow(reference.window(1, 10, -20, 90, 110), 1, 10, -20, 60)
+    poses = [pose for pose in random_poses(40, SHAPE, -60, seed=3, log_scale=0.2)]
+    compiled, plain = both(monkeypatch, lambda: best_near(made, window, poses, reach_px))
+    for one, other in zip(compiled, plain, strict=True):
+        assert one.score == pytest.approx(other.score, abs=1e-4)
+        assert one.score < 1e-3 or apart_px(one.pose, other.pose) < 1e-2
+
+
+@needs_kernel
+def test_near_poses_beyond_all_bounds_touch_no_memory():
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    channels = np.ones((20, 30, 3), np.float32)
+    places = np.array([(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (3, 4, math.nan, 0)], np.float64)
+    out = np.full((3, 3), math.nan)
+    KERNEL.near(channels, made.values, made.weights, places, 2, out)
+    assert (out[:2, 0] == 0).all()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["size", "bands", "numbers", "groups", "strided", "expected"])
+def test_windows_that_do_not_match_are_refused(damage):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    rows, cols = (44, 40) if damage == "size" else (45, 40)
+    spectra = np.zeros((cols // 2 // 8 + 1 + (damage == "groups"), 3, rows, 16), np.float32)
+    best = np.zeros((4 if damage == "bands" else 3, cols, 16), np.float32)
+    numbers = np.zeros(best.shape, np.int32 if damage != "numbers" else np.int64)
+    expected = np.zeros((2, cols, 16), np.float32) if damage == "expected" else None
+    if damage == "strided":
+        best = np.zeros((6, cols, 16), np.float32)[::2]
+    poses = np.zeros((1, 4))
+    with pytest.raises(ValueError, match=r"window|expected|contiguous"):
+        KERNEL.search(spectra, made.values, made.weights, poses, 0, best, numbers, expected)

@@ -125,11 +125,11 @@ def test_the_best_place_near_by_is_that_of_a_whole_search(window):
     for pose in random_poses(12, SHAPE, 90, seed=8, log_scale=0.1):
         template = templates_of(GROUND, pose).at(LEVEL)
         guess = Pose(pose.x_px + 13.0, pose.y_px - 11.0, pose.turn_rad, pose.log_scale)
-        found = best_near(template, window, guess, 18.0)
+        (found,) = best_near(template, window, [guess], 18.0)
         best = search(template, window, near(pose), 1)[0]
         assert apart_px(found.pose, best.pose) < 0.05
         assert found.score == pytest.approx(best.score, rel=1e-3)
-        missed = best_near(template, window, guess, 8.0)
+        (missed,) = best_near(template, window, [guess], 8.0)
         assert missed.score < found.score / 2
         assert apart_px(missed.pose, guess) <= math.hypot(10.0, 10.0)
 
@@ -139,9 +139,10 @@ def test_near_the_border_of_a_window_beyond_it_is_nothing(reference):
     part = SearchWindow(made, LEVEL, 60, 70, 55)
     pose = Pose(2 * (70 + 12.0), 2 * (60 + 40.0), 0.4, 0.0)
     template = templates_of(GROUND, pose).at(LEVEL)
-    assert apart_px(best_near(template, part, pose, 12.0).pose, pose) < 1.0
     outside = Pose(2 * (70 - 200.0), 2 * (60 + 40.0), 0.4, 0.0)
-    assert best_near(template, part, outside, 12.0).score == 0.0
+    inside, beyond = best_near(template, part, [pose, outside], 12.0)
+    assert apart_px(inside.pose, pose) < 1.0 and beyond.score == 0.0
+    assert best_near(template, part, [], 12.0) == []
 
 
 def test_no_middle_is_sought_in_the_margin(reference):

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.search import exact
-from orthonav.search.exact import BLOCK_ROWS, ExactIndex, rows_within, top_tiles
+from orthonav.search.exact import BLOCK_ROWS, ExactIndex, rows_within
 
 CACHES = pytest.mark.parametrize("cache_bytes", [0, 2**27], ids=["blocks", "cached"])
 
@@ -125,54 +124,3 @@ def test_best_needs_little_memory():
     finally:
         tracemalloc.stop()
     assert peak < 4 * 2**20  # all scores would be 72 MB
-
-
-def greedy(scores, centres, count, apart_m):
-    """`top_tiles` as it is defined: the best, then the best of those far enough away, .."""
-    chosen = []
-    for row in sorted(range(len(scores)), key=lambda i: (-scores[i], i)):
-        near = [i for i in chosen if np.hypot(*(centres[i] - centres[row])) < apart_m]
-        if np.isfinite(scores[row]) and not near and len(chosen) < count:
-            chosen.append(row)
-    return chosen
-
-
-@given(
-    st.lists(
-        st.tuples(
-            st.integers(0, 20),
-            st.integers(0, 20),
-            st.sampled_from([0, 1, 2, 3, 0.5, -np.inf, np.nan]),
-        ),
-        max_size=60,
-    ),
-    st.integers(0, 8),
-    st.integers(0, 12),
-    st.integers(1, 4),
-)
-def test_top_tiles_are_the_best_that_lie_apart(tiles, count, apart_m, shortlist):
-    centres = np.array([tile[:2] for tile in tiles], dtype=np.float32).reshape(-1, 2)
-    scores = np.array([tile[2] for tile in tiles], dtype=np.float32)
-    plain = np.where(np.isnan(scores), -np.inf, scores)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(exact, "SHORTLIST", shortlist)
-        rows = top_tiles(scores, centres, count, float(apart_m))
-    assert rows.dtype == np.intp and rows.tolist() == greedy(plain, centres, count, apart_m)
-
-
-@pytest.mark.parametrize("smooth", [True, False])
-def test_top_tiles_of_many(smooth):
-    """Also where all the best tiles lie beside each other, as they do around a peak."""
-    rows, cols = np.mgrid[:300, :300]
-    centres = np.stack([cols.ravel(), rows.ravel()], axis=1).astype(np.float32) * 8
-    scores = np.random.default_rng(4).random(len(centres)).astype(np.float32)
-    if smooth:
-        scores = -np.hypot(*(centres - [700, 900]).T).astype(np.float32)
-    chosen = top_tiles(scores, centres, 16, 60.0)
-    apart = np.hypot(*(centres[chosen][:, None] - centres[chosen]).transpose(2, 0, 1))
-    assert len(chosen) == 16 and chosen[0] == scores.argmax()
-    assert (apart[~np.eye(16, dtype=bool)] >= 60).all()
-    assert (np.diff(scores[chosen]) <= 0).all()
-    better = scores > scores[chosen[-1]]
-    nearest = np.hypot(*(centres[better][:, None] - centres[chosen]).transpose(2, 0, 1)).min(axis=1)
-    assert (nearest < 60).all()

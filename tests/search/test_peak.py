@@ -57,6 +57,32 @@ def test_gated_search_gives_the_same_offset():
     assert neighbours.peak_offset(scores[rows], best, rows) == neighbours.peak_offset(scores, best)
 
 
+@given(
+    st.integers(0, 10**6),
+    st.integers(0, 12),
+    st.sampled_from([0.0, 0.3, 0.7]),
+    st.booleans(),
+)
+def test_maxima_are_the_tiles_that_no_neighbour_exceeds(seed, count, missing, gated):
+    rng = np.random.default_rng(seed)
+    some = tiles(lambda row, col: rng.random() >= missing)
+    centres = GRID.centres_en_m(some).astype(np.float32)
+    scores = rng.integers(0, 9, len(centres)).astype(np.float32)  # many are equal
+    scores[rng.random(len(scores)) < 0.1] = np.nan
+    rows = np.flatnonzero(rng.random(len(centres)) < 0.6) if gated else None
+    seen, values = (some, scores) if rows is None else (some[rows], scores[rows])
+    known = {tuple(tile): value for tile, value in zip(seen.tolist(), values, strict=True)}
+
+    def is_peak(tile, value):
+        steps = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+        around = [known.get((tile[0] + down, tile[1] + right), np.nan) for down, right in steps]
+        return np.isfinite(value) and value >= np.nanmax(around)
+
+    peaks = [at for at, each in enumerate(seen) if is_peak(each, values[at])]
+    found = TileNeighbours(GRID, centres).maxima(values, count, rows)
+    assert found.tolist() == sorted(peaks, key=lambda at: (-values[at], at))[:count]
+
+
 def test_missing_neighbours_leave_their_axis_alone():
     centres = GRID.centres_en_m(tiles(lambda row, col: col != 5)).astype(np.float32)
     neighbours = TileNeighbours(GRID, centres)

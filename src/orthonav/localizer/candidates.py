@@ -71,7 +71,10 @@ class ViewCandidates:
         return -reach < x < cols + reach and -reach < y < rows + reach
 
     def fft_ms(self, level: int, poses: int) -> float:
-        """Estimated cost of an FFT search at a level, of the sheet or of what the prior allows."""
+        """Estimated cost of an FFT search at a level, of the sheet or of what the prior allows;
+        infinite where there is no such level."""
+        if level >= self.registrar.reference.levels:
+            return math.inf
         rows, cols = self.registrar.reference.shape(level)
         if self.prior is not None:
             across = 2 * self.reach_px / 2**level
@@ -118,10 +121,8 @@ class ViewCandidates:
             1 - np.float32(plan.tile_share_per_nat) * nats,
             self._rows,
             run.candidates,
-            plan.tile_apart_strides,
         )
-        near_px = plan.tile_reach_strides * grid.stride_m / grid.gsd_m
-        found = self.registrar.nearby(view.templates, view.levels, tiles, near_px)
+        found = self._nearby(tiles, plan.tile_reach_strides * grid.stride_m / grid.gsd_m)
         if self.prior is None:
             return found
         x, y = self.middle_px
@@ -146,6 +147,19 @@ class ViewCandidates:
         fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
         pool = self.pool if fits else None
         found = search(template, window, run.poses, run.candidates, view.prior.scale_map, pool)
+        if level > view.levels.coarse:
+            return self._nearby(found, self.plan.far_reach_px * 2**level)
+        return self._promising(found)
+
+    def _nearby(self, found: list[Candidate], reach_px: float) -> list[Candidate]:
+        """Candidates at the best place within `reach_px` (level 0), at the coarse level."""
+        view, scales = self.view, self.plan.nearby_log_scales
+        return self._promising(
+            self.registrar.nearby(view.templates, view.levels, found, reach_px, scales)
+        )
+
+    def _promising(self, found: list[Candidate]) -> list[Candidate]:
+        """The first of candidates, best first: those that are not far weaker than the best."""
         least = self.plan.candidate_share
-        worth = sum(each.score >= least * found[0].score for each in found)
-        return found[: max(worth, self.plan.min_candidates)]
+        enough = sum(each.score >= least * found[0].score for each in found)
+        return found[: max(enough, self.plan.min_candidates)]

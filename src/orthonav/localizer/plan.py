@@ -4,7 +4,8 @@ A view is judged at one level of the map, where it is some 72 px across (`Levels
 three sources of candidates:
 
 - the *judged level* by FFT: the only one that misses nothing, and the slowest on a large area;
-- the *coarse level*, one above it, by FFT: a quarter of the pixels;
+- the *coarse level*, one above it, by FFT: a quarter of the pixels; or, on large areas, the level
+  above that one, whose candidates are compared at the coarse level near by;
 - the *tiles* whose embeddings are most similar to the view.
 
 Where the judged level is cheap (a prior, a small sheet) only that one is searched. Elsewhere the
@@ -21,6 +22,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -96,14 +98,17 @@ class SearchPlan:
     """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
     candidates: int = 24
     """Candidates of a search by FFT at the coarse level."""
+    far_candidates: int = 400
+    """Candidates of a search by FFT one level above the coarse one;
+    docs/decisions/registration.md, 15."""
+    far_reach_px: float = 1.5
+    """Their place is sought within so many pixels of that level."""
     stage_candidates: int = 24
     """Candidates of one stage at the judged level; docs/decisions/registration.md, 13."""
     final_candidates: int = 2
     """Candidates of a search at the final level: each is finished."""
-    tile_candidates: tuple[int, int] = (20, 80)
-    """Least and largest number of candidates from tiles."""
-    tile_candidates_any_heading: int = 400
-    """Largest number of them where the heading is unknown; docs/decisions/registration.md, 12."""
+    tile_candidates: tuple[int, int] = (20, 400)
+    """Least and largest number of candidates from tiles; docs/decisions/registration.md, 15."""
     tiles_per_candidate: int = 200
     """Between these, one candidate for so many tiles: the right one ranks lower among more."""
     tile_share_per_nat: float = 0.03
@@ -111,9 +116,10 @@ class SearchPlan:
     its pose; docs/decisions/registration.md, 14."""
     tile_reach_strides: float = 1.1
     """The place of a candidate from tiles is sought within so many strides of the tile grid."""
-    tile_apart_strides: float = 1.5
-    """Candidates from tiles lie at least so many strides of the tile grid apart: neighbours
-    show the same ground."""
+    nearby_log_scales: tuple[float, ...] = (-0.13, 0.0, 0.13)
+    """Candidates from tiles and from above the coarse level are compared there under their log
+    scale plus each of these, the best of which counts: their scale is hardly known;
+    docs/decisions/registration.md, 15."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Least and largest side of a view, in tiles, for which tiles are asked: below, most of a tile
     is missing; above, most of the view is unused."""
@@ -162,9 +168,9 @@ class SearchPlan:
     began, ms; the best place so far is the answer."""
     threads: int = 1
     """Threads that share the poses of a search and the candidates."""
-    fft_pose_ms: float = 0.1
+    fft_pose_ms: float = 0.01
     """Estimated cost of one pose of an FFT search, whatever its size."""
-    fft_pixel_ms: float = 5.5e-7
+    fft_pixel_ms: float = 2.2e-7
     """Estimated cost of one pixel of the window under one pose, times the logarithm (base 2) of
     the number of pixels."""
     tile_view_ms: float = 4.0
@@ -173,8 +179,8 @@ class SearchPlan:
     """Estimated cost of embedding the view under one pose."""
     tile_score_ms: float = 5e-8
     """Estimated cost of one number of one tile's embedding under one pose."""
-    tile_nearby_ms: float = 0.5
-    """Estimated cost of the place of one candidate from tiles."""
+    nearby_ms: float = 0.2
+    """Estimated cost of the place of one candidate from tiles or from above the coarse level."""
 
     def fft_ms(self, poses: int, rows: int, cols: int) -> float:
         """Estimated cost of an FFT search of a window; infinite where it is too large."""
@@ -187,11 +193,9 @@ class SearchPlan:
         """Estimated cost of the most similar of so many tiles with embeddings of `dims` numbers."""
         return self.tile_view_ms + poses * (self.tile_pose_ms + self.tile_score_ms * tiles * dims)
 
-    def candidates_from(self, tiles: int, heading_known: bool) -> int:
+    def candidates_from(self, tiles: int) -> int:
         """Number of candidates to take from so many tiles."""
         least, most = self.tile_candidates
-        if not heading_known:
-            most = self.tile_candidates_any_heading
         return max(least, min(most, round(tiles / self.tiles_per_candidate)))
 
     def enough(self, run: Search, levels: Levels) -> ClearMargin:
@@ -215,19 +219,18 @@ class SearchPlan:
         fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)
         judged_ms = fft_ms(levels.look, len(fine))
         if judged_ms > self.cheap_ms:
-            coarse_ms = fft_ms(levels.coarse, len(rough))
-            both = [(coarse_ms, self.candidates, False)]
+            both = [self._coarse(levels, rough, fft_ms)]
             near, dims = tiles()
             if near:
-                count = self.candidates_from(near, prior.turn_rad is not None)
-                cost_ms = self.tiles_ms(len(rough), near, dims) + self.tile_nearby_ms * count
-                both = sorted([*both, (cost_ms, count, True)])
+                count = self.candidates_from(near)
+                cost_ms = self.tiles_ms(len(rough), near, dims) + self.nearby_ms * count
+                both.append(Search(levels.coarse, rough, True, count, cost_ms))
             # The cheaper one wherever it is possible; the other only where it can be afforded.
             affordable = 0.0 if judged_ms <= self.last_ms else self.last_ms
-            for number, (cost_ms, count, from_tiles) in enumerate(both):
-                if math.isinf(cost_ms) or (number and cost_ms > affordable):
+            for number, each in enumerate(sorted(both, key=lambda each: each.cost_ms)):
+                if math.isinf(each.cost_ms) or (number and each.cost_ms > affordable):
                     break
-                yield Search(levels.coarse, rough, from_tiles, count, cost_ms)
+                yield each
         if judged_ms <= max(self.last_ms, self.cheap_ms):
             for least, most in pairwise(self.stages_nats):
                 stage = [pose for pose, nats in fine if least < nats <= most]
@@ -240,24 +243,53 @@ class SearchPlan:
             poses = [pose for pose, _ in final]
             yield Search(levels.final, poses, False, self.final_candidates, final_ms)
 
+    def _coarse(
+        self, levels: Levels, poses: list[Pose], fft_ms: Callable[[int, int], float]
+    ) -> Search:
+        """The search of the coarse level; one level above it where that takes too long."""
+        cost_ms = fft_ms(levels.coarse, len(poses))
+        if cost_ms <= self.last_ms:
+            return Search(levels.coarse, poses, False, self.candidates, cost_ms)
+        far, count = levels.coarse + 1, self.far_candidates
+        cost_ms = fft_ms(far, len(poses)) + self.nearby_ms * count
+        return Search(far, poses, False, count, cost_ms)
+
     def _poses(
         self, prior: PosePrior, turn_step_rad: float, scale_step: float
     ) -> list[tuple[Pose, float]]:
         """Poses to try, each with its negative log density in nats, the most likely first."""
-        made = bank(
-            None if prior.turn_rad is None else prior.turn_std_rad,
-            prior.log_scale_std,
-            turn_step_rad=turn_step_rad,
-            scale_step=scale_step,
-            sigmas=self.bank_sigmas,
-        )
+        turn_std_rad = None if prior.turn_rad is None else prior.turn_std_rad
+        steps = turn_step_rad, scale_step, self.bank_sigmas
         reported = prior.turn_rad or 0.0
-        cell = turn_step_rad / 2, scale_step / 2
-        poses = [(reported + turn, log_scale) for turn, log_scale in made.poses]
-        rated = [(pose, prior.nats(*pose, within=cell)) for pose in poses]
-        return sorted(
-            (each for each in rated if each[1] <= self.max_nats), key=lambda each: each[1]
-        )
+        return [
+            ((reported + turn, log_scale), nats)
+            for turn, log_scale, nats in _likely_poses(turn_std_rad, prior.log_scale_std, *steps)
+            if nats <= self.max_nats
+        ]
+
+
+@lru_cache(64)
+def _likely_poses(
+    turn_std_rad: float | None,
+    log_scale_std: float,
+    turn_step_rad: float,
+    scale_step: float,
+    sigmas: float,
+) -> list[tuple[float, float, float]]:
+    """Turns from the reported heading and log scales, each with its negative log density in nats,
+    the most likely first. Cached: the standard deviations are mostly those of the view before."""
+    made = bank(
+        turn_std_rad,
+        log_scale_std,
+        turn_step_rad=turn_step_rad,
+        scale_step=scale_step,
+        sigmas=sigmas,
+    )
+    known = turn_std_rad is not None
+    prior = PosePrior(0.0 if known else None, turn_std_rad or 0.0, log_scale_std)
+    cell = turn_step_rad / 2, scale_step / 2
+    rated = [(*pose, prior.nats(*pose, within=cell)) for pose in made.poses]
+    return sorted(rated, key=lambda each: each[2])
 
 
 class Budget:

@@ -14,7 +14,7 @@ from orthonav.localizer.match import TileMatcher
 from orthonav.localizer.rectify import RectifiedView
 from orthonav.register.pose import Pose
 from orthonav.register.search import Candidate
-from orthonav.search.exact import ExactIndex, top_tiles
+from orthonav.search.exact import ExactIndex
 from orthonav.search.peak import TileNeighbours, parabola_peak
 
 
@@ -58,20 +58,18 @@ class TileProposer:
         weights: NDArray[np.float32],
         rows: NDArray[np.intp] | None,
         count: int,
-        apart_strides: float,
     ) -> list[Candidate]:
         """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
 
         `poses` are headings (rad) and log scales; scores are those of the embeddings, times the
-        `weights` (Q,) of the poses. Up to `count` tiles, at least `apart_strides` strides of the
-        tile grid from each other.
+        `weights` (Q,) of the poses. Up to `count` tiles, the best of those that no tile next to
+        them exceeds: neighbours show the same ground.
         """
         queries = embed_poses(
             self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
         )
         scores = self.index.best(queries * weights[:, None], rows)
-        centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
-        chosen = top_tiles(scores, centres, count, apart_strides * self.grid.stride_m)
+        chosen = self.neighbours.maxima(scores, count, rows)
         tiles = chosen if rows is None else rows[chosen]
         by_pose = self.index.scores(queries, tiles)
         peaks = peak_poses(np.array(poses), by_pose, weights)

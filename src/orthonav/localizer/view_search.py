@@ -57,8 +57,9 @@ class ViewSearch:
         if each.level < self._levels.look:
             self._direct = self._registrar.direct(view.templates, self._levels, found)
             return
+        level = min(each.level, self._levels.coarse)
         self._judged += self._registrar.judged(
-            view.templates, self._levels, found, each.level, view.prior, self._judged
+            view.templates, self._levels, found, level, view.prior, self._judged
         )
 
     def _clear_after(self, run: Search) -> Registered | None:
@@ -67,8 +68,9 @@ class ViewSearch:
         if not self._judged or not self._seems_clear(margin):
             return None
         found = self._finished(self._judged)
-        # Candidates from tiles are not all places: their rivals alone prove too little.
-        proven = not run.from_tiles or self._is_proven(found, self._plan.doubt)
+        # Candidates from tiles or from far above are not all places: rivals alone prove too little.
+        compared_all = not run.from_tiles and run.level <= self._levels.coarse
+        proven = compared_all or self._is_proven(found, self._plan.doubt)
         return found if proven and self._is_clear(found, margin) else None
 
     def _proven_before(self, cost_ms: float) -> Registered | None:

@@ -1,4 +1,5 @@
-/* Refinement of a view on the map: the loop of orthonav.register.refine, compiled.
+/* Refinement of a view on the map: the loop of orthonav.register.refine, compiled. `_search.c` has
+ * the search.
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
@@ -7,15 +8,13 @@
  *
  * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
 
-#define Py_LIMITED_API 0x030b0000
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "_kernel.h"
+
 #include <limits.h>
 #include <math.h>
 #include <string.h>
 
-#define LAYOUT 1        /* of all arguments and results; kernel.py has the same number */
-#define LANES 4         /* cosine and sine of the doubled direction, grey, valid or mask */
+#define LAYOUT 2        /* of all arguments and results; kernel.py has the same number */
 #define BLOCKS 6        /* blocks along a side of a view: orthonav.register.template.BLOCKS */
 #define FULLY_VALID 0.99f
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
@@ -23,24 +22,6 @@
 #define CURVATURES (BLOCKS * BLOCKS * PER_BLOCK)
 #define DERIVED (CURVATURES + 8)
 #define CHUNK 128       /* pixels of a row whose taps are found together */
-#define LARGEST 32768   /* longest side, px */
-#define INLINE static inline __attribute__((always_inline)) /* for one processor alike */
-#define SHIFT 64        /* makes coordinates positive, so that truncation rounds down */
-
-typedef float lanes __attribute__((vector_size(16)));
-typedef float lanes_in_memory __attribute__((vector_size(16), aligned(4)));
-
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define FOR_EVERY_PROCESSOR __attribute__((target_clones("arch=haswell", "default")))
-#else
-#define FOR_EVERY_PROCESSOR
-#endif
-
-typedef struct {
-    const float *first;     /* evidence (R, C, 4) */
-    Py_ssize_t stride;      /* floats from row to row */
-    int rows, cols;
-} window_t;
 
 typedef struct {
     const float *view;      /* (H, W, 4): evidence of the view and its mask */
@@ -62,29 +43,6 @@ INLINE float from_middle(int at, int side) { return (float)at + 0.5f - (float)si
 
 /* Block that a row or column belongs to: the first ones are floor(side * block / BLOCKS). */
 INLINE int block_of(int at, int side) { return ((at + 1) * BLOCKS - 1) / side; }
-
-INLINE lanes all(float value) { return (lanes){value, value, value, value}; }
-
-INLINE lanes load(const float *from) { return *(const lanes_in_memory *)from; }
-
-INLINE int below(float value) { return (int)(value + SHIFT) - SHIFT; }
-
-INLINE lanes tap(const window_t *window, int row, int col) {
-    if (row < 0 || col < 0 || row >= window->rows || col >= window->cols) return all(0.0f);
-    return load(window->first + row * window->stride + LANES * col);
-}
-
-/* Evidence at column x and row y, counted from pixel centres, bilinear; zero beyond the window. */
-INLINE lanes sampled(const window_t *window, float x, float y) {
-    if (!(x > -2.0f && y > -2.0f && x < (float)window->cols + 1.0f && y < (float)window->rows + 1.0f))
-        return all(0.0f);
-    const int col = below(x), row = below(y);
-    const lanes a = tap(window, row, col), b = tap(window, row, col + 1);
-    const lanes c = tap(window, row + 1, col), d = tap(window, row + 1, col + 1);
-    const float right = x - (float)col, down = y - (float)row;
-    const lanes top = a + right * (b - a), bottom = c + right * (d - c);
-    return top + down * (bottom - top);
-}
 
 /* The same where all four taps are inside. */
 INLINE lanes inside(const float *at, Py_ssize_t stride, float right, float down) {
@@ -144,9 +102,8 @@ INLINE void add_kinds(double *out, lanes sum) {
     out[1] += sum[2];
 }
 
-FOR_EVERY_PROCESSOR
-static void compare(const window_t *window, const template_t *view, const double matrix[6],
-                    float cosine, float sine, double *out) {
+INLINE void compare_inline(const window_t *window, const template_t *view, const double *matrix,
+                           float cosine, float sine, double *out) {
     const lanes straight = {cosine, cosine, 1.0f, 1.0f}, crossed = {-sine, sine, 0.0f, 0.0f};
     const float dx = (float)matrix[0], dy = (float)matrix[3];
     const float *const made = window->first;
@@ -187,6 +144,11 @@ static void compare(const window_t *window, const template_t *view, const double
     }
 }
 
+FOR_EVERY_PROCESSOR(compare,
+                    (const window_t *window, const template_t *view, const double *matrix,
+                     float cosine, float sine, double *out),
+                    (window, view, matrix, cosine, sine, out))
+
 /* Sobel's derivatives along x and y at one pixel, per pixel; the border is reflected. */
 INLINE void sobel(const float *const rows[3], int col, int cols, lanes out[2]) {
     const int left = LANES * (col > 0 ? col - 1 : (cols > 1)), middle = LANES * col;
@@ -200,8 +162,7 @@ INLINE void sobel(const float *const rows[3], int col, int cols, lanes out[2]) {
 
 /* Derivatives of a view, and their products with each other by block and kind of evidence, then
  * those with the view itself, by kind. */
-FOR_EVERY_PROCESSOR
-static void derive(const float *values, int rows, int cols, float *slopes, double *out) {
+INLINE void derive_inline(const float *values, int rows, int cols, float *slopes, double *out) {
     memset(out, 0, DERIVED * sizeof(double));
     for (int row = 0; row < rows; row++) {
         const float y = from_middle(row, rows);
@@ -246,6 +207,9 @@ static void derive(const float *values, int rows, int cols, float *slopes, doubl
         }
     }
 }
+
+FOR_EVERY_PROCESSOR(derive, (const float *values, int rows, int cols, float *slopes, double *out),
+                    (values, rows, cols, slopes, out))
 
 typedef struct {
     double x, y, turn, log_scale;   /* level-0 px, rad */
@@ -393,11 +357,9 @@ static void refine(const window_t *window, const template_t *view, const numbers
     memcpy(best->step, step, sizeof step);
 }
 
-/* Borrow a buffer of float32 or float64 with so many dimensions, each pixel's numbers together. */
-static int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind,
-                  int flags) {
+int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags) {
     if (PyObject_GetBuffer(from, into, PyBUF_STRIDES | PyBUF_FORMAT | flags) < 0) return -1;
-    const Py_ssize_t size = kind == 'f' ? 4 : 8;
+    const Py_ssize_t size = kind == 'd' ? 8 : 4;
     int good = into->ndim == dimensions && into->itemsize == size && into->format &&
                into->format[0] == kind && into->shape[dimensions - 1] == last &&
                into->strides[dimensions - 1] == size;
@@ -409,8 +371,11 @@ static int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t la
     return -1;
 }
 
-static int is_whole(const Py_buffer *buffer) {
-    return buffer->strides[0] == buffer->shape[1] * buffer->strides[1];
+int is_whole(const Py_buffer *buffer) {
+    Py_ssize_t size = buffer->itemsize;
+    for (int at = buffer->ndim - 1; at >= 0; size *= buffer->shape[at--])
+        if (buffer->strides[at] != size) return 0;
+    return 1;
 }
 
 /* Whether view and slopes are contiguous and of one shape; else an error is set. */
@@ -522,6 +487,11 @@ static PyMethodDef functions[] = {
      "refine(window, view, slopes, numbers, pose, limits): see orthonav.register.refine."},
     {"derive", py_derive, METH_VARARGS,
      "derive(view, slopes, out): see orthonav.register.template."},
+    {"search", py_search, METH_VARARGS,
+     "search(spectra, view, weights, poses, first, best, which, expected): see "
+     "orthonav.register.search."},
+    {"near", py_near, METH_VARARGS,
+     "near(channels, view, weights, corner, poses, reach, out): see orthonav.register.search."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -9,7 +9,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -19,14 +19,14 @@ from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
 from orthonav.register.scale_map import ScaleMap
-from orthonav.register.search import Candidate, SearchWindow, best_near
+from orthonav.register.search import PLACES_AT_ONCE, Candidate, SearchWindow, best_near
 from orthonav.register.sharpness import Sharpness, sharpness
 from orthonav.register.template import ViewTemplates
 
 LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across
 (docs/decisions/registration.md, 2)."""
-KEPT_TO_LOOK = 64
+KEPT_TO_LOOK = 200
 """Candidates that pass from the coarse level to the judged one, at most
 (docs/decisions/registration.md, 12)."""
 KEPT_TO_FINISH = 3
@@ -267,9 +267,11 @@ class Registrar:
         levels: Levels,
         candidates: Sequence[Candidate],
         reach_px: float,
+        log_scales: Sequence[float] = (0.0,),
     ) -> list[Candidate]:
         """Candidates at the best place within `reach_px` (level 0) of each, at the coarse level.
 
+        Each is compared under its log scale plus each of `log_scales`, the best of which counts.
         Best first; of candidates that end at the same place the best one stays.
         """
         recipe, side_px = levels.recipe(levels.coarse), view_side_px(templates)
@@ -280,13 +282,20 @@ class Registrar:
             _ = whole.channels
         _ = template.interleaved  # made, like the channels, before threads ask for them
 
-        def moved(found: Candidate) -> Candidate:
-            place = found.pose.x_px, found.pose.y_px
+        def moved(some: Sequence[Candidate]) -> list[Candidate]:
+            place = some[0].pose.x_px, some[0].pose.y_px
             around_px = reach_px + side_px
             window = whole or self.part_window(levels.coarse, recipe, side_px, place, around_px)
-            return best_near(template, window, found.pose, reach_px)
+            made = []
+            for more in log_scales:
+                poses = [replace(each.pose, log_scale=each.pose.log_scale + more) for each in some]
+                made.append(best_near(template, window, poses, reach_px))
+            return [max(same, key=lambda each: each.score) for same in zip(*made, strict=True)]
 
-        found = sorted(self._shared(moved, candidates), key=lambda each: -each.score)
+        at_once = PLACES_AT_ONCE if whole else 1
+        parts = [candidates[at : at + at_once] for at in range(0, len(candidates), at_once)]
+        found = [each for some in self._shared(moved, parts) for each in some]
+        found.sort(key=lambda each: -each.score)
         places = np.array([complex(each.pose.x_px, each.pose.y_px) for each in found])
         free = np.ones(len(found), np.bool_)
         kept = []

@@ -8,9 +8,11 @@ scale, whereas correlation alone favours small views.
 """
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +21,7 @@ from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
+from orthonav.register.kernel import KERNEL
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale, rotation
 from orthonav.register.reference import cut
@@ -32,6 +35,10 @@ ENERGY_FLOOR = 0.3
 
 POSES_AT_ONCE = 6
 """Poses that a thread takes at a time."""
+PLACES_AT_ONCE = 50
+"""Poses whose surroundings a thread searches at a time."""
+WIDE = 8
+"""Columns or rows that the kernel transforms together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +113,24 @@ class SearchWindow:
     @cached_property
     def spectra(self) -> NDArray[np.complex64]:
         """Spectra (3, h, w) of the channels, padded to `size`; the channels are not kept."""
+        return self._transformed()
+
+    @cached_property
+    def spectra_by_columns(self) -> Array:
+        """The same as the kernel takes them (G, 3, h, 16): eight columns, real parts first."""
+        spectra = self._transformed()
+        channels, rows, cols = spectra.shape
+        out = np.zeros((-(-cols // WIDE), channels, rows, 2, WIDE), np.float32)
+        for group, into in enumerate(out):
+            some = spectra[..., WIDE * group : WIDE * (group + 1)]
+            into[..., 0, : some.shape[2]], into[..., 1, : some.shape[2]] = some.real, some.imag
+        return out.reshape(len(out), channels, rows, 2 * WIDE)
+
+    def prepare(self) -> None:
+        """Make what threads share, so that none makes it again."""
+        _ = self.spectra if KERNEL is None else self.spectra_by_columns
+
+    def _transformed(self) -> NDArray[np.complex64]:
         planes = np.moveaxis(self._normalized(), 2, 0)
         return np.asarray(rfft2(planes, s=self.size), np.complex64)
 
@@ -139,7 +164,8 @@ def search(
     """
     share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
     parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
-    _ = template.interleaved, window.spectra  # made before threads ask for them
+    _ = template.interleaved
+    window.prepare()
     surfaces = (pool.map if pool else map)(
         lambda part: _best_of(template, window, poses, part, scales), parts
     )
@@ -164,15 +190,43 @@ def search(
     return found
 
 
-def best_near(template: Template, window: SearchWindow, pose: Pose, reach_px: float) -> Candidate:
-    """The best place of a view within `reach_px` (level 0) of a pose, along each axis, under its
+def best_near(
+    template: Template, window: SearchWindow, poses: Sequence[Pose], reach_px: float
+) -> list[Candidate]:
+    """The best place of a view within `reach_px` (level 0) of each pose, along each axis, under its
     heading and scale."""
     unit = 2.0**template.level
-    half, reach = posed_half_px(template, pose.log_scale), math.ceil(reach_px / unit)
+    reach = math.ceil(reach_px / unit)
+    places = np.array(
+        [
+            (p.x_px / unit - window.col, p.y_px / unit - window.row, p.turn_rad, p.log_scale)
+            for p in poses
+        ]
+    ).reshape(-1, 4)
+    found = np.empty((len(places), 3))
+    if KERNEL is None:
+        for place, into in zip(places, found, strict=True):
+            into[:] = _best_near(template, window, place, reach)
+    else:
+        KERNEL.near(window.channels, template.values, template.weights, places, reach, found)
+    found[:, 1] = (window.col + found[:, 1]) * unit
+    found[:, 2] = (window.row + found[:, 2]) * unit
+    return [
+        Candidate(score, Pose(x, y, pose.turn_rad, pose.log_scale))
+        for (score, x, y), pose in zip(found.tolist(), poses, strict=True)
+    ]
+
+
+def _best_near(
+    template: Template, window: SearchWindow, place: NDArray[np.float64], reach: int
+) -> tuple[float, float, float]:
+    """Score, x and y of the best place within `reach` of (x, y, turn, log scale), pixels of the
+    window; without the kernel."""
+    x, y, turn, log_scale = place.tolist()
+    half = posed_half_px(template, log_scale)
     # Middles of views lie on first corners of pixels, from these on.
-    row = round(pose.y_px / unit) - window.row - reach
-    col = round(pose.x_px / unit) - window.col - reach
-    posed = posed_channels(template, pose.turn_rad, pose.log_scale)
+    row, col = round(y) - reach, round(x) - reach
+    posed = posed_channels(template, turn, log_scale)
     around = cut(window.channels, row - half, col - half, *2 * [2 * (half + reach)])
     surface = np.asarray(
         cv2.matchTemplate(around, np.ascontiguousarray(np.moveaxis(posed, 0, 2)), cv2.TM_CCORR),
@@ -180,9 +234,7 @@ def best_near(template: Template, window: SearchWindow, pose: Pose, reach_px: fl
     )
     down, right = divmod(int(surface.argmax()), surface.shape[1])
     x, y = _between(surface, down, right)
-    x_px, y_px = (window.col + col + x) * unit, (window.row + row + y) * unit
-    place = Pose(x_px, y_px, pose.turn_rad, pose.log_scale)
-    return Candidate(float(surface[down, right]), place)
+    return float(surface[down, right]), col + x, row + y
 
 
 def _best_of(
@@ -195,6 +247,8 @@ def _best_of(
     """The best score (H, W) of some of the poses at every place, and the number of its pose."""
     shape = window.height, window.width
     expected = None if scales is None else scales.over(window.level, window.row, window.col, shape)
+    if KERNEL is not None:
+        return _best_by_kernel(template, window, poses, part, scales, expected)
     best = np.full(shape, -np.inf, np.float32)
     which = np.zeros(shape, np.int32)
     numbers = np.empty(shape, np.int32)
@@ -212,6 +266,47 @@ def _best_of(
         cv2.copyTo(scores, better, best)
         cv2.copyTo(numbers, better, which)
     return best, which
+
+
+def _best_by_kernel(
+    template: Template,
+    window: SearchWindow,
+    poses: list[tuple[float, float]],
+    part: range,
+    scales: ScaleMap | None,
+    expected: Array | None,
+) -> tuple[Array, NDArray[np.int32]]:
+    """The same by the kernel; `expected` (H, W): log scales expected at every place."""
+    bands = -(-window.height // (2 * WIDE))
+    best = np.full((bands, window.size[1], 2 * WIDE), -np.inf, np.float32)
+    which = np.zeros(best.shape, np.int32)
+    reach = (-math.inf, math.inf)
+    tried = np.array(
+        [
+            (turn, log_scale, *(scales.reach(log_scale) if scales else reach))
+            for turn, log_scale in (poses[number] for number in part)
+        ]
+    )
+    KERNEL.search(
+        *(window.spectra_by_columns, template.values, template.weights, tried, part.start),
+        *(best, which, None if expected is None else _in_bands(expected, best.shape)),
+    )
+    return _from_bands(best, window), _from_bands(which, window)
+
+
+def _in_bands(values: Array, shape: tuple[int, ...]) -> Array:
+    """Values (H, W) as the kernel takes them (B, C, 16): bands of sixteen rows, column by column;
+    NaN beyond them."""
+    bands, cols, rows = shape
+    out = np.full((bands * rows, cols), np.nan, np.float32)
+    out[: values.shape[0], : values.shape[1]] = values
+    return np.ascontiguousarray(out.reshape(bands, rows, cols).swapaxes(1, 2))
+
+
+def _from_bands(values: NDArray[Any], window: SearchWindow) -> NDArray[Any]:
+    """Values (H, W) of the window from what the kernel made (B, C, 16)."""
+    rows = values.swapaxes(1, 2).reshape(-1, values.shape[1])
+    return np.ascontiguousarray(rows[: window.height, : window.width])
 
 
 class _Scratch:

@@ -245,8 +245,12 @@ class ViewTemplates:
 def halved(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Grey and valid at half the resolution about the same middle; sides must be even."""
+    """Grey and valid at half the resolution; the last row or column of an odd number is left out.
+
+    The middle stays where it is unless one is.
+    """
     size = grey.shape[1] // 2, grey.shape[0] // 2
+    grey, valid = grey[: 2 * size[1], : 2 * size[0]], valid[: 2 * size[1], : 2 * size[0]]
     smaller = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     if valid.all():
         return smaller, np.ones(smaller.shape, np.bool_)

@@ -10,8 +10,6 @@ BLOCK_ROWS = 1024
 """Embeddings decoded at once: half a megabyte at 128 numbers, which stays in the cache."""
 CACHE_BYTES = 128 * 2**20
 """Decoded embeddings kept in memory: 260,000 tiles of 128 numbers."""
-SHORTLIST = 32
-"""Tiles that `top_tiles` examines at first for each one wanted."""
 _CONVERT_FP16 = getattr(cv2, "convertFp16", None)  # OpenCV 4, where cv2.add knows no float16
 _ZERO = np.zeros(1, dtype=np.float16)
 
@@ -95,45 +93,3 @@ def rows_within(
     """Rows of tiles whose centres (N, 2) lie within `radius_m` of a point: the prior's gate."""
     offset = centres_en_m - np.asarray(centre_en_m, dtype=np.float32)
     return np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= radius_m**2)
-
-
-def top_tiles(
-    scores: NDArray[np.float32], centres_en_m: NDArray[np.float32], count: int, apart_m: float
-) -> NDArray[np.intp]:
-    """Rows of the best tiles, best first, each at least `apart_m` from every better one chosen.
-
-    `scores` (N,) and `centres_en_m` (N, 2) belong together. Up to `count` rows: fewer where no
-    more lie far enough apart. Of equal scores the first row counts as better; tiles whose score is
-    not finite are left out.
-    """
-    finite = np.flatnonzero(np.isfinite(scores))
-    values = scores[finite]
-    looked_at = SHORTLIST * max(count, 1)
-    while True:
-        order = _best_first(values, looked_at)
-        chosen = _apart(centres_en_m[finite[order]], count, apart_m)
-        if len(chosen) == count or len(order) == len(finite):
-            return finite[order[chosen]]
-        looked_at = 8 * len(order)
-
-
-def _best_first(values: NDArray[np.float32], at_least: int) -> NDArray[np.intp]:
-    """Indices of the `at_least` highest values and all that equal the last of them, sorted."""
-    kept = np.arange(len(values))
-    if at_least < len(values):
-        lowest = np.partition(values, len(values) - at_least)[len(values) - at_least]
-        kept = np.flatnonzero(values >= lowest)
-    return kept[np.argsort(-values[kept], kind="stable")]
-
-
-def _apart(points_m: NDArray[np.float32], count: int, apart_m: float) -> NDArray[np.intp]:
-    """Indices of up to `count` points (N, 2), each the first that is far enough from the others."""
-    free = np.ones(len(points_m), dtype=np.bool_)
-    chosen: list[int] = []
-    while len(chosen) < count and free.any():
-        at = int(free.argmax())
-        chosen.append(at)
-        offset = points_m - points_m[at]
-        free &= np.einsum("ij,ij->i", offset, offset) >= apart_m**2
-        free[at] = False
-    return np.array(chosen, dtype=np.intp)

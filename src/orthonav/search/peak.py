@@ -6,6 +6,7 @@ smoothly around the peak, and a parabola through three neighbours cuts the media
 third of that of the best tile's centre (`docs/benchmarks.md`).
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +23,7 @@ class TileNeighbours:
         """Raises `MapFileError` where centres are not on the grid or not sorted."""
         tiles = grid.tiles_rc(centres_en_m)
         inside = (tiles >= 0).all() and (tiles < [grid.rows, grid.cols]).all()
-        self._cols = grid.cols
+        self._cols, self._shape = grid.cols, (grid.rows, grid.cols)
         self._flat = tiles[:, 0] * grid.cols + tiles[:, 1]
         if not inside or (np.diff(self._flat) <= 0).any():
             raise MapFileError("tile centres are not those of the tile grid, sorted by rows")
@@ -33,6 +34,23 @@ class TileNeighbours:
         if not 0 <= col + east < self._cols:
             return None
         return find(self._flat, (row - north) * self._cols + col + east)
+
+    def maxima(
+        self, scores: NDArray[np.float32], count: int, rows: NDArray[np.intp] | None = None
+    ) -> NDArray[np.intp]:
+        """Places in `scores` of the `count` best tiles that no tile next to them exceeds, best
+        first.
+
+        `scores` (N,) belong to all tiles, or to `rows` (sorted) where given; tiles whose score is
+        not finite are left out.
+        """
+        flat = self._flat if rows is None else self._flat[rows]
+        on_grid = np.full(self._shape, -np.inf, np.float32)
+        on_grid.flat[flat] = np.where(np.isfinite(scores), scores, -np.inf)
+        highest = np.asarray(cv2.dilate(on_grid, np.ones((3, 3), np.uint8)))
+        is_peak = np.isfinite(on_grid.flat[flat]) & (on_grid.flat[flat] >= highest.flat[flat])
+        peaks = np.flatnonzero(is_peak)
+        return np.asarray(peaks[np.argsort(-scores[peaks], kind="stable")[:count]])
 
     def peak_offset(
         self, scores: NDArray[np.float32], best: int, rows: NDArray[np.intp] | None = None

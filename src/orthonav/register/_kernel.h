@@ -1,0 +1,73 @@
+/* What both files of the kernel share: vectors, one function for several processors, buffers. */
+
+#ifndef ORTHONAV_KERNEL_H
+#define ORTHONAV_KERNEL_H
+
+#define Py_LIMITED_API 0x030b0000
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#define LANES 4         /* cosine and sine of the doubled direction, grey, valid or mask */
+#define LARGEST 32768   /* longest side, px */
+#define SHIFT 64        /* makes coordinates positive, so that truncation rounds down */
+#define INLINE static inline __attribute__((always_inline))
+
+typedef float lanes __attribute__((vector_size(16)));
+typedef float lanes_in_memory __attribute__((vector_size(16), aligned(4)));
+
+/* A function compiled twice from `NAME_inline`: for processors with AVX2, and for all. GCC's
+ * target_clones("arch=..") is no substitute: it asks for that very model of processor. */
+#if defined(__x86_64__) && defined(__GNUC__)
+#define HAS_AVX2 (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+#define FOR_EVERY_PROCESSOR(NAME, PARAMETERS, ARGUMENTS)                                            \
+    __attribute__((target("avx2,fma"))) static void NAME##_avx2 PARAMETERS { NAME##_inline ARGUMENTS; } \
+    static void NAME##_plain PARAMETERS { NAME##_inline ARGUMENTS; }                                \
+    static void NAME PARAMETERS {                                                                   \
+        if (HAS_AVX2) NAME##_avx2 ARGUMENTS;                                                        \
+        else NAME##_plain ARGUMENTS;                                                                \
+    }
+#else
+#define FOR_EVERY_PROCESSOR(NAME, PARAMETERS, ARGUMENTS)                                            \
+    static void NAME PARAMETERS { NAME##_inline ARGUMENTS; }
+#endif
+
+INLINE lanes all(float value) { return (lanes){value, value, value, value}; }
+
+INLINE lanes load(const float *from) { return *(const lanes_in_memory *)from; }
+
+INLINE int below(float value) { return (int)(value + SHIFT) - SHIFT; }
+
+typedef struct {
+    const float *first;     /* evidence (R, C, 4) */
+    Py_ssize_t stride;      /* floats from row to row */
+    int rows, cols;
+} window_t;
+
+INLINE lanes tap(const window_t *window, int row, int col) {
+    if (row < 0 || col < 0 || row >= window->rows || col >= window->cols) return all(0.0f);
+    return load(window->first + row * window->stride + LANES * col);
+}
+
+/* Evidence at column x and row y, counted from pixel centres, bilinear; zero beyond the window. */
+INLINE lanes sampled(const window_t *window, float x, float y) {
+    if (!(x > -2.0f && y > -2.0f && x < (float)window->cols + 1.0f && y < (float)window->rows + 1.0f))
+        return all(0.0f);
+    const int col = below(x), row = below(y);
+    const lanes a = tap(window, row, col), b = tap(window, row, col + 1);
+    const lanes c = tap(window, row + 1, col), d = tap(window, row + 1, col + 1);
+    const float right = x - (float)col, down = y - (float)row;
+    const lanes top = a + right * (b - a), bottom = c + right * (d - c);
+    return top + down * (bottom - top);
+}
+
+/* Borrow a buffer of numbers of 'f', 'd' or 'i' with so many dimensions, the last of `last` numbers
+ * that lie together; 0, or -1 with an error. */
+int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags);
+
+/* Whether all numbers of a buffer lie together. */
+int is_whole(const Py_buffer *buffer);
+
+PyObject *py_search(PyObject *self, PyObject *arguments);
+PyObject *py_near(PyObject *self, PyObject *arguments);
+
+#endif

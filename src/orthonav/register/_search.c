@@ -1,0 +1,694 @@
+/* Search of a view on the map: orthonav.register.search, compiled.
+ *
+ * `search` lays a view on every place of a window under each of many poses, by Fourier transforms of
+ * eight columns or rows at a time: those along a column, the product with the spectra of the map and
+ * the one back stay in the processor's cache. `near` lays it on the places around each of many poses,
+ * one by one. The Python module does the same with SciPy and OpenCV; it is the oracle of this file and
+ * takes its place where it was not compiled. */
+
+#include "_kernel.h"
+
+#include <limits.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define WIDE 8          /* columns or rows that are transformed together */
+#define PAIR (2 * WIDE) /* floats of their real and imaginary parts */
+#define CHANNELS 3
+#define MOST_FACTORS 20
+#define AT_ONCE 4       /* places along a row that are compared together */
+
+typedef float wide __attribute__((vector_size(32)));
+typedef float wide_in_memory __attribute__((vector_size(32), aligned(4)));
+typedef int wide_int __attribute__((vector_size(32)));
+
+typedef struct {
+    wide re, im;
+} pair_t;
+
+typedef struct {
+    wide_in_memory re, im;
+} pair_in_memory_t;
+
+#if defined(__clang__)
+#define MIX(A, B, ...) __builtin_shufflevector(A, B, __VA_ARGS__)
+#else
+#define MIX(A, B, ...) __builtin_shuffle(A, B, (wide_int){__VA_ARGS__})
+#endif
+
+/* Eight rows of eight numbers become columns. */
+INLINE void transpose(wide *m) {
+    wide two[WIDE], four[WIDE];
+    for (int at = 0; at < WIDE; at += 2) {
+        two[at] = MIX(m[at], m[at + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+        two[at + 1] = MIX(m[at], m[at + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+    }
+    for (int at = 0; at < WIDE; at += 4)
+        for (int half = 0; half < 2; half++) {
+            const wide a = two[at + half], b = two[at + 2 + half];
+            four[at + 2 * half] = MIX(a, b, 0, 1, 8, 9, 4, 5, 12, 13);
+            four[at + 2 * half + 1] = MIX(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+        }
+    for (int at = 0; at < 4; at++) {
+        m[at] = MIX(four[at], four[at + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+        m[at + 4] = MIX(four[at], four[at + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+    }
+}
+
+/* ---- Fourier transform of eight sequences at once (Stockham) ---- */
+
+typedef struct {
+    int length, count, factors[MOST_FACTORS];
+    float *twiddles;    /* pairs of cosine and minus sine, pass after pass */
+} plan_t;
+
+INLINE pair_t plus(pair_t a, pair_t b) { return (pair_t){a.re + b.re, a.im + b.im}; }
+INLINE pair_t minus(pair_t a, pair_t b) { return (pair_t){a.re - b.re, a.im - b.im}; }
+INLINE pair_t times(pair_t a, float by) { return (pair_t){a.re * by, a.im * by}; }
+INLINE pair_t times_i(pair_t a, float by) { return (pair_t){-a.im * by, a.re * by}; }
+INLINE pair_t turned(pair_t a, const float *by) {
+    return (pair_t){a.re * by[0] - a.im * by[1], a.re * by[1] + a.im * by[0]};
+}
+
+/* Transform of 2, 3, 4 or 5 numbers, `apart` from each other. */
+INLINE void butterfly(int factor, const pair_t *from, int apart, pair_t *out) {
+    const pair_t a = from[0], b = from[apart];
+    if (factor == 2) {
+        out[0] = plus(a, b), out[1] = minus(a, b);
+    } else if (factor == 3) {
+        const pair_t c = from[2 * apart], sum = plus(b, c), middle = plus(a, times(sum, -0.5f));
+        const pair_t side = times_i(minus(b, c), -0.866025403784438647f);
+        out[0] = plus(a, sum), out[1] = plus(middle, side), out[2] = minus(middle, side);
+    } else if (factor == 4) {
+        const pair_t c = from[2 * apart], d = from[3 * apart];
+        const pair_t even = plus(a, c), odd = minus(a, c), sum = plus(b, d);
+        const pair_t side = times_i(minus(b, d), -1.0f);
+        out[0] = plus(even, sum), out[1] = plus(odd, side);
+        out[2] = minus(even, sum), out[3] = minus(odd, side);
+    } else {
+        const float cos1 = 0.309016994374947424f, sin1 = -0.951056516295153572f;
+        const float cos2 = -0.809016994374947424f, sin2 = -0.587785252292473129f;
+        const pair_t c = from[2 * apart], d = from[3 * apart], e = from[4 * apart];
+        const pair_t near = plus(b, e), far = plus(c, d), x = minus(b, e), y = minus(c, d);
+        const pair_t middle1 = plus(a, plus(times(near, cos1), times(far, cos2)));
+        const pair_t middle2 = plus(a, plus(times(near, cos2), times(far, cos1)));
+        const pair_t side1 = plus(times_i(x, sin1), times_i(y, sin2));
+        const pair_t side2 = minus(times_i(x, sin2), times_i(y, sin1));
+        out[0] = plus(a, plus(near, far));
+        out[1] = plus(middle1, side1), out[4] = minus(middle1, side1);
+        out[2] = plus(middle2, side2), out[3] = minus(middle2, side2);
+    }
+}
+
+/* One pass: what `done` passes' factors multiply to, and `left` numbers between parts. */
+INLINE void pass(int factor, int done, int left, const pair_t *from, pair_t *to,
+                 const float *twiddles) {
+    const size_t apart = (size_t)left * done;
+    pair_t out[5];
+    for (int k = 0; k < done; k++, from += (size_t)left * factor, to += left) {
+        butterfly(factor, from, left, out);
+        for (int j = 0; j < factor; j++) to[apart * j] = out[j];
+        const float *by = twiddles;
+        for (int i = 1; i < left; i++) {
+            butterfly(factor, from + i, left, out);
+            to[i] = out[0];
+            for (int j = 1; j < factor; j++, by += 2) to[i + apart * j] = turned(out[j], by);
+        }
+    }
+}
+
+/* Transform `data`; it ends there or in `scratch`, which `ended` says. */
+INLINE void transform_inline(const plan_t *plan, pair_t *data, pair_t *scratch, pair_t **ended) {
+    const float *twiddles = plan->twiddles;
+    for (int at = 0, done = 1; at < plan->count; done *= plan->factors[at++]) {
+        const int factor = plan->factors[at], left = plan->length / (done * factor);
+        switch (factor) {
+        case 2: pass(2, done, left, data, scratch, twiddles); break;
+        case 3: pass(3, done, left, data, scratch, twiddles); break;
+        case 4: pass(4, done, left, data, scratch, twiddles); break;
+        default: pass(5, done, left, data, scratch, twiddles); break;
+        }
+        twiddles += 2 * (size_t)(factor - 1) * (left - 1);
+        pair_t *const other = data;
+        data = scratch, scratch = other;
+    }
+    *ended = data;
+}
+
+FOR_EVERY_PROCESSOR(transform, (const plan_t *plan, pair_t *data, pair_t *scratch, pair_t **ended),
+                    (plan, data, scratch, ended))
+
+/* 0; or -1 without memory, or where the length has other prime factors than 2, 3 and 5. */
+static int make_plan(int length, plan_t *plan) {
+    static const int factors[] = {4, 2, 3, 5};
+    int rest = length;
+    size_t size = 0;
+    plan->length = length, plan->count = 0, plan->twiddles = NULL;
+    for (int at = 0; at < 4; at++)
+        for (; rest % factors[at] == 0; rest /= factors[at]) plan->factors[plan->count++] = factors[at];
+    if (rest != 1) return -1;
+    for (int at = 0, done = 1; at < plan->count; done *= plan->factors[at++])
+        size += (size_t)(plan->factors[at] - 1) * (length / (done * plan->factors[at]));
+    float *into = plan->twiddles = malloc((2 * size + 1) * sizeof(float));
+    if (!into) return -1;
+    for (int at = 0, done = 1; at < plan->count; done *= plan->factors[at++])
+        for (int i = 1; i < length / (done * plan->factors[at]); i++)
+            for (int j = 1; j < plan->factors[at]; j++) {
+                const double angle = -2 * acos(-1.0) * ((long long)j * done * i % length) / length;
+                *into++ = (float)cos(angle), *into++ = (float)sin(angle);
+            }
+    return 0;
+}
+
+/* ---- The view as the map would show it ---- */
+
+typedef struct {
+    window_t picture;   /* evidence (H, W, 4) */
+    double weights[2];  /* of the two kinds of evidence */
+} view_t;
+
+typedef struct {
+    double turn, log_scale, lowest, highest;    /* the scales that are expected where it is compared */
+} pose_t;
+
+typedef struct {
+    double x, y, turn, log_scale;   /* px of the level */
+} place_t;
+
+/* As `posed_half_px` of search.py, at most `LARGEST`, which fits into no window. */
+static int half_of(const view_t *view, double log_scale) {
+    const double half = ceil(exp(log_scale) * hypot(view->picture.rows, view->picture.cols) / 2) + 1;
+    return half < LARGEST ? (int)half : LARGEST;
+}
+
+/* Planes (3, 2 half, 2 half) of a view under a pose, and the factors that give both kinds of evidence
+ * the norm of their weight; as `posed_channels` of search.py. */
+INLINE void pose_view_inline(const view_t *view, double turn, double log_scale, int half,
+                             float *planes, float *gains) {
+    const int side = 2 * half;
+    const size_t area = (size_t)side * side;
+    const float cosine = (float)(cos(turn) * exp(-log_scale));
+    const float sine = (float)(sin(turn) * exp(-log_scale));
+    const float cosine2 = (float)cos(2 * turn), sine2 = (float)sin(2 * turn);
+    const float right = (float)(view->picture.cols - 1) / 2, down = (float)(view->picture.rows - 1) / 2;
+    double energies[2] = {0};
+    for (int row = 0; row < side; row++, planes += side) {
+        const float y = (float)row + 0.5f - (float)half;
+        float sums[2] = {0};
+        for (int col = 0; col < side; col++) {
+            const float x = (float)col + 0.5f - (float)half;
+            const lanes seen = sampled(&view->picture, cosine * x + sine * y + right,
+                                       cosine * y - sine * x + down);
+            planes[col] = cosine2 * seen[0] - sine2 * seen[1];
+            planes[area + col] = sine2 * seen[0] + cosine2 * seen[1];
+            planes[2 * area + col] = seen[2];
+            sums[0] += seen[0] * seen[0] + seen[1] * seen[1];
+            sums[1] += seen[2] * seen[2];
+        }
+        energies[0] += sums[0], energies[1] += sums[1];
+    }
+    for (int kind = 0; kind < 2; kind++) {
+        const double norm = exp(-log_scale / 2) * view->weights[kind];
+        gains[kind] = energies[kind] > 0 ? (float)(norm / sqrt(energies[kind])) : 0.0f;
+    }
+}
+
+FOR_EVERY_PROCESSOR(pose_view,
+                    (const view_t *view, double turn, double log_scale, int half, float *planes,
+                     float *gains),
+                    (view, turn, log_scale, half, planes, gains))
+
+static void *memory_for(size_t floats) {
+    const size_t line = 64;
+    return aligned_alloc(line, (floats * sizeof(float) + line) / line * line);
+}
+
+/* ---- Every place of a window ---- */
+
+typedef struct {
+    const pair_in_memory_t *spectra;    /* (G, 3, R): of the map, eight columns together */
+    plan_t down, along;                 /* along columns of R and rows of C numbers */
+    int groups, bands;                  /* G, and bands of sixteen rows that are wanted */
+    float *planes;                      /* of the view */
+    float *strips, *surface;            /* (G, 3, side, 16) and (G, R, 16) */
+    pair_t *data, *scratch, *total;     /* of one transform, and of the sum of channels */
+} search_t;
+
+/* Best scores (B, C) and the numbers of their poses (B, C, 16); `expected` (B, C) or NULL: the log
+ * scale at each place. Each pair has eight rows of a band and the eight below. */
+typedef struct {
+    pair_in_memory_t *best;
+    int *which;
+    const pair_in_memory_t *expected;
+} bests_t;
+
+/* The middle of the view goes to the first number, what lies before it wraps to the end; all turned by
+ * half a turn, for a product of spectra to be a correlation. */
+INLINE int wrapped(int half, int at, int length) {
+    return half - at < 0 ? half - at + length : half - at;
+}
+
+/* Into strips: spectra of two real rows each that were transformed as one complex row. Each pair of
+ * rows is of `channel`, the first ones are `row`, lanes are `apart` rows from each other. */
+INLINE void separate(const search_t *search, const pair_t *spectra, int side, const int channel[2],
+                     const int row[2], int apart, int count) {
+    const int cols = search->along.length;
+    for (int group = 0; group < search->groups; group++) {
+        wide parts[2][2][WIDE] = {{{{0}}}}; /* of both rows: real and imaginary ones of eight numbers */
+        for (int at = 0; at < WIDE && group * WIDE + at <= cols / 2; at++) {
+            const int k = group * WIDE + at;
+            const pair_t here = spectra[k], there = spectra[k ? cols - k : 0];
+            parts[0][0][at] = here.re + there.re, parts[0][1][at] = here.im - there.im;
+            parts[1][0][at] = here.im + there.im, parts[1][1][at] = there.re - here.re;
+        }
+        for (int part = 0; part < 2; part++) {
+            const size_t strip = (size_t)group * CHANNELS + channel[part];
+            pair_t *into = (pair_t *)search->strips + strip * side + row[part];
+            transpose(parts[part][0]);
+            transpose(parts[part][1]);
+            for (int lane = 0; lane < count; lane++, into += apart)
+                *into = (pair_t){parts[part][0][lane], parts[part][1][lane]};
+        }
+    }
+}
+
+/* Eight complex rows, real parts from `re`, imaginary ones from `im`, `apart` floats between rows. */
+INLINE void fill_rows(const search_t *search, const float *re, const float *im, size_t apart, int half,
+                      int count, float gain) {
+    const int cols = search->along.length;
+    memset(search->data, 0, cols * sizeof(pair_t));
+    for (int lane = 0; lane < count; lane++, re += apart, im += apart) {
+        float *const into = (float *)search->data + lane;
+        for (int at = 0; at < 2 * half; at++) {
+            float *const place = into + (size_t)wrapped(half, at, cols) * PAIR;
+            place[0] = gain * re[at], place[WIDE] = gain * im[at];
+        }
+    }
+}
+
+/* Transforms of the view's rows: of both gradients as one, of every two rows of grey as one. */
+INLINE void transform_rows_inline(const search_t *search, int half, const float *gains) {
+    const int side = 2 * half, gradients[2] = {0, 1}, grey[2] = {2, 2};
+    const size_t area = (size_t)side * side;
+    /* The transform back leaves the number of pixels, taking two rows apart a factor of two. */
+    const float share = 0.5f / ((float)search->along.length * (float)search->down.length);
+    pair_t *ended;
+    for (int from = 0; from < side; from += WIDE) {
+        const int count = side - from < WIDE ? side - from : WIDE, rows[2] = {from, from};
+        const float *first = search->planes + (size_t)from * side;
+        fill_rows(search, first, first + area, side, half, count, share * gains[0]);
+        transform(&search->along, search->data, search->scratch, &ended);
+        separate(search, ended, side, gradients, rows, 1, count);
+    }
+    for (int from = 0; from < half; from += WIDE) {
+        const int count = half - from < WIDE ? half - from : WIDE, rows[2] = {2 * from, 2 * from + 1};
+        const float *first = search->planes + 2 * area + (size_t)2 * from * side;
+        fill_rows(search, first, first + side, 2 * side, half, count, share * gains[1]);
+        transform(&search->along, search->data, search->scratch, &ended);
+        separate(search, ended, side, grey, rows, 2, count);
+    }
+}
+
+FOR_EVERY_PROCESSOR(transform_rows, (const search_t *search, int half, const float *gains),
+                    (search, half, gains))
+
+/* Transforms along columns, the product with the map's, summed over channels, and those back. What
+ * they leave in the surface has imaginary parts first: with both parts exchanged, a transform is the
+ * one back. */
+INLINE void multiply_columns_inline(const search_t *search, int half) {
+    const int side = 2 * half, rows = search->down.length;
+    pair_t *const total = search->total, *ended;
+    for (int group = 0; group < search->groups; group++) {
+        for (int channel = 0; channel < CHANNELS; channel++) {
+            const size_t strip = (size_t)group * CHANNELS + channel;
+            const pair_t *view = (const pair_t *)search->strips + strip * side;
+            const pair_in_memory_t *map = search->spectra + strip * rows;
+            memset(search->data, 0, rows * sizeof(pair_t));
+            for (int at = 0; at < side; at++) search->data[wrapped(half, at, rows)] = view[at];
+            transform(&search->down, search->data, search->scratch, &ended);
+            for (int at = 0; at < rows; at++) {
+                const wide re = ended[at].re * map[at].re - ended[at].im * map[at].im;
+                const wide im = ended[at].re * map[at].im + ended[at].im * map[at].re;
+                total[at] = channel ? (pair_t){total[at].re + im, total[at].im + re} : (pair_t){im, re};
+            }
+        }
+        transform(&search->down, total, search->scratch, &ended);
+        memcpy(search->surface + (size_t)group * rows * PAIR, ended, rows * sizeof(pair_t));
+    }
+}
+
+FOR_EVERY_PROCESSOR(multiply_columns, (const search_t *search, int half), (search, half))
+
+INLINE wide_int chosen(wide_int where, wide_int one, wide_int other) {
+    return (where & one) | (~where & other);
+}
+
+/* Eight columns of a group, of the eight rows from `row` on: imaginary and real parts. */
+INLINE void columns_of(const search_t *search, int group, int row, wide *im, wide *re) {
+    const int rows = search->down.length;
+    const pair_t *surface = (const pair_t *)search->surface + (size_t)group * rows + row;
+    for (int lane = 0; lane < WIDE; lane++) {
+        const pair_t found = row + lane < rows ? surface[lane] : (pair_t){{0}, {0}};
+        im[lane] = found.re, re[lane] = found.im;
+    }
+    transpose(im);
+    transpose(re);
+}
+
+/* The sixteen rows of a band, the upper eight as real rows a and the lower ones as b: the complex rows
+ * a + i b, imaginary parts first. */
+INLINE void join_rows(const search_t *search, int band) {
+    const int cols = search->along.length, row = band * PAIR;
+    wide a_re[WIDE], a_im[WIDE], b_re[WIDE], b_im[WIDE];
+    for (int group = 0; group < search->groups; group++) {
+        columns_of(search, group, row, a_im, a_re);
+        columns_of(search, group, row + WIDE, b_im, b_re);
+        for (int at = 0; at < WIDE && group * WIDE + at <= cols / 2; at++) {
+            const int k = group * WIDE + at;
+            search->data[k] = (pair_t){a_im[at] + b_re[at], a_re[at] - b_im[at]};
+            if (k && 2 * k != cols)
+                search->data[cols - k] = (pair_t){b_re[at] - a_im[at], a_re[at] + b_im[at]};
+        }
+    }
+}
+
+INLINE int is_any(wide_int where) {
+    long long parts[4];
+    memcpy(parts, &where, sizeof parts);
+    return (parts[0] | parts[1] | parts[2] | parts[3]) != 0;
+}
+
+/* Transforms back along the rows, and the best score at every place. */
+INLINE void compare_rows_inline(const search_t *search, int number, float lowest, float highest,
+                                const bests_t *bests) {
+    const int cols = search->along.length;
+    const wide_int here = (wide_int){0} + number;
+    pair_t *scores;
+    for (int band = 0; band < search->bands; band++) {
+        join_rows(search, band);
+        transform(&search->along, search->data, search->scratch, &scores);
+        pair_in_memory_t *best = bests->best + (size_t)band * cols;
+        int *which = bests->which + (size_t)band * cols * PAIR;
+        for (int at = 0; at < cols; at++, which += PAIR) {
+            const wide upper = scores[at].im, lower = scores[at].re;
+            wide_int in_upper = upper > best[at].re, in_lower = lower > best[at].im, numbers[2];
+            if (bests->expected) {
+                const pair_in_memory_t *expected = bests->expected + (size_t)band * cols + at;
+                in_upper &= (expected->re >= lowest) & (expected->re <= highest);
+                in_lower &= (expected->im >= lowest) & (expected->im <= highest);
+            }
+            if (!is_any(in_upper | in_lower)) continue;
+            best[at].re = (wide)chosen(in_upper, (wide_int)upper, (wide_int)best[at].re);
+            best[at].im = (wide)chosen(in_lower, (wide_int)lower, (wide_int)best[at].im);
+            memcpy(numbers, which, sizeof numbers);
+            numbers[0] = chosen(in_upper, here, numbers[0]);
+            numbers[1] = chosen(in_lower, here, numbers[1]);
+            memcpy(which, numbers, sizeof numbers);
+        }
+    }
+}
+
+FOR_EVERY_PROCESSOR(compare_rows,
+                    (const search_t *search, int number, float lowest, float highest,
+                     const bests_t *bests),
+                    (search, number, lowest, highest, bests))
+
+/* 0, or -1 without memory. Poses under which the view does not fit into the window are left out. */
+static int search_all(search_t *search, const view_t *view, const pose_t *poses, Py_ssize_t count,
+                      int first, const bests_t *bests) {
+    const int rows = search->down.length, cols = search->along.length;
+    const int most = (rows < cols ? rows : cols) / 2, longest = rows > cols ? rows : cols;
+    int largest = 0;
+    for (Py_ssize_t at = 0; at < count; at++) {
+        const int half = half_of(view, poses[at].log_scale);
+        if (half <= most && half > largest) largest = half;
+    }
+    const size_t side = 2 * (size_t)largest, strips = search->groups * CHANNELS * side * PAIR;
+    search->planes = memory_for(CHANNELS * side * side);
+    search->strips = memory_for(strips);
+    search->surface = memory_for((size_t)search->groups * rows * PAIR);
+    search->data = memory_for((size_t)longest * PAIR);
+    search->scratch = memory_for((size_t)longest * PAIR);
+    search->total = memory_for((size_t)rows * PAIR);
+    const int has_memory = search->planes && search->strips && search->surface && search->data &&
+                           search->scratch && search->total;
+    if (has_memory) memset(search->strips, 0, strips * sizeof(float));
+    for (Py_ssize_t at = 0; has_memory && at < count; at++) {
+        const pose_t *pose = poses + at;
+        const int half = half_of(view, pose->log_scale);
+        float gains[2];
+        if (half > most) continue;
+        pose_view(view, pose->turn, pose->log_scale, half, search->planes, gains);
+        transform_rows(search, half, gains);
+        multiply_columns(search, half);
+        compare_rows(search, first + (int)at, (float)pose->lowest, (float)pose->highest, bests);
+    }
+    free(search->planes), free(search->strips), free(search->surface);
+    free(search->data), free(search->scratch), free(search->total);
+    return has_memory ? 0 : -1;
+}
+
+/* ---- The places around a pose ---- */
+
+typedef struct {
+    const float *map;       /* (R, C, 3) */
+    int rows, cols;
+    int reach;              /* px to each side */
+    float *planes, *posed;  /* of the view: (3, side, side), and interleaved, rows of `posed_floats` */
+    float *around;          /* of the map, rows of `around_floats` */
+    wide *sums;             /* (2 reach + 1, 2 reach + 1 rounded up) */
+    int posed_floats, around_floats, across;
+} near_t;
+
+/* Floats of the posed rows that are not zero, in eights. */
+INLINE void interleave(const near_t *near, int half, const float *gains, int row, int *from, int *to) {
+    const int side = 2 * half;
+    const size_t area = (size_t)side * side;
+    const float *plane = near->planes + (size_t)row * side;
+    float *into = near->posed;
+    *from = side, *to = 0;
+    for (int col = 0; col < side; col++) {
+        const float values[] = {gains[0] * plane[col], gains[0] * plane[area + col],
+                                gains[1] * plane[2 * area + col]};
+        memcpy(into + CHANNELS * col, values, sizeof values);
+        if (values[0] == 0.0f && values[1] == 0.0f && values[2] == 0.0f) continue;
+        if (*from == side) *from = col;
+        *to = col + 1;
+    }
+    memset(into + CHANNELS * side, 0, (near->posed_floats - CHANNELS * side) * sizeof(float));
+    *from *= CHANNELS, *to *= CHANNELS;
+}
+
+/* The map around a view whose first place has its first pixel at (row, col); zero beyond the map. */
+static void cut_around(const near_t *near, int row, int col, int side) {
+    const int size = side + 2 * near->reach;
+    const int first = col > 0 ? col : 0, last = col + size < near->cols ? col + size : near->cols;
+    for (int at = 0; at < size; at++) {
+        float *into = near->around + (size_t)at * near->around_floats;
+        memset(into, 0, near->around_floats * sizeof(float));
+        if (row + at < 0 || row + at >= near->rows || first >= last) continue;
+        memcpy(into + CHANNELS * (first - col),
+               near->map + CHANNELS * ((size_t)(row + at) * near->cols + first),
+               (size_t)CHANNELS * (last - first) * sizeof(float));
+    }
+}
+
+/* Adds a posed row times the map's, at all places, to their sums. */
+INLINE void add_row_inline(const near_t *near, int row, int from, int to) {
+    const int places = 2 * near->reach + 1;
+    for (int down = 0; down < places; down++) {
+        const float *map = near->around + (size_t)(row + down) * near->around_floats;
+        wide *into = near->sums + (size_t)down * near->across;
+        for (int right = 0; right < places; right += AT_ONCE, into += AT_ONCE) {
+            wide sums[AT_ONCE] = {{0}};
+            for (int at = from; at < to; at += WIDE) {
+                const wide mine = *(const wide_in_memory *)(near->posed + at);
+                for (int k = 0; k < AT_ONCE; k++)
+                    sums[k] += mine * *(const wide_in_memory *)(map + at + CHANNELS * (right + k));
+            }
+            for (int k = 0; k < AT_ONCE; k++) into[k] += sums[k];
+        }
+    }
+}
+
+FOR_EVERY_PROCESSOR(add_row, (const near_t *near, int row, int from, int to), (near, row, from, to))
+
+/* Where between three values the peak lies, from the middle one; as `_between` of search.py. */
+static double peak_of(double before, double middle, double after) {
+    const double bend = before - 2 * middle + after;
+    return bend < 0 ? fmax(-0.5, fmin(0.5, (before - after) / (2 * bend))) : 0.0;
+}
+
+static double score_at(const near_t *near, int down, int right) {
+    const wide sum = near->sums[(size_t)down * near->across + right];
+    double total = 0.0;
+    for (int lane = 0; lane < WIDE; lane++) total += sum[lane];
+    return total;
+}
+
+/* The nearest whole number, within what fits any map. */
+static int rounded(double value) { return (int)fmax(-1e6, fmin(1e6, nearbyint(value))); }
+
+/* The best score near a place, and where: score, x and y. */
+static void best_near(const near_t *near, const view_t *view, const place_t *place, double *out) {
+    const int half = half_of(view, place->log_scale), places = 2 * near->reach + 1;
+    const int row = rounded(place->y) - near->reach, col = rounded(place->x) - near->reach;
+    int best_down = 0, best_right = 0, from, to;
+    double best = -INFINITY;
+    float gains[2];
+    pose_view(view, place->turn, place->log_scale, half, near->planes, gains);
+    cut_around(near, row - half, col - half, 2 * half);
+    memset(near->sums, 0, (size_t)places * near->across * sizeof(wide));
+    for (int at = 0; at < 2 * half; at++) {
+        interleave(near, half, gains, at, &from, &to);
+        add_row(near, at, from, to);
+    }
+    for (int down = 0; down < places; down++)
+        for (int right = 0; right < places; right++) {
+            const double score = score_at(near, down, right);
+            if (score > best) best = score, best_down = down, best_right = right;
+        }
+    out[0] = best, out[1] = col + best_right, out[2] = row + best_down;
+    if (best_right > 0 && best_right < places - 1)
+        out[1] += peak_of(score_at(near, best_down, best_right - 1), best,
+                          score_at(near, best_down, best_right + 1));
+    if (best_down > 0 && best_down < places - 1)
+        out[2] += peak_of(score_at(near, best_down - 1, best_right), best,
+                          score_at(near, best_down + 1, best_right));
+}
+
+/* 0, or -1 without memory. */
+static int search_near(near_t *near, const view_t *view, const place_t *places, Py_ssize_t count,
+                       double *out) {
+    int largest = 0;
+    for (Py_ssize_t at = 0; at < count; at++) {
+        const int half = half_of(view, places[at].log_scale);
+        if (half > largest) largest = half;
+    }
+    const size_t side = 2 * (size_t)largest, size = side + 2 * near->reach;
+    near->across = (2 * near->reach + AT_ONCE) / AT_ONCE * AT_ONCE;
+    near->posed_floats = (int)(CHANNELS * side + WIDE);
+    near->around_floats = (int)(CHANNELS * (size + AT_ONCE) + WIDE);
+    near->planes = memory_for(CHANNELS * side * side);
+    near->posed = memory_for(near->posed_floats);
+    near->around = memory_for(size * near->around_floats);
+    near->sums = memory_for((size_t)(2 * near->reach + 1) * near->across * WIDE);
+    const int has_memory = near->planes && near->posed && near->around && near->sums;
+    for (Py_ssize_t at = 0; has_memory && at < count; at++) best_near(near, view, places + at, out + 3 * at);
+    free(near->planes), free(near->posed), free(near->around), free(near->sums);
+    return has_memory ? 0 : -1;
+}
+
+/* ---- What Python calls ---- */
+
+/* Borrow contiguous buffers; 0, or -1 with an error and none borrowed. */
+typedef struct {
+    PyObject *from;
+    int dimensions;
+    Py_ssize_t last;
+    char kind;
+    int flags;
+} wanted_t;
+
+static void give_back(Py_buffer *buffers, int count) {
+    while (count--)
+        if (buffers[count].obj) PyBuffer_Release(buffers + count);
+}
+
+static int borrow_all(const wanted_t *wanted, Py_buffer *buffers, int count) {
+    memset(buffers, 0, count * sizeof *buffers);
+    for (int at = 0; at < count; at++) {
+        const wanted_t *want = wanted + at;
+        if (want->from == Py_None) continue;
+        if (borrow(want->from, buffers + at, want->dimensions, want->last, want->kind, want->flags) < 0) {
+            buffers[at].obj = NULL;
+            give_back(buffers, at);
+            return -1;
+        }
+        int good = is_whole(buffers + at);
+        for (int axis = 0; axis < want->dimensions; axis++) good &= buffers[at].shape[axis] <= INT_MAX / 64;
+        if (!good) {
+            PyErr_SetString(PyExc_ValueError, "arrays must be contiguous, and not too large");
+            give_back(buffers, at + 1);
+            return -1;
+        }
+    }
+    return 0;
+}
+
+static view_t view_of(const Py_buffer *buffer, const double weights[2]) {
+    const int rows = (int)buffer->shape[0], cols = (int)buffer->shape[1];
+    return (view_t){{buffer->buf, (Py_ssize_t)LANES * cols, rows, cols}, {weights[0], weights[1]}};
+}
+
+static int is_alike(const Py_buffer *one, const Py_buffer *other) {
+    return one->shape[0] == other->shape[0] && one->shape[1] == other->shape[1];
+}
+
+PyObject *py_search(PyObject *self, PyObject *arguments) {
+    PyObject *from[6];
+    Py_buffer got[6];
+    double weights[2];
+    int first, failed = 0;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OO(dd)OiOOO", &from[0], &from[1], &weights[0], &weights[1], &from[2],
+                          &first, &from[3], &from[4], &from[5]))
+        return NULL;
+    const wanted_t wanted[6] = {{from[0], 4, PAIR, 'f', 0},
+                                {from[1], 3, LANES, 'f', 0},
+                                {from[2], 2, 4, 'd', 0},
+                                {from[3], 3, PAIR, 'f', PyBUF_WRITABLE},
+                                {from[4], 3, PAIR, 'i', PyBUF_WRITABLE},
+                                {from[5], 3, PAIR, 'f', 0}};
+    if (borrow_all(wanted, got, 6) < 0) return NULL;
+    const Py_ssize_t *of_map = got[0].shape, *of_best = got[3].shape;
+    search_t search = {.spectra = got[0].buf, .groups = (int)of_map[0], .bands = (int)of_best[0]};
+    const bests_t bests = {got[3].buf, got[4].buf, got[5].buf};
+    const view_t view = view_of(&got[1], weights);
+    const int rows = (int)of_map[2], cols = (int)of_best[1];
+    if (of_map[1] != CHANNELS || of_map[0] != cols / 2 / WIDE + 1 || rows > LARGEST || cols > LARGEST ||
+        (of_best[0] - 1) * PAIR >= rows || !is_alike(&got[3], &got[4]) ||
+        (got[5].obj && !is_alike(&got[3], &got[5])))
+        PyErr_SetString(PyExc_ValueError, "spectra, scores and numbers must be of one window");
+    else if (make_plan(rows, &search.down) < 0 || make_plan(cols, &search.along) < 0)
+        PyErr_SetString(PyExc_ValueError, "sides of the window must be products of 2, 3 and 5");
+    else {
+        Py_BEGIN_ALLOW_THREADS
+        failed = search_all(&search, &view, got[2].buf, got[2].shape[0], first, &bests);
+        Py_END_ALLOW_THREADS
+        if (failed) PyErr_NoMemory();
+    }
+    free(search.down.twiddles), free(search.along.twiddles);
+    give_back(got, 6);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
+PyObject *py_near(PyObject *self, PyObject *arguments) {
+    PyObject *from[4];
+    Py_buffer got[4];
+    double weights[2];
+    int reach, failed = 0;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OO(dd)OiO", &from[0], &from[1], &weights[0], &weights[1], &from[2],
+                          &reach, &from[3]))
+        return NULL;
+    const wanted_t wanted[4] = {{from[0], 3, CHANNELS, 'f', 0},
+                                {from[1], 3, LANES, 'f', 0},
+                                {from[2], 2, 4, 'd', 0},
+                                {from[3], 2, 3, 'd', PyBUF_WRITABLE}};
+    if (borrow_all(wanted, got, 4) < 0) return NULL;
+    near_t near = {.map = got[0].buf, .rows = (int)got[0].shape[0], .cols = (int)got[0].shape[1],
+                   .reach = reach};
+    const view_t view = view_of(&got[1], weights);
+    if (reach < 0 || reach > LARGEST || got[2].shape[0] != got[3].shape[0])
+        PyErr_SetString(PyExc_ValueError, "reach must be from 0 on, and each place needs a result");
+    else {
+        Py_BEGIN_ALLOW_THREADS
+        failed = search_near(&near, &view, got[2].buf, got[2].shape[0], got[3].buf);
+        Py_END_ALLOW_THREADS
+        if (failed) PyErr_NoMemory();
+    }
+    give_back(got, 4);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
