@@ -1,5 +1,6 @@
 """The map as registration sees it: evidence of windows, computed on demand."""
 
+import math
 import threading
 from collections import OrderedDict
 from typing import Protocol
@@ -47,6 +48,10 @@ class Reference:
         """Rows and columns of a level."""
         return self.pyramid.shape(level)
 
+    def is_ready(self, level: int) -> bool:
+        """Whether a level is small enough to be kept whole."""
+        return math.prod(self.shape(level)) <= WHOLE_LEVEL_PX
+
     def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> Array:
         """Evidence (H, W, 4) of a whole level, computed once."""
         with self._lock:
@@ -62,7 +67,7 @@ class Reference:
     ) -> Array:
         """Evidence (height, width, 4) of a window; zero beyond the sheet."""
         rows, cols = self.shape(level)
-        if rows * cols <= WHOLE_LEVEL_PX:
+        if self.is_ready(level):
             return cut(self.whole(level, recipe), row, col, height, width)
         # No more than the sheet: a window beyond it costs nothing.
         margin = recipe.margin_px
