@@ -40,12 +40,12 @@ class MapWindow:
         """Around the window of a view at a pose, larger by `margins` (rows, columns) on each side.
 
         `slack_px`: how far the pose may still move, pixels of the level. The whole level where that
-        is ready.
+        is cached.
         """
         rows, cols = template.mask.shape
         height, width = rows + 2 * margins[0], cols + 2 * margins[1]
         unit = 2.0**template.level
-        if reference.is_ready(template.level):
+        if reference.caches(template.level):
             whole = reference.whole(template.level, template.recipe)
             return cls(whole, 0, 0, unit, (height, width))
         scale = math.exp(pose.log_scale) / 2

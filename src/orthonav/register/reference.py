@@ -48,8 +48,8 @@ class Reference:
         """Rows and columns of a level."""
         return self.pyramid.shape(level)
 
-    def is_ready(self, level: int) -> bool:
-        """Whether a level is small enough to be kept whole."""
+    def caches(self, level: int) -> bool:
+        """Whether the evidence of a level is made once and cached: where it is small enough."""
         return math.prod(self.shape(level)) <= WHOLE_LEVEL_PX
 
     def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> Array:
@@ -67,7 +67,7 @@ class Reference:
     ) -> Array:
         """Evidence (height, width, 4) of a window; zero beyond the sheet."""
         rows, cols = self.shape(level)
-        if self.is_ready(level):
+        if self.caches(level):
             return cut(self.whole(level, recipe), row, col, height, width)
         # No more than the sheet: a window beyond it costs nothing.
         margin = recipe.margin_px

@@ -53,7 +53,7 @@ MAX_KEPT_WINDOWS = 4
 """Search windows of whole sheets in the cache."""
 SAME_PLACE_SHARE = 1 / 8
 """Candidates from tiles closer together than this share of the view's side are one place."""
-WHOLE_WINDOW_PX = 2_000_000
+WHOLE_WINDOW_PX = 4_000_000
 """Up to so many pixels of the coarse level their surroundings are cut out of one window of the
 whole sheet (12 bytes each); of larger sheets a window is made for each."""
 MAX_RATIO = 10.0
