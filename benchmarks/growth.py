@@ -164,7 +164,8 @@ def cameras(place: Workplace) -> Section:
         "processor: median and p99 of the time of all threads together; clock: of the time that "
         "passed, with other work on the machine; both without the first view, which prepares the "
         "map",
-        "of files: resident pages of the libraries at the end; the map is read into memory, not mapped",
+        "of files: resident pages of files at the end, those of the libraries: the map is read "
+        "into memory, not mapped",
     )
     section.tables.append(Table(section.title, header, rows, notes))
     return section
