@@ -19,7 +19,7 @@ from orthonav.geo.camera import Camera
 from orthonav.mapfile import open_map
 from orthonav.simulate.flight import Errors
 
-CAMERA_SIDE_M, CAMERA_HZ = 2000, 2.0
+CAMERA_SIDE_M, CAMERA_HZ, CAMERA_VIEWS = 2000, 2.0, 40
 CAMERAS = SMALL_CAMERA, Camera(320, 240, 250.0, 250.0, 161.5, 118.5)
 """Both see the same ground."""
 VIEWS_M = 1000
@@ -149,7 +149,7 @@ def cameras(place: Workplace) -> Section:
     for camera in CAMERAS:
         lap = rendered(place, present, frame, LoopedFlight(camera, CAMERA_HZ, short=True))
         for track, threads in itertools.product((False, True), (1, 2)):
-            views = 6 if place.quick else None
+            views = 6 if place.quick else CAMERA_VIEWS
             task = Task(BOTH, str(map_path), str(lap), track=track, threads=threads, views=views)
             rows.append(_camera_cells(section, camera, task, placed(task)))
             print(f"        {rows[-1][:3]} done", file=sys.stderr, flush=True)
@@ -158,7 +158,7 @@ def cameras(place: Workplace) -> Section:
         *("first view ms", "peak MB", "of files MB", "15 m"),
     )
     notes = (
-        f"views of 320 x 240 m of 2021, {1 / CAMERA_HZ:g} s apart, on "
+        f"{views} views of 320 x 240 m of 2021, {1 / CAMERA_HZ:g} s apart, on "
         f"{CAMERA_SIDE_M / 1e3:g} x {CAMERA_SIDE_M / 1e3:g} km of generated ground at 1 m, heading "
         "known, no prior; one process per row",
         "processor: median and p99 of the time of all threads together; clock: of the time that "

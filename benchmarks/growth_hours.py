@@ -25,7 +25,7 @@ from orthonav.mapfile import open_map
 SIDE_M, GSD_M, RATE_HZ = 2000, 2.0, 0.25
 CAMERA = Camera(160, 120, 125.0, 125.0, 80.5, 59.5)
 """One pixel of it is one of the map."""
-HOURS = 0.25, 0.5, 1.0, 2.0, 4.0
+HOURS = 0.25, 0.5, 1.0, 2.0
 QUICK_HOURS = 0.1, 0.2
 KINDS = {"track": "hours of flight", "smooth": "hours of flight, recorded for smoothing"}
 HEADER = ("views", "ms", "p99 ms", "resident MB", "peak MB")
