@@ -163,7 +163,7 @@ def cameras(place: Workplace) -> Section:
         "known, no prior; one process per row",
         "processor: median and p99 of the time of all threads together; clock: of the time that "
         "passed, with other work on the machine; both without the first view, which prepares the "
-        "map",
+        "map, and without reading and decoding the picture",
         "of files: resident pages of files at the end, those of the libraries: the map is read "
         "into memory, not mapped",
     )
