@@ -63,7 +63,8 @@ def measure(place: Workplace) -> Section:
         f"read, decoded and tracked, as fast as the processor does it; laps over {SIDE_M / 1e3:g} "
         f"x {SIDE_M / 1e3:g} km of generated ground of another date at {GSD_M:g} m",
         f"processor time of one core, of the last {last} views, {LAPS} laps; memory: resident "
-        "at that hour, and the largest up to it; the list of these figures takes some 0.1 kB a view",
+        "at that hour, and the largest up to it; the list of these figures takes some 0.1 kB a "
+        "view",
     )
     section.tables[-1] = replace(section.tables[-1], notes=[*section.tables[-1].notes, *notes])
     plot(curves, place.cache.parent / "growth-hours.png")
