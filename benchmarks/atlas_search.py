@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.atlas_fields import Fields, drawn_ids
+from benchmarks.child import memory_mb
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, Table, number, provenance
 from orthonav.atlas.index_manifest import Part, ShardInfo
@@ -161,7 +162,7 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
     """Search in this process, bound to one core, one query at a time."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     faiss().omp_set_num_threads(1)
-    bare_mb = _status_mb("VmHWM")
+    bare_mb = memory_mb("VmHWM")
     truth = np.load(folder / TRUTH)
     queries, exact, own = truth["queries"], truth["ids"], truth["own"]
     start = time.perf_counter()
@@ -192,7 +193,7 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
         float(np.median(thread_ms)),
         batch_ms,
         open_ms,
-        _status_mb("VmHWM"),
+        memory_mb("VmHWM"),
         bare_mb,
     )
 
@@ -289,13 +290,6 @@ def _facts(section: Section, count: int, found: Sequence[Found]) -> None:
 def _about(folder: Path) -> dict[str, Any]:
     made: dict[str, Any] = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
     return made
-
-
-def _status_mb(name: str) -> float:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{name}:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return float("nan")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -8,15 +8,21 @@ from pathlib import Path
 from typing import Any
 
 
-def peak_memory_mb() -> float:
-    """Peak resident memory of this process in MB.
+def memory_mb(kind: str) -> float:
+    """Resident memory of this process in MB: the largest (`VmHWM`), now (`VmRSS`), of files now
+    (`RssFile`).
 
     Linux's own count: `ru_maxrss` of a started process also remembers its parent's memory.
     """
     for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
+        if line.startswith(f"{kind}:"):
             return int(line.split()[1]) * 1024 / 1e6
-    raise RuntimeError("this system does not report the peak memory of a process")
+    raise RuntimeError(f"this system does not report {kind} of a process")
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process in MB."""
+    return memory_mb("VmHWM")
 
 
 class _Clock:

@@ -1,19 +1,27 @@
 """How the time and memory of a view grow: a table and a plot per kind of work, slopes named."""
 
+import itertools
 import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
+from benchmarks.looped_flight import SMALL_CAMERA, LoopedFlight, rendered
 from benchmarks.placing import BOTH, Task, placed
 from benchmarks.record import Section, Table, number
 from benchmarks.verdicts import from_placed, percent
+from orthonav.geo.camera import Camera
+from orthonav.mapfile import open_map
 from orthonav.simulate.flight import Errors
 
+CAMERA_SIDE_M, CAMERA_HZ, CAMERA_VIEWS = 2000, 2.0, 40
+CAMERAS = SMALL_CAMERA, Camera(320, 240, 250.0, 250.0, 161.5, 118.5)
+"""Both see the same ground."""
 VIEWS_M = 1000
 """Side of the square over which all views are flown."""
 ALIKE = (
@@ -59,6 +67,26 @@ class Axis:
     cases: dict[float, Case]
 
 
+@dataclass(frozen=True)
+class Curve:
+    """Two figures (`labels`, in `unit`) by the amount `x` of one kind of work."""
+
+    title: str
+    x: Sequence[float]
+    figures: Sequence[tuple[float, float]]
+    unit: str = "ms a view"
+    labels: tuple[str, str] = ("median", "99 %")
+
+    @property
+    def slope(self) -> float:
+        """Exponent of the first figure."""
+        return slope_of(self.x, [first for first, _ in self.figures])
+
+    def notes(self, what: str) -> tuple[str, ...]:
+        """A line that names the exponent; none of a single point."""
+        return () if math.isnan(self.slope) else (f"{what} grows as x^{self.slope:.2f}",)
+
+
 SIDES_M = 1000, 2000, 4000, 10000
 AXES = (
     Axis("area, km2", {(side / 1e3) ** 2: Case(side) for side in SIDES_M}),
@@ -89,7 +117,7 @@ def measure(place: Workplace) -> Section:
     section, known = Section("How a view's time grows"), dict[Case, dict[str, object]]()
     views = 6 if place.quick else 40
     seen = f"{views} views of 2021 over the inner 1 x 1 km, the same places in every row"
-    curves = []
+    curves: list[Curve] = []
     for axis in AXES[:1] if place.quick else AXES:
         cases = {
             x: case for x, case in axis.cases.items() if not place.quick or case.side_m <= 1000
@@ -102,15 +130,62 @@ def measure(place: Workplace) -> Section:
             cells, quantiles_ms = _cells(section, f"{axis.title} {x:g}", case, known[case])
             rows.append([f"{x:g}", *cells])
             times_ms.append(quantiles_ms)
-        slope = slope_of(list(cases), [median for median, _ in times_ms])
-        notes = () if math.isnan(slope) else (f"time of a view grows as x^{slope:.2f}",)
+        curves.append(Curve(axis.title, list(cases), times_ms))
+        notes = curves[-1].notes("time of a view")
         section.tables.append(Table(f"Growth: {axis.title}", (axis.title, *HEADER), rows, notes))
-        curves.append((axis.title, list(cases), times_ms, slope))
     section.tables[-1] = replace(
         section.tables[-1], notes=[*section.tables[-1].notes, *ALIKE, seen]
     )
-    _plot(curves, place.cache.parent / "growth.png")
+    plot(curves, place.cache.parent / "growth.png")
     return section
+
+
+def cameras(place: Workplace) -> Section:
+    """Small cameras over the same ground: single views and a track, one thread and two."""
+    section, rows = Section("Small cameras"), []
+    past, present = place.area(CAMERA_SIDE_M, 1.0, [PAST, PRESENT])
+    map_path = place.map(past)
+    frame = open_map(map_path).manifest.sheets[0].frame
+    for camera in CAMERAS:
+        lap = rendered(place, present, frame, LoopedFlight(camera, CAMERA_HZ, short=True))
+        for track, threads in itertools.product((False, True), (1, 2)):
+            views = 6 if place.quick else CAMERA_VIEWS
+            task = Task(BOTH, str(map_path), str(lap), track=track, threads=threads, views=views)
+            rows.append(_camera_cells(section, camera, task, placed(task)))
+            print(f"        {rows[-1][:3]} done", file=sys.stderr, flush=True)
+    header = (
+        *("camera, px", "views", "threads", "processor ms", "p99 ms", "clock ms", "p99 ms"),
+        *("first view ms", "peak MB", "of files MB", "15 m"),
+    )
+    notes = (
+        f"{views} views of 320 x 240 m of 2021, {1 / CAMERA_HZ:g} s apart, on "
+        f"{CAMERA_SIDE_M / 1e3:g} x {CAMERA_SIDE_M / 1e3:g} km of generated ground at 1 m, heading "
+        "known, no prior; one process per row",
+        "processor: median and p99 of the time of all threads together; clock: of the time that "
+        "passed, with other work on the machine; both without the first view, which prepares the "
+        "map, and without reading and decoding the picture",
+        "of files: resident pages of files at the end, those of the libraries: the map is read "
+        "into memory, not mapped",
+    )
+    section.tables.append(Table(section.title, header, rows, notes))
+    return section
+
+
+def _camera_cells(
+    section: Section, camera: Camera, task: Task, result: dict[str, Any]
+) -> list[str]:
+    """Cells of a row of `cameras`."""
+    verdict, kind = from_placed(result), "tracked" if task.track else "single"
+    size = f"{camera.width_px} x {camera.height_px}"
+    name, data = f"{size} px, {kind}, {task.threads} threads", "lap"
+    times = {"processor": verdict.times_ms[1:], "clock": np.array(result["wall_ms"][1:])}
+    cells = [size, kind, str(task.threads)]
+    for clock, times_ms in times.items():
+        found = section.add(f"{name}: {clock}", "ms", times_ms, data=data, seed=FLIGHT_SEED)
+        cells += [number(found.median), number(float(np.percentile(times_ms, 99)))]
+    cells += [number(result[key]) for key in ("cold_ms", "peak_mb", "mapped_mb")]
+    section.add(f"{name}: peak memory", "MB", [result["peak_mb"]], data=data, seed=FLIGHT_SEED)
+    return [*cells, percent(float(verdict.within(15.0).mean()))]
 
 
 def slope_of(x: Sequence[float], y: Sequence[float]) -> float:
@@ -149,10 +224,8 @@ def _cells(
     return [*cells, percent(float(hits.mean()))], (time.median, p99_ms)
 
 
-def _plot(
-    curves: Sequence[tuple[str, Sequence[float], Sequence[tuple[float, float]], float]], path: Path
-) -> Path:
-    """Median and p99 of the time over the amount of work, one panel per kind of work."""
+def plot(curves: Sequence[Curve], path: Path) -> Path:
+    """The curves over the amount of work, one panel per kind of work."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -163,11 +236,11 @@ def _plot(
     figure, axes = pyplot.subplots(
         rows, columns, figsize=(3.6 * columns, 3 * rows), layout="constrained", squeeze=False
     )
-    for axis, (title, x, times_ms, slope) in zip(axes.flat, curves, strict=False):
-        median, p99 = zip(*times_ms, strict=True)
-        axis.loglog(x, median, "o-", label=f"median, slope {slope:.2f}")
-        axis.loglog(x, p99, "o--", label="99 %")
-        axis.set(xlabel=title, ylabel="ms a view")
+    for axis, curve in zip(axes.flat, curves, strict=False):
+        first, second = zip(*curve.figures, strict=True)
+        axis.loglog(curve.x, first, "o-", label=f"{curve.labels[0]}, slope {curve.slope:.2f}")
+        axis.loglog(curve.x, second, "o--", label=curve.labels[1])
+        axis.set(xlabel=curve.title, ylabel=curve.unit)
         axis.grid(alpha=0.3, which="both")
         axis.legend(fontsize=8)
     for axis in axes.flat[len(curves) :]:

@@ -30,7 +30,8 @@ if [ ! -e "$work/root/.done" ]; then
     rm -rf "$work/root" && mkdir "$work/root"
     # Through a tar file, so that all files belong to the user, also in a user namespace.
     mmdebstrap --quiet --arch=arm64 --variant=extract --format=tar \
-        --hook-dir=/usr/share/mmdebstrap/hooks/merged-usr --include=python3,libstdc++6 \
+        --hook-dir=/usr/share/mmdebstrap/hooks/merged-usr \
+        --include=python3,libstdc++6,libpython3-dev \
         "$suite" - | tar -x -C "$work/root" --exclude=./dev --no-same-owner
     touch "$work/root/.done"
 fi
@@ -48,13 +49,25 @@ if [ ! -e "$work/site/.done" ]; then
     touch "$work/site/.done"
 fi
 
+# The package as links, in which the kernel of arm64 takes the place of that of this machine.
+kernel=orthonav/register/_kernel
+rm -rf "$work/src" && mkdir "$work/src" && cp -rs "$checkout/src/orthonav" "$work/src/"
+rm -f "$work/src/$kernel".*so
+if command -v aarch64-linux-gnu-gcc >/dev/null; then
+    aarch64-linux-gnu-gcc -O3 -shared -fPIC "-I$work/root/usr/include/$python" \
+        -idirafter "$work/root/usr/include" -o "$work/src/$kernel.abi3.so" \
+        "$checkout/src/$kernel.c" -lm
+else
+    echo "aarch64-linux-gnu-gcc is missing: NumPy takes the place of the kernel" >&2
+fi
+
 # The emulated Python is a script that gives its own name to Python, as sys.executable: processes
 # started with it are emulated too, whatever their environment.
 cat >"$work/python" <<EOF
 #!/bin/sh
 export QEMU_CPU="$QEMU_CPU" PYTHONHOME="$work/root/usr" PYTHONDONTWRITEBYTECODE=1
-export PYTHONPATH="$checkout/src:$work/site"
-exec qemu-aarch64-static -0 "$work/python" -L "$work/root" "$work/root/usr/bin/$python" "\$@"
+export PYTHONPATH="$work/src:$work/site"
+exec "\${QEMU:-qemu-aarch64-static}" -0 "$work/python" -L "$work/root" "$work/root/usr/bin/$python" "\$@"
 EOF
 chmod +x "$work/python"
 emulated() { "$work/python" "$@"; }
