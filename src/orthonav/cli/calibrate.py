@@ -48,7 +48,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=5.0,
         metavar="M",
-        help="standard deviation of --gnss-positions per axis (m; default 5)",
+        help="standard deviation of --gnss-positions, per axis (default 5)",
     )
     parser.add_argument(
         "--heading",
