@@ -3,7 +3,7 @@
 #              are then skipped by name
 # make lint    style, types, import layers; rows of the paper's tables that are older than their code
 # make bench   measure speed, memory and accuracy beside what a user would pick instead
-# make paper   the tables of the paper in the reduced setting, less than an hour
+# make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
 # make clean   remove .venv and what was made here
 
