@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.errors import FlightError
-from orthonav.evaluate.calibration_report import nees_words
+from orthonav.evaluate.calibration_report import nees_text
 from orthonav.evaluate.flights import verdict
 from orthonav.evaluate.metrics import (
     CRITERIA,
@@ -246,4 +246,4 @@ def test_confident_and_wrong_is_told_from_a_wrong_guess() -> None:
     ],
 )
 def test_consistency_is_put_in_words(nees, said) -> None:
-    assert nees_words(nees, 1.5, 2.6) == said
+    assert nees_text(nees, 1.5, 2.6) == said

@@ -12,7 +12,14 @@ from orthonav.geo.camera import Camera
 from orthonav.geo.headings import seem_radians
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.setups import SAMPLE, DoubtedViews, Setup, Tried, mirrored_camera, try_setups
+from orthonav.onboard.setups import (
+    SAMPLE,
+    LowConfidenceViews,
+    Setup,
+    Tried,
+    mirrored_camera,
+    try_setups,
+)
 from orthonav.records import Fix, NoFix, Prior, View, ViewResult
 
 ACCEPTS = Acceptance("confidence", 0.9).accepts
@@ -118,7 +125,7 @@ def test_a_sample_of_the_doubted_views_is_kept(views):
             self.telemetry = replace(views[0].telemetry, time_ns=number)
             self.grey = lambda: views[0].grey
 
-    doubted = DoubtedViews(views[0].camera, lambda telemetry: telemetry)
+    doubted = LowConfidenceViews(views[0].camera, lambda telemetry: telemetry)
     place = Fix(46.0, 3.0, np.eye(2), 0.4, 35.0, 0.0, 100.0)
     for number, _ in enumerate(doubted.watching(map(Recorded, range(100)))):
         outcome = NoFix("blank", "") if number % 2 else replace(place, confidence=number / 100)

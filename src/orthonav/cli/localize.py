@@ -17,7 +17,7 @@ from orthonav.cli.common import add_search, print_json, progress, search_plan
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
-from orthonav.cli.setups import Counts, Doubts
+from orthonav.cli.setups import Counts, SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
@@ -206,7 +206,7 @@ def _on_map(options: argparse.Namespace) -> None:
     if mount:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
-    results, doubts = [], Doubts(options, flight, localizer, mount, heights)
+    results, advisor = [], SetupAdvice(options, flight, localizer, mount, heights)
     with progress(options) as shown:
         for result in localize_flight(
             locator,
@@ -214,10 +214,10 @@ def _on_map(options: argparse.Namespace) -> None:
             skip_bad_images=options.skip_bad_images,
             accept=accept,
             heights=heights,
-            views=doubts.watching(),
+            views=advisor.watching(),
         ):
             results.append(result)
-            doubts.take(result)
+            advisor.take(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
         if tracker is not None and options.smooth:
@@ -226,7 +226,7 @@ def _on_map(options: argparse.Namespace) -> None:
             compare_with_flight(flight, results)
         write_results(options.out, results)
         export_all(exports, results, dem or TerrainLayer.of(opened))
-        advice, tried = doubts.advice(results, accept, shown)
+        advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
         changed = report_changes(options, opened, [(seen_by, results)], shown)
     _print_summary(options, results, accept, advice, tried, changed)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from orthonav.evaluate.calibration_report import (
+    calibration_lines,
     calibration_to_json,
     consistency_to_json,
     row_to_json,
-    trust_lines,
 )
 from orthonav.evaluate.contact_sheet import Row
 from orthonav.evaluate.figures import or_none
@@ -156,7 +156,7 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
 
     `whole`: what `total` gives.
     """
-    lines = trust_lines(whole)
+    lines = calibration_lines(whole)
     for flight in flights:
         if flight.track is not None:
             lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")
