@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     from orthonav.geo.route import read_route
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise AtlasError("torchrun is for a single map: an atlas is spread with --cluster")
+        raise AtlasError("torchrun trains one map: use --cluster to build an atlas in parallel")
     request = AtlasRequest(
         url=options.atlas,
         orthos=options.ortho,
@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
             result = build_atlas(request, runner, shown, reporter(options))
     except KeyboardInterrupt:
         print(
-            "orthonav: error: interrupted; finished sheets are kept, rerun to resume",
+            "orthonav: error: interrupted; finished sheets are stored, rerun to resume",
             file=sys.stderr,
         )
         return 1

@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
 
     if options.latency:
         if options.dem is not None:
-            raise FlightError("--latency uses the heights of the log: leave out --dem")
+            raise FlightError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
     if not 0 < options.gnss_std_m < 1e5:

@@ -277,7 +277,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     from orthonav.geo.terrain import LANDING_M
 
     if options.dem_datum is not None and options.dem is None:
-        raise CheckError("--dem-datum is that of a terrain model: give --dem too")
+        raise CheckError("--dem-datum needs a terrain model: give --dem too")
     if options.agl_m is not None:
         return options.agl_m, "as given"
     heights = [] if route is None else [each for each in route.heights if each is not None]

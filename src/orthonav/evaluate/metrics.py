@@ -225,7 +225,7 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
     Raises `ValueError` for no flight at all.
     """
     if not comparisons:
-        raise ValueError("nothing to pool: expected at least one flight")
+        raise ValueError("no results: expected at least one flight")
     parts = list(comparisons)
     starts: list[int] = []
     views = 0
