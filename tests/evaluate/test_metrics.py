@@ -222,7 +222,7 @@ def test_confident_and_wrong_is_told_from_a_wrong_guess() -> None:
     """Wrong is above 35 m, the radius of the evaluation and the radius that the fix states."""
     guess = measure(three_fixes())
     assert (guess.n_confident, guess.n_confident_wrong) == (1, 0)
-    assert verdict(guess).startswith("No confident fix is wrong: none of 1 errs by more than 35 m")
+    assert verdict(guess).startswith("No confident fix is wrong: none of 1 has an error above 35 m")
     assert "largest 5.0 m" in verdict(guess)
     results = [fix("a", (0.0, 40.0), confidence=0.95), fix("b", (0.0, 30.0), confidence=0.95)]
     wrong = compare(truth_of(TRUTH_EN_M), results)

@@ -177,7 +177,7 @@ def confidence_text(metrics: Metrics) -> str:
     default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
     return (
         f"{calibration.n_fixes} fixes state {calibration.mean_confidence:.3f} on average, and "
-        f"{calibration.share_right:.3f} of them err by at most the radius they state{default}; "
+        f"{calibration.share_right:.3f} of them are within the stated radius{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
 

@@ -83,7 +83,7 @@ class Comparison:
         return self.errors_m.size + self.n_without_result
 
     def confident_wrong(self, least_m: float) -> BoolArray:
-        """(N,): confident fixes that err by more than `least_m` and the radius they state."""
+        """(N,): confident fixes with an error above `least_m` and above the stated radius."""
         wrong: BoolArray = self.confident & (self.errors_m > np.fmax(least_m, self.own_radius_m))
         return wrong
 
