@@ -133,8 +133,8 @@ def test_all_is_defined_without_any_fix() -> None:
 
 def test_what_has_no_partner_is_counted_and_left_out() -> None:
     truth = {**truth_of(TRUTH_EN_M), "a": (math.nan, 0.0)}
-    stranger = ViewResult("z", 0, NoFix("blank", ""), 1.0)
-    metrics = measure(compare(truth, [fix("a", (0, 0)), fix("b", (0, 0)), stranger]))
+    other = ViewResult("z", 0, NoFix("blank", ""), 1.0)
+    metrics = measure(compare(truth, [fix("a", (0, 0)), fix("b", (0, 0)), other]))
     assert (metrics.n_views, metrics.n_without_truth, metrics.n_without_result) == (3, 2, 2)
     assert metrics.coverage == metrics.accuracy == 1 / 3 and metrics.reasons == {"no_result": 2}
 
@@ -218,7 +218,7 @@ def test_curves_and_rows_agree_and_shares_grow(views: list[tuple[float, float | 
         assert accuracy == pytest.approx(sum(error <= 15.0 for error in kept) / len(kept))
 
 
-def test_confident_and_wrong_is_told_from_a_wrong_guess() -> None:
+def test_confident_and_wrong_is_distinguished_from_a_wrong_guess() -> None:
     """Wrong is above 35 m, the radius of the evaluation and the radius that the fix states."""
     guess = measure(three_fixes())
     assert (guess.n_confident, guess.n_confident_wrong) == (1, 0)
