@@ -207,7 +207,7 @@ def _draw_ellipses(
     for i in usable[:: max(1, math.ceil(usable.size / MOST_ELLIPSES))]:
         sizes, axes_en = np.linalg.eigh(comparison.cov_en_m2[i])
         width, height = 2 * np.sqrt(nees_bound(0.95) * np.maximum(sizes[::-1], 0.0))
-        turn_deg = math.degrees(math.atan2(axes_en[1, 1], ways[0, 1]))
+        turn_deg = math.degrees(math.atan2(axes_en[1, 1], axes_en[0, 1]))
         colour = STATE_STYLES.get(series.states[i], (GREY, ""))[0]
         at = tuple(map(float, comparison.fix_en_m[i]))
         shape = Ellipse((at[0], at[1]), width, height, angle=turn_deg, fill=False, zorder=5)
