@@ -88,7 +88,8 @@ def _area(found: Sequence[Result]) -> list[str]:
         f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; a method "
         f"that always finds the correct tile has {percent(bound)} % at 15 m anywhere",
         "route: one view per tile step along the route; right tile: share of the views anywhere "
-        "that are within half a tile spacing (along the diagonal); of: number of views of each kind",
+        "that are within half a tile spacing (along the diagonal); of: number of views of each "
+        "kind",
         TUNED,
     ]
 
