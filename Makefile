@@ -1,9 +1,9 @@
-# make demo    install into .venv and run the whole story on a generated area
+# make demo    install into .venv and run all steps on a generated area
 # make test    install and run the tests; `make test EXTRAS=test` without PyTorch and Ray, whose tests
 #              are then skipped by name
 # make lint    style, types, import layers; rows of the paper's tables that are older than their code
-# make bench   measure speed, memory and accuracy beside what a user would pick instead
-# make paper   the tables of the paper in the reduced setting, less than an hour
+# make bench   measure speed, memory and accuracy, and compare with other methods
+# make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
 # make clean   remove .venv and what was made here
 

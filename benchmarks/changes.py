@@ -302,8 +302,8 @@ def _table(found: Sequence[Outcome], options: argparse.Namespace) -> Table:
         )
     header = (
         *("scene, map / views", "dates up to + from", "confident views"),
-        *("cells changed + unchanged", "changed, not seen", "AUC", "changed and named"),
-        "unchanged and named",
+        *("cells changed + unchanged", "changed, not seen", "AUC", "changed and reported"),
+        "unchanged and reported",
     )
     notes = (
         f"{options.views} views {options.width} px of the map wide at random places of the later "

@@ -272,7 +272,7 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     return [
         Table("Checks and what came out", header, rows, notes),
         _bins_table(found, lambda each: each.predicted(by[each.scene]), "by the other scenes"),
-        _bins_table(found, lambda each: each.predicted(PLAIN), "trials as they are"),
+        _bins_table(found, lambda each: each.predicted(PLAIN), "without recalibration"),
     ]
 
 

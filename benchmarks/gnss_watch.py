@@ -24,9 +24,9 @@ from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     Fault,
+    GnssState,
     GnssStatus,
     MapPosition,
-    State,
 )
 from orthonav.simulate.motion import gauss_markov
 from orthonav.simulate.receiver import (
@@ -229,7 +229,7 @@ def false_alarms(
     solved = solutions(receiver_of(receiver), path.times_s, path.en_m, rng, rate_hz)
     monitor = GnssMonitor(FRAME)
     seen = changes(fed(monitor, solved, positions))
-    return [(at_s, status) for at_s, status in seen if status.state is State.ALARM], monitor
+    return [(at_s, status) for at_s, status in seen if status.state is GnssState.ALARM], monitor
 
 
 def delay(
@@ -252,7 +252,7 @@ def delay(
     solved = solutions(receiver, path.times_s, path.en_m, rng)
     found: list[tuple[float, Fault | None]] = []
     for now_s, status in changes(fed(GnssMonitor(FRAME), solved, positions)):
-        if status.state is State.ALARM and now_s >= at_s:
+        if status.state is GnssState.ALARM and now_s >= at_s:
             found.append((now_s - at_s, status.fault))
         if found and now_s > at_s + found[0][0] + SETTLED_S:
             break
@@ -358,7 +358,7 @@ def slow_drag(mps: float, seed: int) -> tuple[float, float, float]:
     monitor, most = GnssMonitor(FRAME), 0.0
     for now_s, status in fed(monitor, solved, positions):
         off_m = math.hypot(*(monitor.learnt.en_m - errors.displaced_en_m))
-        if now_s > 3600 and status.state is State.ALARM:
+        if now_s > 3600 and status.state is GnssState.ALARM:
             return now_s - 3600, most, off_m
         most = max(most, off_m) if now_s > 3600 else 0.0
     return math.nan, most, off_m

@@ -278,11 +278,11 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, undrawn)
 
 def test_true_positions_of_another_place_are_named(run, fixes_path, truth_path, tmp_path):
     lines = [line.split(",") for line in truth_path.read_text().splitlines()]
-    for name, told, said in (
+    for name, changed, said in (
         ("swapped.csv", [[f, lon, lat] for f, lat, lon in lines[1:]], "seem to be swapped"),
         ("far.csv", [[f, str(float(lat) - 5), lon] for f, lat, lon in lines[1:]], "same flight?"),
     ):
-        rows = [",".join(row) for row in [lines[0], *told]]
+        rows = [",".join(row) for row in [lines[0], *changed]]
         (tmp_path / name).write_text("\n".join(rows) + "\n")
         done = run("evaluate", fixes_path, "--truth", tmp_path / name)
         assert done.code == 0 and said in done.err and " km from the fixes (median)" in done.err
@@ -294,11 +294,11 @@ def test_a_map_of_another_area_is_named(run, map_path, flight_path, out):
     few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
     truth = few / "truth.csv"
     rows = [line.split(",") for line in truth.read_text().splitlines()]
-    for told, said in (
+    for changed, said in (
         ([[frame, str(float(lat) - 5), lon] for frame, lat, lon in rows[1:]], " km from the map; "),
         ([[frame, lon, lat] for frame, lat, lon in rows[1:]], "seem to be swapped"),
     ):
-        truth.write_text("\n".join(",".join(row) for row in [rows[0], *told]) + "\n")
+        truth.write_text("\n".join(",".join(row) for row in [rows[0], *changed]) + "\n")
         done = run(
             *("localize", map_path, few, "--out", out / "f.jsonl", "--json"),
             *("--accept", "confidence:0.9999999"),

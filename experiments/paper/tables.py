@@ -85,10 +85,11 @@ def _area(found: Sequence[Result]) -> list[str]:
     bound = ceiling(first.stride_m)
     return [
         f"{flown['length_m']:g} x {flown['band_m']:g} m from {flown['agl_m']:g} m, "
-        f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; one who "
-        f"always named the right tile would have {percent(bound)} % at 15 m anywhere",
-        "route: one view per tile step along it; right tile: of views anywhere, within half a tile "
-        "spacing (along the diagonal); of: number of views of each kind",
+        f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; a method "
+        f"that always finds the correct tile has {percent(bound)} % at 15 m anywhere",
+        "route: one view per tile step along the route; right tile: share of the views anywhere "
+        "that are within half a tile spacing (along the diagonal); of: number of views of each "
+        "kind",
         TUNED,
     ]
 
@@ -115,7 +116,7 @@ def table_3(results: Sequence[Result]) -> list[Table]:
     notes = (
         "accuracy at 15 m of the accepted views, and their share, in %, views on the grid",
         "accepted at 95 %: largest share that a threshold accepts with at least 95 % correct, "
-        "chosen on these very views; excluding: best score over the best one beyond half a tile",
+        "chosen on the same views; excluding: best score over the best one beyond half a tile",
     )
     return [Table("Table 3: confidence criteria", header, rows, notes)]
 
@@ -285,8 +286,8 @@ def row_table(results: Sequence[Result]) -> Table:
     )
     known = [each.plain["cpu_minutes"] for each in results if "cpu_minutes" in each.plain]
     notes = (
-        f"core minutes: time of the processor, of {len(known)} rows together {sum(known):.0f}; "
-        "minutes: by the clock, longer beside other work",
+        f"core minutes: processor time, {sum(known):.0f} for {len(known)} rows together; minutes: "
+        "elapsed time, longer beside other work",
     )
     return Table("Rows", header, rows, notes)
 

@@ -31,7 +31,7 @@ _MODULES = {
 
 
 @dataclass(frozen=True)
-class Package:
+class RequiredPackage:
     """A package that orthonav or one of its extras asks for.
 
     `name`: as pyproject.toml writes it. `asked`: version range, such as `>=1.4`. `version`: the one
@@ -82,15 +82,15 @@ def _numbers(version: str) -> list[int]:
     return [int(part) for part in version.split(".")[:2]]
 
 
-def packages(extra: str = "") -> tuple[Package, ...]:
+def packages(extra: str = "") -> tuple[RequiredPackage, ...]:
     """Packages of an extra, those of the extras that it includes too, each once; "" is the core."""
-    found: dict[str, Package] = {}
+    found: dict[str, RequiredPackage] = {}
     for name, included, asked, marker in _requirements().get(extra, []):
         if name == NAME:
             for each in included.split(","):
                 found.update({package.name: package for package in packages(each.strip())})
         else:
-            found[name] = Package(name, asked, _version(name), _holds(marker))
+            found[name] = RequiredPackage(name, asked, _version(name), _holds(marker))
     return tuple(found.values())
 
 

@@ -393,7 +393,7 @@ def test_conflicting_or_impossible_options_are_refused(
 
 def test_torchrun_is_refused(run, ortho, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert "torchrun is for a single map" in run("atlas", "build", "a", "--ortho", ortho).err
+    assert "torchrun trains one map" in run("atlas", "build", "a", "--ortho", ortho).err
 
 
 def test_the_help_of_a_build_is_grouped(run):

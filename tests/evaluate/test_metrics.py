@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.errors import FlightError
-from orthonav.evaluate.calibration_report import nees_words
+from orthonav.evaluate.calibration_report import nees_text
 from orthonav.evaluate.flights import verdict
 from orthonav.evaluate.metrics import (
     CRITERIA,
@@ -133,8 +133,8 @@ def test_all_is_defined_without_any_fix() -> None:
 
 def test_what_has_no_partner_is_counted_and_left_out() -> None:
     truth = {**truth_of(TRUTH_EN_M), "a": (math.nan, 0.0)}
-    stranger = ViewResult("z", 0, NoFix("blank", ""), 1.0)
-    metrics = measure(compare(truth, [fix("a", (0, 0)), fix("b", (0, 0)), stranger]))
+    other = ViewResult("z", 0, NoFix("blank", ""), 1.0)
+    metrics = measure(compare(truth, [fix("a", (0, 0)), fix("b", (0, 0)), other]))
     assert (metrics.n_views, metrics.n_without_truth, metrics.n_without_result) == (3, 2, 2)
     assert metrics.coverage == metrics.accuracy == 1 / 3 and metrics.reasons == {"no_result": 2}
 
@@ -218,11 +218,11 @@ def test_curves_and_rows_agree_and_shares_grow(views: list[tuple[float, float | 
         assert accuracy == pytest.approx(sum(error <= 15.0 for error in kept) / len(kept))
 
 
-def test_confident_and_wrong_is_told_from_a_wrong_guess() -> None:
+def test_confident_and_wrong_is_distinguished_from_a_wrong_guess() -> None:
     """Wrong is above 35 m, the radius of the evaluation and the radius that the fix states."""
     guess = measure(three_fixes())
     assert (guess.n_confident, guess.n_confident_wrong) == (1, 0)
-    assert verdict(guess).startswith("No confident fix is wrong: none of 1 errs by more than 35 m")
+    assert verdict(guess).startswith("No confident fix is wrong: none of 1 has an error above 35 m")
     assert "largest 5.0 m" in verdict(guess)
     results = [fix("a", (0.0, 40.0), confidence=0.95), fix("b", (0.0, 30.0), confidence=0.95)]
     wrong = compare(truth_of(TRUTH_EN_M), results)
@@ -246,4 +246,4 @@ def test_confident_and_wrong_is_told_from_a_wrong_guess() -> None:
     ],
 )
 def test_consistency_is_put_in_words(nees, said) -> None:
-    assert nees_words(nees, 1.5, 2.6) == said
+    assert nees_text(nees, 1.5, 2.6) == said

@@ -99,3 +99,8 @@ def test_far_away_is_far_away():
 def test_an_invalid_centre_is_refused(lat, lon):
     with pytest.raises(AreaError, match="centre of a sheet"):
         LocalFrame(lat, lon)
+
+
+def test_a_centre_with_swapped_coordinates_is_named():
+    with pytest.raises(AreaError, match=r"got 120.0, 48.0; latitude and longitude seem"):
+        LocalFrame(120.0, 48.0)

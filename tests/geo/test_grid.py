@@ -104,5 +104,5 @@ def test_impossible_numbers_are_refused(change, message):
     "extent", [(1, 0, 0, 1), (0, 1, 1, 0), (math.nan, 0, 1, 1), (-math.inf, 0, math.inf, 1)]
 )
 def test_an_empty_or_endless_extent_is_refused(extent):
-    with pytest.raises(AreaError, match="area is empty or endless"):
+    with pytest.raises(AreaError, match="area is empty or not finite"):
         TileGrid.covering(extent, **GOOD)

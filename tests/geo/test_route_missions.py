@@ -157,7 +157,7 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
         (plan(home=["x", 8, 0]), "plannedHomePosition must be a number"),
         (
             plan(simple(16, A), {"type": "ComplexItem", "complexItemType": "StructureScan"}),
-            "item 2 of the plan is a 'StructureScan': only surveys, .*take it out",
+            "item 2 of the plan is a 'StructureScan': only surveys, .*remove it from the plan",
         ),
         (plan(transects("survey", ())), "item 1 of the plan .survey. has no Visual"),
         (plan({"type": "ComplexItem", "complexItemType": "survey"}), "no VisualTransectPoints"),

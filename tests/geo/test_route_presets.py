@@ -54,7 +54,8 @@ def test_it_is_read_like_a_file_and_makes_an_area():
         ("paper:A@1,2,3,4", "must be paper:A@LAT,LON"),
         ("paper:A@1,east", "must be paper:A@LAT,LON"),
         ("paper:A@nan,2", "must be paper:A@LAT,LON"),
-        ("paper:A@90,2", "no place within 89 deg"),
+        ("paper:A@90,2", "latitude of -89 to 89"),
+        ("paper:A@120,46", "got 120.0, 46.0; latitude and longitude seem to be swapped"),
     ],
 )
 def test_other_presets_are_refused(text, message):

@@ -97,7 +97,7 @@ def test_any_coordinate_system_and_a_raster_that_begins_in_the_south(make_dem, t
 
 
 def test_the_vertical_datum_is_that_of_the_file_or_asked_for(make_dem):
-    with pytest.raises(ImageryError, match=r"does not state what .* --dem-datum"):
+    with pytest.raises(ImageryError, match=r"does not state its vertical datum.* --dem-datum"):
         open_dem(make_dem())
     compound = "EPSG:32631+5773"
     corner = Affine(10, 0, 458_000, 0, -10, 5_152_000)
@@ -165,7 +165,7 @@ def test_holes_stay_holes(make_dem, change, profile, guessed, caplog):
     assert np.isnan(dem(*places(float(east), float(north))))
     around = dem.in_plane(FRAME, east - 400.0, north + 400.0, 20.0, 40, 40)
     assert np.isnan(around[20, 20]) and np.nanmin(around) > 350
-    assert ("is taken as no data" in caplog.text) == guessed
+    assert ("is treated as no data" in caplog.text) == guessed
     assert error_m(dem) < 0.6
 
 

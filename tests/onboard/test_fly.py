@@ -1,5 +1,6 @@
 """The flight loop: every fault of a flight, and a flight over UDP from end to end."""
 
+import argparse
 import json
 import math
 import os
@@ -31,11 +32,13 @@ from fake_autopilot import (
 from paced import pace_by
 
 from orthonav.cli import main
-from orthonav.errors import CameraError, MapChangedError, MapFileError
+from orthonav.errors import CameraError, MapChangedError, MapFileError, VariantError
 from orthonav.flight.fixes import result_from_json
 from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.flight.heights import FlownHeights
 from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
@@ -863,6 +866,26 @@ def test_invalid_options_end_with_one_line(flown, run, tmp_path):
     assert done.code == 1 and "tcp-listen" in done.err
     done = run("fly", path, folder, "--autopilot", "udpin:0", "--start", "1,2")
     assert done.code == 2 and "LAT,LON,STD_M" in done.err
+
+
+def test_a_start_far_from_the_map_is_named_and_a_swap_too(flown, caplog):
+    from orthonav.cli.flying import _given_start
+
+    localizer = Localizer(open_map(flown[0]))
+    lat, lon = localizer.sheet.frame.lat_deg, localizer.sheet.frame.lon_deg
+
+    def start(*values):
+        caplog.clear()
+        return _given_start(argparse.Namespace(start=values), localizer), caplog.text
+
+    assert start(lat, lon, 50.0) == (Prior(lat, lon, 50.0), "")
+    assert _given_start(argparse.Namespace(start=None), localizer) is None
+    assert "km from the map; check the map and the positions\n" in start(lat + 1, lon, 50.0)[1]
+    assert "seem to be swapped" in start(lon, lat, 50.0)[1]
+    with pytest.raises(VariantError, match=r"got 120,46,50; latitude and longitude seem"):
+        start(120.0, 46.0, 50.0)
+    with pytest.raises(VariantError, match="above 0 m"):
+        start(lat, lon, 0.0)
 
 
 def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():

@@ -16,7 +16,7 @@ from orthonav.onboard.gnss.difference import Difference, DifferenceModel, Differ
 from orthonav.onboard.gnss.learner import _Filter
 from orthonav.onboard.gnss.monitor import RETURN_S, GnssMonitor
 from orthonav.onboard.gnss.receiver import SILENCE_S, Receiver
-from orthonav.onboard.gnss.records import Fault, MapPosition, State
+from orthonav.onboard.gnss.records import Fault, GnssState, MapPosition
 from orthonav.simulate.receiver import receiver_of, solutions
 
 S = 10**9
@@ -63,9 +63,9 @@ class Air:
 def test_agreement_is_reached_and_the_displacement_learnt():
     air = Air()
     errors = {"gnss_m": (12.0, -5.0), "map_m": (12.0 - 25.0, -5.0 + 10.0)}
-    assert air.fly(30, **errors).state is State.WAITING
+    assert air.fly(30, **errors).state is GnssState.WAITING
     status = air.fly(600, **errors)
-    assert (status.state, status.reason, status.code) == (State.GOOD, None, 0)
+    assert (status.state, status.reason, status.code) == (GnssState.GOOD, None, 0)
     learnt = air.monitor.learnt
     assert learnt.en_m == pytest.approx([25, -10], abs=2.5)
     assert learnt.std_m < 6 and learnt.agreed_s > 400
@@ -108,7 +108,7 @@ def test_hours_without_a_fault_raise_no_alarm(name, seed, hours):
     errors = MAPS[name]
     alarms, last = false_alarms(hours, seed, "good:std_m=4", errors, rate_hz=1.0)
     assert alarms == []
-    assert last.status.state is State.GOOD
+    assert last.status.state is GnssState.GOOD
     off_m = np.hypot(*(last.learnt.en_m - errors.displaced_en_m))
     assert off_m < 4 * last.learnt.std_m < 15
 
@@ -119,7 +119,7 @@ def test_a_slow_drag_off_never_becomes_a_displacement():
     air.fly(120)
     for second in range(400):
         status = air.fly(1, gnss_m=(0.2 * second, 0.0))
-    assert status.state is State.ALARM and status.fault in (Fault.OFFSET, Fault.DRIFT)
+    assert status.state is GnssState.ALARM and status.fault in (Fault.OFFSET, Fault.DRIFT)
     assert np.hypot(*air.monitor.learnt.en_m) < 2
 
 
@@ -131,10 +131,10 @@ def test_a_drag_off_that_was_learnt_is_named_and_undone():
         replace(air.monitor.learnt, mean=poisoned), DifferenceModel()
     )
     status = air.fly(3)
-    assert (status.state, status.fault) == (State.ALARM, Fault.OFFSET)
+    assert (status.state, status.fault) == (GnssState.ALARM, Fault.OFFSET)
     assert status.fault_en_m == pytest.approx([25, 0], abs=1)
     assert np.array_equal(air.monitor.learnt.mean, KNOWN.mean)
-    assert air.fly(90).state is State.GOOD  # it agrees with what was known before
+    assert air.fly(90).state is GnssState.GOOD  # it agrees with what was known before
 
 
 @pytest.mark.long
@@ -147,7 +147,7 @@ def test_a_latency_does_not_make_a_step_where_the_aircraft_rolls():
     solved = solutions(receiver_of("good"), path.times_s, path.en_m, rng, 1.0)
     monitor = GnssMonitor(FRAME)
     states = {status.state for _, status in fed(monitor, solved, positions)}
-    assert states == {State.WAITING, State.GOOD}
+    assert states == {GnssState.WAITING, GnssState.GOOD}
     rolled = path.bank_tangent(0.0) - path.bank_tangent(0.3)
     assert 300 * np.abs(rolled).max() > 15  # the flight has such rolls
 
@@ -155,10 +155,10 @@ def test_a_latency_does_not_make_a_step_where_the_aircraft_rolls():
 def test_a_spoofed_place_at_the_start_is_an_offset():
     air = Air()
     status = air.fly(30, gnss_m=(400.0, 0.0))
-    assert (status.state, status.fault) == (State.ALARM, Fault.OFFSET)
+    assert (status.state, status.fault) == (GnssState.ALARM, Fault.OFFSET)
     air = Air(KNOWN)  # with a known displacement much less is enough
     status = air.fly(90, gnss_m=(60.0, 0.0))
-    assert (status.state, status.fault) == (State.ALARM, Fault.OFFSET)
+    assert (status.state, status.fault) == (GnssState.ALARM, Fault.OFFSET)
 
 
 def test_a_constant_offset_from_the_start_counts_as_displacement_of_an_unknown_map():
@@ -173,12 +173,12 @@ def test_a_constant_offset_from_the_start_counts_as_displacement_of_an_unknown_m
 def test_a_return_is_announced_after_agreement_only():
     air = Air()
     air.fly(400)
-    assert air.fly(20, gnss_m=(35.0, 0.0)).state is State.ALARM
-    assert air.fly(300, gnss_m=(35.0, 0.0)).state is State.ALARM  # it does not heal by itself
+    assert air.fly(20, gnss_m=(35.0, 0.0)).state is GnssState.ALARM
+    assert air.fly(300, gnss_m=(35.0, 0.0)).state is GnssState.ALARM  # it does not heal by itself
     status = air.fly(30)
-    assert (status.state, status.reason) == (State.RETURNING, "gnss_returning")
+    assert (status.state, status.reason) == (GnssState.RETURNING, "gnss_returning")
     status = air.fly(int(RETURN_S) + 10)
-    assert (status.state, status.fault) == (State.GOOD, None)
+    assert (status.state, status.fault) == (GnssState.GOOD, None)
     assert np.hypot(*status.difference_en_m) < 3
 
 
@@ -187,9 +187,9 @@ def test_an_outage_needs_agreement_too():
     air = Air()
     air.fly(400)
     assert air.fly(5, fix_type=1).fault is Fault.LOST
-    assert air.fly(8).state is State.ALARM
-    assert air.fly(8).state is State.RETURNING
-    assert air.fly(int(RETURN_S) + 10).state is State.GOOD
+    assert air.fly(8).state is GnssState.ALARM
+    assert air.fly(8).state is GnssState.RETURNING
+    assert air.fly(int(RETURN_S) + 10).state is GnssState.GOOD
     air.fly(5, fix_type=1)
     assert air.fly(30, gnss_m=(50.0, 0.0)).reason == "gnss_offset"  # it came back elsewhere
 
@@ -198,7 +198,7 @@ def test_a_jump_of_the_map_is_not_blamed_on_gnss():
     air = Air()
     air.fly(400)
     status = air.fly(20, map_m=(60.0, 0.0))
-    assert status.state is State.ALARM and status.fault is Fault.DISAGREES
+    assert status.state is GnssState.ALARM and status.fault is Fault.DISAGREES
 
 
 def test_single_wrong_positions_of_the_map_are_ignored():
@@ -206,12 +206,12 @@ def test_single_wrong_positions_of_the_map_are_ignored():
     for _ in range(20):
         air.fly(20)
         air.fly(1, map_m=(120.0, 0.0))
-    assert all(state is not State.ALARM for state, _ in air.states)
+    assert all(state is not GnssState.ALARM for state, _ in air.states)
 
 
 def test_without_the_map_the_receiver_is_still_checked():
     air = Air()
-    assert air.fly(60, map_m=None).state is State.WAITING
+    assert air.fly(60, map_m=None).state is GnssState.WAITING
     assert air.fly(1, map_m=None, gnss_m=(40.0, 0.0)).fault is Fault.JUMP
 
 
@@ -226,11 +226,11 @@ def test_a_hovering_receiver_may_repeat_its_position():
     air.fly(100)
     lat, lon = (float(each) for each in FRAME.latlon_from_en([0.0, 0.0]))
     air.fly(20, lat_deg=lat, lon_deg=lon)
-    assert all(state is not State.ALARM for state, _ in air.states)
+    assert all(state is not GnssState.ALARM for state, _ in air.states)
     air = Air()
     air.fly(100)
     status = air.fly(6, lat_deg=lat, lon_deg=lon, vel_en_mps=None)
-    assert status.state is State.ALARM
+    assert status.state is GnssState.ALARM
 
 
 def test_a_wrong_velocity_is_named():
@@ -243,13 +243,13 @@ def test_a_wrong_velocity_is_named():
 
 def test_a_receiver_without_velocity_is_watched():
     air = Air()
-    assert air.fly(200, vel_en_mps=None).state is State.GOOD
-    assert air.fly(6, vel_en_mps=None, gnss_m=(50.0, 0.0)).state is State.ALARM
+    assert air.fly(200, vel_en_mps=None).state is GnssState.GOOD
+    assert air.fly(6, vel_en_mps=None, gnss_m=(50.0, 0.0)).state is GnssState.ALARM
 
 
 def test_a_receiver_that_was_never_heard_has_no_fault():
     assert Receiver().fault(10**12, 20.0) is None
-    assert Air().fly(100, silent=True).state is State.WAITING
+    assert Air().fly(100, silent=True).state is GnssState.WAITING
 
 
 def test_invalid_samples_are_lost_not_an_error():
@@ -263,7 +263,7 @@ def test_a_clock_that_goes_back_begins_a_new_window():
     air.fly(200)
     air.now_s -= 150
     air.fly(100)
-    assert all(state is not State.ALARM for state, _ in air.states)
+    assert all(state is not GnssState.ALARM for state, _ in air.states)
 
 
 def value(second, en_m, std_m=3.0):

@@ -12,7 +12,14 @@ from orthonav.geo.camera import Camera
 from orthonav.geo.headings import seem_radians
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.setups import SAMPLE, DoubtedViews, Setup, Tried, mirrored_camera, try_setups
+from orthonav.onboard.setups import (
+    SAMPLE,
+    LowConfidenceViews,
+    Setup,
+    Tried,
+    mirrored_camera,
+    try_setups,
+)
 from orthonav.records import Fix, NoFix, Prior, View, ViewResult
 
 ACCEPTS = Acceptance("confidence", 0.9).accepts
@@ -37,12 +44,12 @@ def tried(registering, views, **how):
     )
 
 
-def told(view, **values):
+def reported(view, **values):
     return View(view.grey, view.camera, replace(view.telemetry, **values))
 
 
 def test_a_wrong_heading_is_found(registering, views):
-    turned = [told(view, yaw_deg=(view.telemetry.yaw_deg + 180) % 360) for view in views]
+    turned = [reported(view, yaw_deg=(view.telemetry.yaw_deg + 180) % 360) for view in views]
     (found,) = tried(registering, turned)
     assert found.setup.name == "any heading" and found.explains
     assert abs(abs(found.heading_off_deg) - 180) < 12 and found.heading_std_deg < 20
@@ -54,7 +61,7 @@ def test_a_wrong_heading_is_found(registering, views):
 
 
 def test_a_wrong_height_is_found_with_its_ratio(registering, views):
-    high = [told(view, agl_m=view.telemetry.agl_m * 1.9) for view in views[:1]]
+    high = [reported(view, agl_m=view.telemetry.agl_m * 1.9) for view in views[:1]]
     *failed, found = tried(registering, high, heading_known=False)
     assert found.setup.name == "half the height" and found.explains
     assert found.height_ratio == pytest.approx(1 / 1.9, rel=0.06)
@@ -85,7 +92,7 @@ def test_a_map_of_another_area_is_not_explained(views):
             return NoFix("no_match", "")
 
     prior = Prior(46.0, 3.0, 30.0)
-    many = [told(views[0], prior=prior, yaw_deg=0.7 * number) for number in range(SAMPLE)]
+    many = [reported(views[0], prior=prior, yaw_deg=0.7 * number) for number in range(SAMPLE)]
     found = tried(elsewhere := Elsewhere(), many)
     assert len(found) == 10 and elsewhere.asked == 40 and not any(e.explains for e in found)
     assert len(tried(Elsewhere(), many, heading_known=False, use_prior=False)) == 5
@@ -118,7 +125,7 @@ def test_a_sample_of_the_doubted_views_is_kept(views):
             self.telemetry = replace(views[0].telemetry, time_ns=number)
             self.grey = lambda: views[0].grey
 
-    doubted = DoubtedViews(views[0].camera, lambda telemetry: telemetry)
+    doubted = LowConfidenceViews(views[0].camera, lambda telemetry: telemetry)
     place = Fix(46.0, 3.0, np.eye(2), 0.4, 35.0, 0.0, 100.0)
     for number, _ in enumerate(doubted.watching(map(Recorded, range(100)))):
         outcome = NoFix("blank", "") if number % 2 else replace(place, confidence=number / 100)

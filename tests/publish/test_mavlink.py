@@ -312,6 +312,8 @@ def test_the_origin_is_set_in_millimetres() -> None:
     assert sent(set_gps_global_origin(Origin(0, 0, 1e9)))["altitude"] == INT32_MAX
     with pytest.raises(EstimateError, match="altitude"):
         Origin(48.0, 0.0, math.nan)
+    with pytest.raises(EstimateError, match="latitude and longitude seem to be swapped"):
+        Origin(120.0, 48.0, 90.0)
 
 
 places = st.tuples(st.floats(-90, 90), st.floats(-180, 180)) | st.sampled_from(

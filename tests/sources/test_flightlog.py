@@ -587,7 +587,7 @@ def test_only_flight_logs_are_detected_as_logs(tmp_path, content):
 def test_options_of_a_log(tmp_path, content):
     path = tmp_path / "flight_0001.mcap"
     path.write_bytes(content[0])
-    with pytest.raises(FlightError, match="leave out --telemetry"):
+    with pytest.raises(FlightError, match="omit --telemetry"):
         open_source(path, SourceOptions(telemetry=path))
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"camera": {**camera_plain(CAMERA), "fx_px": 77.0}}))

@@ -102,10 +102,10 @@ class Reader:
 @pytest.mark.parametrize(
     "claims, message",
     [
-        ([(0, 1, 129 * MB)], "a chunk claims"),
-        ([(0, 9, 100 * MB)] * 11, "chunks of the same time claim"),
-        ([(k, 20 - k, 100 * MB) for k in range(11)], "chunks of the same time claim"),
-        ([(5, 5, 100 * MB)] * 11 + [(9, 0, 100 * MB)] * 11, "chunks of the same time claim"),
+        ([(0, 1, 129 * MB)], "a chunk states"),
+        ([(0, 9, 100 * MB)] * 11, "chunks of the same time state"),
+        ([(k, 20 - k, 100 * MB) for k in range(11)], "chunks of the same time state"),
+        ([(5, 5, 100 * MB)] * 11 + [(9, 0, 100 * MB)] * 11, "chunks of the same time state"),
         ([(k, k, 100 * MB) for k in range(50)], None),
         ([(k, k + 1, 100 * MB) for k in range(50)], None),
         ([], None),

@@ -15,8 +15,8 @@ from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
     LEVEL_GROUND_IN_GAPS,
     check_overlap,
-    doubts_of,
     fitted,
+    warnings_of,
     with_options,
 )
 from orthonav.sources.track import GAP_NS, RecordedTrack, Samples, angles_at, attitude_of_angles
@@ -141,7 +141,7 @@ def test_what_is_assumed_about_heights_is_said_once(names, options, expected):
     series = Samples(1)
     series.add(0, 50.0)
     track = RecordedTrack(None, **dict.fromkeys(names, series.series()))
-    doubts = doubts_of(track, SourceOptions(**options))
+    doubts = warnings_of(track, SourceOptions(**options))
     assert len(doubts) == (expected is not None)
     assert expected is None or expected in doubts[0]
 
@@ -160,7 +160,7 @@ def test_take_off_heights_in_gaps_of_a_distance_sensor_are_said():
     series = Samples(1)
     series.add(0, 50.0)
     track = RecordedTrack(None, (series.series(),), home=series.series())
-    assert doubts_of(track, SourceOptions()) == [LEVEL_GROUND_IN_GAPS]
+    assert warnings_of(track, SourceOptions()) == [LEVEL_GROUND_IN_GAPS]
 
 
 def test_what_the_options_add():

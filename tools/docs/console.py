@@ -143,8 +143,8 @@ def _environment() -> dict[str, str]:
 
 def _link_checkout(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    targets = {".venv": Path(sys.prefix), "examples": ROOT / "examples"}
-    for name, target in {**targets, "experiments": ROOT / "experiments"}.items():
+    parts = {name: ROOT / name for name in ("benchmarks", "examples", "experiments")}
+    for name, target in {".venv": Path(sys.prefix), **parts}.items():
         link = folder.parent / name
         if not link.exists():
             link.symlink_to(target)

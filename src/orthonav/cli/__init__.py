@@ -1,7 +1,7 @@
 """The command line. Each command is one module with `add` (its arguments) and `run`.
 
 A module with many options names the everyday ones in `EVERYDAY`, by action where the command has
-actions; `--help` shows those, and `--help-all` shows every option.
+actions; `--help` shows those, and `--help-all` shows every option of any command.
 """
 
 import argparse
@@ -137,19 +137,17 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
             module.add(command)
             _name_units(command)
             everyday = getattr(module, "EVERYDAY", ())
-            by_action = everyday.items() if isinstance(everyday, dict) else [("", everyday)]
-            for action, options in by_action:
-                if options:
-                    part = _action(command, action) if action else command
-                    _shorten_help(part, options, show_all="--help-all" in arguments)
+            by_action = everyday if isinstance(everyday, dict) else {"": everyday}
+            for action, part in {"": command, **_actions(command)}.items():
+                options = by_action.get(action, ())
+                _add_help_all(part, options, show_all="--help-all" in arguments)
     return parser
 
 
-def _action(command: argparse.ArgumentParser, name: str) -> argparse.ArgumentParser:
-    """The parser of an action of a command, such as `atlas build`."""
+def _actions(command: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of the actions of a command, such as those of `atlas`, by name."""
     parts = (each for each in command._actions if isinstance(each, argparse._SubParsersAction))
-    found: argparse.ArgumentParser = next(parts).choices[name]
-    return found
+    return {name: part for action in parts for name, part in action.choices.items()}
 
 
 def _name_units(command: argparse.ArgumentParser) -> None:
@@ -166,11 +164,17 @@ def _name_units(command: argparse.ArgumentParser) -> None:
                 action.metavar = "N"
 
 
-def _shorten_help(
+def _add_help_all(
     command: argparse.ArgumentParser, everyday: Sequence[str], *, show_all: bool
 ) -> None:
-    """Add `--help-all`; without it, hide the options that are neither required nor everyday."""
-    command.add_argument("--help-all", action="help", help="show all options and exit")
+    """Add `--help-all`; without it, hide the options that are neither required nor everyday.
+
+    A command without everyday options shows all of them with `--help` too.
+    """
+    help_all = "show all options and exit" if everyday else argparse.SUPPRESS
+    command.add_argument("--help-all", action="help", help=help_all)
+    if not everyday:
+        return
     shown = {*everyday, "--help", "--help-all", "--verbose", "--quiet"}
     hidden = [
         action

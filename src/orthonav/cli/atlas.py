@@ -21,8 +21,11 @@ EVERYDAY = {
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command and of its actions."""
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS)
-    common.add_argument("-q", "--quiet", action="store_true", default=argparse.SUPPRESS)
+    for flags, text in (
+        (("-v", "--verbose"), "say more, on stderr"),
+        (("-q", "--quiet"), "errors only, no progress"),
+    ):
+        common.add_argument(*flags, action="store_true", default=argparse.SUPPRESS, help=text)
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def action(name: str, text: str) -> argparse.ArgumentParser:
@@ -33,7 +36,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     build_atlas.add(action("build", "build the missing sheets of an atlas, which is created first"))
     info = action("info", "print the contents of an atlas")
     info.add_argument("--json", action="store_true", help="print as JSON")
-    check = action("check", "check whether an atlas is whole: exit 0, or 3 and a list of problems")
+    check = action(
+        "check", "check whether an atlas is complete: exit 0, or 3 and a list of problems"
+    )
     check.add_argument(
         "--deep", action="store_true", help="read every file, verify its checksum and its recipe"
     )
@@ -47,7 +52,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=_hours,
         default=24.0,
         metavar="H",
-        help="remove no younger files, which may belong to a running build (default %(default)g)",
+        help="least age of the leftovers that --clean removes; younger files may belong to a "
+        "running build (default %(default)g)",
     )
     check.add_argument("--json", action="store_true", help="print as JSON")
     copied = action("add", "copy sheets of another atlas of the same recipe into this one")
@@ -57,21 +63,26 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--replace", action="store_true", help="replace sheets that differ from those of FROM"
     )
     retire = action("retire", "take sheets out of an atlas")
-    retire.add_argument("sheets", nargs="+", metavar="SHEET", help="name, as r001526c001392")
-    index = action(
-        "index", "make the index that finds views without a prior, or bring it up to date"
+    retire.add_argument(
+        "sheets", nargs="+", metavar="SHEET", help="name of a sheet, such as r001526c001392"
     )
-    index.add_argument("--rebuild", action="store_true", help="rebuild all of it")
+    index = action("index", "build or update the index that is searched without a prior")
+    index.add_argument("--rebuild", action="store_true", help="rebuild the whole index")
     cut = action("cut", "cut the map of a route or of bounds out of an atlas")
     add_area(cut, cut.add_mutually_exclusive_group(required=True))
     cut.add_argument(
         "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
     )
     cut.add_argument(
-        "--workers", type=int, metavar="N", help="threads that read sheets (default: one per core)"
+        "--workers",
+        type=int,
+        metavar="N",
+        help="number of parallel workers: threads that read sheets (default: one per core)",
     )
     cut.add_argument(
-        "--allow-holes", action="store_true", help="cut although sheets under the route are missing"
+        "--allow-holes",
+        action="store_true",
+        help="write the map even if sheets under the route are missing",
     )
 
 

@@ -13,7 +13,9 @@ from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progr
 log = logging.getLogger(__name__)
 
 EVERYDAY = (
-    *("--route", "--bounds", "--band-m", "--gsd-m", "--other-date", "--dem", "--work", "--json"),
+    *("--other-date", "--dem"),
+    *("--route", "--bounds", "--band-m"),
+    *("--gsd-m", "--work", "--json"),
 )
 RECIPE = (
     "gsd_m",
@@ -30,13 +32,13 @@ RECIPE = (
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
-    add_area(parser, parser.add_mutually_exclusive_group())
-    add_recipe(parser)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
     )
-    parser.add_argument(
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    imagery = parser.add_argument_group("imagery")
+    add_orthos(imagery, "orthophoto (any georeferenced raster that GDAL reads)")
+    imagery.add_argument(
         "--other-date",
         type=Path,
         action="append",
@@ -45,8 +47,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="orthophoto of the same area at another date, from which confidence and covariance "
         "are calibrated; it does not become part of the map; may be repeated",
     )
-    add_dem(parser, "which gives the map a terrain layer")
-    parser.add_argument(
+    add_dem(imagery, "which gives the map a terrain layer")
+    area = parser.add_argument_group("area (default: all imagery)")
+    add_area(area, area.add_mutually_exclusive_group())
+    add_recipe(parser.add_argument_group("map"))
+    _add_work(parser.add_argument_group("work"))
+
+
+def _add_work(group: argparse._ActionsContainer) -> None:
+    group.add_argument(
         "--work",
         type=Path,
         metavar="DIR",
@@ -54,20 +63,19 @@ def add(parser: argparse.ArgumentParser) -> None:
         "from which an interrupted build resumes (default: MAP.onav.work for large areas, removed "
         "when the map is written)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--workers",
         type=int,
         metavar="N",
-        help="threads that read imagery and make batches for a network (default: one per core; "
-        "2 make batches, up to 16 for a GPU)",
+        help="number of parallel workers: threads that read imagery and make batches for a network "
+        "(default: one per core; 2 make batches, up to 16 for a GPU)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--device",
         default="auto",
         choices=("auto", "cpu", "cuda"),
-        help="where a network is learnt (default auto: a GPU if there is one)",
+        help="device on which a network is trained (default auto: a GPU if there is one)",
     )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def add_recipe(parser: argparse._ActionsContainer) -> None:
@@ -116,7 +124,7 @@ def recipe_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def reporter(options: argparse.Namespace) -> Callable[[str], None]:
-    """A function that prints lines about the work on a terminal, and logs them elsewhere."""
+    """A function that prints lines about the work on a terminal, otherwise logs them."""
     if options.quiet or not sys.stderr.isatty():
         return log.info
     return lambda line: print(line, file=sys.stderr)

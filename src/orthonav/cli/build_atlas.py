@@ -36,21 +36,34 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--replace", action="store_true", help="rebuild sheets that were made otherwise"
     )
     coarse = parser.add_argument_group("coarse tiles, for views without a prior")
-    coarse.add_argument("--coarse-gsd-m", type=float, help="metres per pixel (default 8)")
+    coarse.add_argument(
+        "--coarse-gsd-m", type=float, help="ground resolution, metres per pixel (default 8)"
+    )
     coarse.add_argument("--coarse-tile-px", type=int, help="width of a tile (default 128)")
     coarse.add_argument(
         "--coarse-overlap", type=float, metavar="SHARE", help="overlap of tiles (default 0.875)"
     )
-    coarse.add_argument("--no-coarse", dest="coarse", action="store_false", help="leave them out")
     coarse.add_argument(
-        "--no-index", dest="index", action="store_false", help="do not index them at the end"
+        "--no-coarse", dest="coarse", action="store_false", help="omit the coarse tiles"
+    )
+    coarse.add_argument(
+        "--no-index",
+        dest="index",
+        action="store_false",
+        help="do not update the search index at the end",
     )
     cluster = parser.add_argument_group("workers")
-    cluster.add_argument("--workers", type=int, metavar="N", help="sheets built at a time")
+    cluster.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="number of parallel workers: sheets that are built at a time (default: 1; with "
+        "--cluster one per core)",
+    )
     cluster.add_argument(
         "--cluster",
         metavar="local|ADDRESS",
-        help="build with Ray, on the cores of this machine or by the cluster at HOST:PORT "
+        help="build with Ray, on the cores of this machine (local) or on the cluster at HOST:PORT "
         "(default: one sheet after the other in this process)",
     )
     cluster.add_argument(
@@ -69,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     from orthonav.geo.route import read_route
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise AtlasError("torchrun is for a single map: an atlas is spread with --cluster")
+        raise AtlasError("torchrun trains one map: use --cluster to build an atlas in parallel")
     request = AtlasRequest(
         url=options.atlas,
         orthos=options.ortho,
@@ -87,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
             result = build_atlas(request, runner, shown, reporter(options))
     except KeyboardInterrupt:
         print(
-            "orthonav: error: interrupted; finished sheets are kept, rerun to resume",
+            "orthonav: error: interrupted; finished sheets are stored, rerun to resume",
             file=sys.stderr,
         )
         return 1

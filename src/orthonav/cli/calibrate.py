@@ -48,7 +48,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=5.0,
         metavar="M",
-        help="standard deviation of --gnss-positions per axis (m; default 5)",
+        help="standard deviation of --gnss-positions, per axis (default 5)",
     )
     parser.add_argument(
         "--heading",
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
 
     if options.latency:
         if options.dem is not None:
-            raise FlightError("--latency uses the heights of the log: leave out --dem")
+            raise FlightError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
     if not 0 < options.gnss_std_m < 1e5:

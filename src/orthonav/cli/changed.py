@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from orthonav.records import ViewResult
 
 
-def add_report_changes(parser: argparse.ArgumentParser) -> None:
+def add_report_changes(parser: argparse._ActionsContainer) -> None:
     """Add `--report-changes FILE`."""
     parser.add_argument(
         "--report-changes",

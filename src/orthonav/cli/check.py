@@ -45,56 +45,65 @@ if TYPE_CHECKING:
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = "exit status: 0 go, 3 marginal, 4 no-go; 1 error, 2 wrong usage"
-    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="REPORT/", help="folder of page, JSON and layers"
     )
-    parser.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     parser.add_argument(
+        "--json", action="store_true", help="print the content of check.json instead of the text"
+    )
+    _add_route(parser.add_argument_group("route (default: the whole map)"))
+    _add_ground(parser.add_argument_group("ground"))
+    _add_errors(parser.add_argument_group("camera, telemetry and motion"))
+    _add_effort(parser.add_argument_group("trials"))
+
+
+def _add_route(group: argparse._ActionsContainer) -> None:
+    group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
+    group.add_argument(
         "--band-m",
         type=float,
-        help="width of the search band for legs without one "
-        "(default: four standard deviations of the prior, at least half a view)",
+        help="width of the search band for legs without a width of their own (default: four "
+        "standard deviations of the prior, at least half a view)",
     )
-    parser.add_argument(
-        "--other-date",
-        type=Path,
-        metavar="TIF",
-        help="orthophoto of a second date, not in the map: improves the prediction",
-    )
-    parser.add_argument(
-        "--changes",
-        type=Path,
-        metavar="FILE.geojson",
-        help="ground that changed since the map was made, from localize or evaluate "
-        "--report-changes: warned of, and fixes there are predicted without it",
-    )
-    parser.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
-    )
-    parser.add_argument(
+    group.add_argument(
         "--agl-m",
         type=float,
         help="height above ground (default: the lowest of the route; without one, the height from "
         "which the shorter side of a view covers a tile of the map)",
     )
     add_dem(
-        parser,
+        group,
         "for routes whose heights are above sea level or home (default: the terrain of the map)",
     )
-    _add_errors(parser)
-    _add_effort(parser)
-    parser.add_argument(
-        "--json", action="store_true", help="print the content of check.json instead of the text"
+
+
+def _add_ground(group: argparse._ActionsContainer) -> None:
+    """Evidence about the ground besides the map."""
+    group.add_argument(
+        "--other-date",
+        type=Path,
+        metavar="TIF",
+        help="orthophoto of another date than the map's, which improves the prediction",
+    )
+    group.add_argument(
+        "--changes",
+        type=Path,
+        metavar="FILE.geojson",
+        help="ground that changed since the map was made, as written by localize or evaluate "
+        "--report-changes: the check warns of it and predicts fixes without it",
     )
 
 
-def _add_errors(parser: argparse.ArgumentParser) -> None:
-    """Accuracy of telemetry and prior, motion, and the confidence that is asked for."""
-    heading = parser.add_mutually_exclusive_group()
+def _add_errors(group: argparse._ActionsContainer) -> None:
+    """Camera, accuracy of telemetry and prior, and motion."""
+    group.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
+    )
+    heading = group.add_mutually_exclusive_group()
     heading.add_argument(
         "--yaw-std-deg",
         type=float,
@@ -105,16 +114,16 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         "--heading",
         choices=("known", "unknown"),
         default="known",
-        help="unknown: search all headings",
+        help="known: to --yaw-std-deg (default); unknown: all headings are tried",
     )
-    parser.add_argument(
+    group.add_argument(
         "--agl-std",
         type=float,
         metavar="SHARE",
         default=0.05,
-        help="standard deviation of the reported height, a share of it (default 0.05)",
+        help="standard deviation of the reported height, as a share of it (default 0.05)",
     )
-    prior = parser.add_mutually_exclusive_group()
+    prior = group.add_mutually_exclusive_group()
     prior.add_argument(
         "--prior-std-m",
         type=float,
@@ -125,58 +134,61 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         "--prior",
         choices=("telemetry", "none"),
         default="telemetry",
-        help="none: search the whole map",
+        help="telemetry: search around a prior position (default); none: search the whole map",
     )
-    parser.add_argument(
+    group.add_argument(
         "--relief-m",
         type=float,
         default=3.0,
         help="standard deviation of the height of houses and trees, which causes relief "
         "displacement (default 3)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--tilt-std-deg",
         type=float,
         default=1.5,
-        help="standard deviation of the pitch and roll that are not reported; they displace fixes "
-        "(default 1.5)",
+        help="standard deviation of the error of the reported pitch and roll, which displaces "
+        "fixes (default 1.5)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--other-sensor",
         action="store_true",
         help="the camera differs from the map's sensor by more than years do (a drone over "
-        "satellite imagery, infrared, another season only): fixes are predicted to be rarer",
+        "satellite imagery, infrared): fixes are predicted to be rarer",
     )
-    parser.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
-    parser.add_argument(
+    group.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
+    group.add_argument(
         "--drift",
         type=float,
         metavar="SHARE",
         default=0.03,
         help="error of dead reckoning per metre flown without a fix (default 0.03)",
     )
-    parser.add_argument(
+
+
+def _add_effort(group: argparse._ActionsContainer) -> None:
+    """The confidence that is required, and the number of trials."""
+    group.add_argument(
         "--min-confidence",
         type=float,
         metavar="P",
         default=0.9,
         help="confidence that a fix needs to be accepted (default 0.9)",
     )
-
-
-def _add_effort(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    group.add_argument(
         "--effort",
         type=float,
         default=1.0,
         metavar="FACTOR",
         help="factor on the number of trials (default 1)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--quick", action="store_true", help="skip the trials of other errors and other heights"
     )
-    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the trials (default 1)")
+    group.add_argument(
+        "--workers", type=int, help="number of parallel workers: processes (default: one per core)"
+    )
+    group.add_argument("--seed", type=int, default=1, help="seed of the trials (default 1)")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -265,7 +277,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     from orthonav.geo.terrain import LANDING_M
 
     if options.dem_datum is not None and options.dem is None:
-        raise CheckError("--dem-datum is that of a terrain model: give --dem too")
+        raise CheckError("--dem-datum needs a terrain model: give --dem too")
     if options.agl_m is not None:
         return options.agl_m, "as given"
     heights = [] if route is None else [each for each in route.heights if each is not None]

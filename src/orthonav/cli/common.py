@@ -65,7 +65,7 @@ def progress(options: argparse.Namespace) -> Iterator[Progress]:
 
 
 def bounds(text: str) -> tuple[float, float, float, float]:
-    """W,S,E,N in degrees."""
+    """West, south, east, north in degrees, from `W,S,E,N`."""
     try:
         west, south, east, north = (float(part) for part in text.split(","))
     except ValueError as error:
@@ -80,7 +80,7 @@ def add_area(parser: argparse._ActionsContainer, group: Any) -> None:
         "--bounds",
         type=bounds,
         metavar="W,S,E,N",
-        help="area in degrees; write --bounds=W,S,E,N if W is negative",
+        help="area: west, south, east, north in degrees; write --bounds=W,S,E,N if W is negative",
     )
     parser.add_argument(
         "--band-m",
@@ -100,8 +100,8 @@ def add_dem(parser: argparse._ActionsContainer, effect: str) -> None:
     parser.add_argument(
         "--dem-datum",
         metavar="NAME",
-        help="what its heights count from, where it does not state it: egm96, egm2008, msl, "
-        "ellipsoid or EPSG:NUMBER of a vertical system",
+        help="vertical datum of the terrain model, where the file does not state it: egm96, "
+        "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
     )
 
 
@@ -111,8 +111,8 @@ def add_search(parser: argparse._ActionsContainer) -> None:
         "--budget-ms",
         type=float,
         metavar="MS",
-        help="begin no further search of a view that would end later than this after its first one "
-        "began (ms; default: no limit): the best place so far is the answer",
+        help="time budget of a view: no further search begins that would end later than this after "
+        "the first one began (default: no limit); the best place so far is the answer",
     )
     parser.add_argument(
         "--threads",
@@ -141,7 +141,7 @@ def print_json(plain: Any) -> None:
     print(json.dumps(plain, indent=1, allow_nan=False))
 
 
-def add_orthos(parser: argparse.ArgumentParser, what: str) -> None:
+def add_orthos(parser: argparse._ActionsContainer, what: str) -> None:
     """Add `--ortho FILE|FOLDER ...`, which may be repeated."""
     parser.add_argument(
         "--ortho",

@@ -2,6 +2,9 @@
 
 import argparse
 import json
+import os
+import shlex
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -66,7 +69,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _how_to_view(out: Path) -> str:
     """The reports, and the command that shows the flight."""
-    command = f"orthonav view {out}/fixes.jsonl --map {out}/area.onav --flight {out}/flight"
+    files = [f"{out}/fixes.jsonl", "--map", f"{out}/area.onav", "--flight", f"{out}/flight"]
+    command = shlex.join([*_this_program(), "view", *files])
     return "\n".join(
         (
             "open in a browser:",
@@ -75,6 +79,16 @@ def _how_to_view(out: Path) -> str:
             f"step through the views:\n  {command}",
         )
     )
+
+
+def _this_program() -> list[str]:
+    """The words that call this program again: its name, if the shell finds it, else its path."""
+    called = Path(sys.argv[0])
+    if called.name != "orthonav":
+        return [sys.executable, "-m", "orthonav"]
+    found = shutil.which("orthonav")
+    is_found = found is not None and os.path.realpath(found) == os.path.realpath(called)
+    return ["orthonav" if is_found else str(called)]
 
 
 def _is_earlier_demo(out: Path) -> bool:

@@ -35,7 +35,13 @@ log = logging.getLogger(__name__)
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("fixes", type=Path, nargs="+", metavar="fixes.jsonl")
+    parser.add_argument(
+        "fixes",
+        type=Path,
+        nargs="+",
+        metavar="fixes.jsonl",
+        help="fixes of a flight, as written by localize or fly --jsonl; several files are compared",
+    )
     parser.add_argument(
         "--truth",
         type=Path,
@@ -66,15 +72,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="write an HTML report with its figures as SVG and PNG",
     )
     parser.add_argument(
-        "--map", type=Path, metavar="MAP.onav", help="map for the background of the report"
+        "--map", type=Path, metavar="MAP.onav", help="map of the flight: background of the report"
     )
     parser.add_argument(
         "--flight",
         type=Path,
         action="append",
         metavar="FLIGHT_DIR",
-        help="show the worst views beside the map in the report (with --map and --report), and for "
-        "--report-changes; one per file of fixes, in the same order",
+        help="flight folder with the images, for the worst views in the report (with --map and "
+        "--report) and for --report-changes; one per file of fixes, in the same order",
     )
     add_report_changes(parser)
 

@@ -38,10 +38,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "area", nargs="?", metavar="ROUTE|W,S,E,N", help="planned route, or an area in degrees"
     )
-    add_area(parser, parser)
-    parser.add_argument(
-        "--margin-m", type=float, default=200.0, help="fetched around the area (default 200)"
-    )
     parser.add_argument(
         "--source",
         metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
@@ -54,6 +50,14 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--dry-run", action="store_true", help="print the estimated cost and fetch nothing"
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    area = parser.add_argument_group("area")
+    add_area(area, area)
+    area.add_argument(
+        "--margin-m",
+        type=float,
+        default=200.0,
+        help="width of the margin that is fetched around the area (default 200)",
+    )
     _add_imagery(parser)
     _add_file(parser)
     _add_requests(parser)
@@ -74,8 +78,15 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--crs", help="coordinate system, such as EPSG:2154, if there is a choice")
     group.add_argument("--matrix-set", help="tile matrix set of a WMTS")
     group.add_argument("--time", help="ISO 8601 time, or interval A/B of a STAC")
-    group.add_argument("--wms-version", choices=("1.1.1", "1.3.0"), help="(default 1.3.0)")
-    group.add_argument("--tile-px", type=int, help="width of tiles (xyz, tms) or images (wms)")
+    group.add_argument(
+        "--wms-version", choices=("1.1.1", "1.3.0"), help="version of WMS (default 1.3.0)"
+    )
+    group.add_argument(
+        "--service-tile-px",
+        dest="tile_px",
+        type=int,
+        help="width of the service's tiles (xyz, tms) or images (wms)",
+    )
     group.add_argument("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
     group.add_argument("--subdomains", default="abc", help="values of {s} (default abc)")
     group.add_argument("--collection", help="collection of a STAC")
@@ -84,24 +95,26 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--nodata-colour",
         choices=("black", "white"),
-        help="large patches of exactly this colour are masked",
+        help="colour of missing imagery: large patches of exactly this colour are masked",
     )
 
 
 def _add_file(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("the file that is written")
+    group = parser.add_argument_group("output file")
     group.add_argument("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
     group.add_argument("--licence", help="licence of the imagery")
-    group.add_argument("--attribution", help="who must be named")
+    group.add_argument("--attribution", help="attribution that the licence requires")
     group.add_argument(
         "--compress",
         choices=("jpeg", "deflate"),
         default="jpeg",
         help="compression of the GeoTIFF (default jpeg)",
     )
-    group.add_argument("--quality", type=int, default=90, help="of JPEG, 1 to 100 (default 90)")
     group.add_argument(
-        "--allow-holes", action="store_true", help="write the file although tiles failed"
+        "--quality", type=int, default=90, help="quality of JPEG, 1 to 100 (default 90)"
+    )
+    group.add_argument(
+        "--allow-holes", action="store_true", help="write the file even if tiles failed"
     )
 
 
@@ -110,24 +123,35 @@ def _add_requests(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--key-env", metavar="VARIABLE", help="environment variable with the key for {key}"
     )
-    group.add_argument("--parallel", type=int, default=4, help="at the same time (default 4)")
     group.add_argument(
-        "--per-second", type=float, metavar="N", help="per second and host (default 10)"
+        "--parallel", type=int, default=4, help="most requests at the same time (default 4)"
     )
     group.add_argument(
-        "--retries", type=int, default=5, help="repetitions after a failure (default 5)"
+        "--per-second",
+        type=float,
+        metavar="N",
+        help="most requests per second to one host (default 10)",
     )
     group.add_argument(
-        "--max-tiles", type=int, default=50_000, help="refuse to fetch more (default 50000)"
+        "--retries", type=int, default=5, help="most repetitions of a failed request (default 5)"
     )
     group.add_argument(
-        "--max-mb", type=float, default=4000.0, help="refuse to fetch more (default 4000)"
+        "--max-tiles",
+        type=int,
+        default=50_000,
+        help="refuse to fetch more tiles than this (default 50000)",
+    )
+    group.add_argument(
+        "--max-mb",
+        type=float,
+        default=4000.0,
+        help="refuse to fetch more than this (default 4000)",
     )
     group.add_argument(
         "--cache",
         type=Path,
         metavar="DIR",
-        help="store fetched tiles there (default: beside --out, removed at the end)",
+        help="folder that stores fetched tiles (default: beside --out, removed at the end)",
     )
 
 

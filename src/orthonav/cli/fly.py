@@ -71,8 +71,8 @@ def _add_camera(group: Any) -> None:
         "--camera",
         type=Path,
         metavar="FILE",
-        help="camera calibration: flight.json, or a file of OpenCV, ROS or Kalibr (YAML, JSON); "
-        "default: flight.json of the flight folder",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: "
+        "flight.json of the flight folder",
     )
     group.add_argument(
         "--camera-latency-ms",
@@ -150,15 +150,15 @@ def _add_autopilot(group: Any) -> None:
         "--signing-key",
         type=Path,
         metavar="FILE",
-        help="sign messages and require signed ones: file with a key of 32 bytes or 64 "
-        "hexadecimal digits",
+        help="file with the key of MAVLink signing, 32 bytes or 64 hexadecimal digits; messages "
+        "are then signed, and unsigned ones ignored",
     )
     group.add_argument(
         "--height",
         action="append",
         choices=HEIGHTS,
-        help="height above ground to use; repeat in order of preference (default: all, in this "
-        "order)",
+        help="source of the height above ground; can be repeated in order of preference (default: "
+        "all, in this order)",
     )
     group.add_argument(
         "--telemetry-wait-ms",
@@ -218,28 +218,28 @@ def _add_outputs(group: Any) -> None:
         "--accept",
         default="confidence:0.9",
         metavar="NAME:MIN",
-        help="send fixes above a threshold only: confidence:0.9 (default), or peak_ratio:1.3 in "
-        "addition",
+        help="criterion of a confident fix and its threshold: confidence:0.9 (default), or "
+        "peak_ratio:1.3 in addition; other fixes are not sent",
     )
     group.add_argument(
         "--max-std-m",
         type=float,
         default=50.0,
         metavar="M",
-        help="positions with a larger standard deviation are not sent (m; default 50)",
+        help="largest standard deviation of a position that is sent (default 50)",
     )
     group.add_argument(
         "--send-coasting",
         action="store_true",
-        help="send dead-reckoned positions too, of views that do not show the map: as "
-        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, which PX4 ignores, by no other message",
+        help="also send dead-reckoned positions of views that do not show the map, only as "
+        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, which PX4 ignores",
     )
     group.add_argument(
         "--min-std-m",
         type=float,
         default=0.0,
         metavar="M",
-        help="lower bound of the reported standard deviation (m; default 0)",
+        help="lower bound of the standard deviation that messages state (default 0)",
     )
     group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
 
@@ -314,23 +314,24 @@ def _add_flight(group: Any) -> None:
         type=float,
         default=300.0,
         metavar="S",
-        help="a position saved longer ago is no start; what GNSS learnt continues if the program "
-        "stopped no longer ago (default 300)",
+        help="largest age of a saved position that a flight starts from, and of a stop after which "
+        "the learning of --gnss continues (default 300)",
     )
     group.add_argument(
         "--gnss",
         choices=("off", "watch", "correct"),
         default="off",
         help="watch: compare GNSS with the map, report faults, learn the displacement of the map, "
-        "errors of the mount and the latency; correct: also correct positions by what --state has "
-        "from earlier flights (default off)",
+        "errors of the mount and the latency; correct: also correct positions by what earlier "
+        "flights stored in --state (default off)",
     )
     group.add_argument(
         "--deadline-ms",
         type=float,
         default=500.0,
         metavar="MS",
-        help="drop views that are older when their processing would start (default 500)",
+        help="largest age of a view when its processing starts; older views are dropped "
+        "(default 500)",
     )
     add_search(group)
     add_signature(group)

@@ -13,6 +13,7 @@ from typing import Any
 from orthonav.cli.common import search_plan
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
+from orthonav.cli.source import FAR_M, distance_from_map, far_text
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
@@ -20,6 +21,7 @@ from orthonav.flight import read_camera
 from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
+from orthonav.geo.swapped import swapped_hint
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import MapFile, open_map
@@ -117,7 +119,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         link=link,
         sink=sink,
         diagnosis=TelemetryDiagnosis(localizer, least),
-        start=_start(options, clocks),
+        start=_start(options, clocks, localizer),
         notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
@@ -311,17 +313,14 @@ def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
         )
 
 
-def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | None]:
+def _start(
+    options: argparse.Namespace, clocks: Clocks, localizer: Localizer
+) -> Callable[[], Prior | None]:
     """Function that gives the prior of the first view.
 
     It is the saved position if that is recent, else `--start`, else None.
     """
-    given = Prior(*options.start) if options.start else None
-    if given and not (abs(given.lat_deg) <= 90 and abs(given.lon_deg) <= 180 and given.std_m > 0):
-        raise VariantError(
-            "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a deviation "
-            "above 0 m"
-        )
+    given = _given_start(options, localizer)
     saved = load(options.state) if options.state else None
 
     def prior() -> Prior | None:
@@ -331,6 +330,24 @@ def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | 
         return prior_of(saved, age_s, options.state_max_age_s) or given
 
     return prior
+
+
+def _given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
+    """The position of `--start`; a warning where it is far from the map. Raises `VariantError`."""
+    if not options.start:
+        return None
+    start = Prior(*options.start)
+    place = start.lat_deg, start.lon_deg
+    if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and start.std_m > 0):
+        raise VariantError(
+            "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
+            f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
+            f"{swapped_hint(*place)}"
+        )
+    far_m, hint = distance_from_map(place, localizer)
+    if far_m > FAR_M:
+        log.warning("%s", far_text("--start is", far_m, hint))
+    return start
 
 
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> LogSink | None:

@@ -38,7 +38,7 @@ def gnss_watch(
     or `correct` no state.
     """
     if options.gnss == "correct" and options.state is None:
-        raise VariantError("--gnss correct needs --state FILE with what was learnt of the map")
+        raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
     source: GnssSource
     if recorded:

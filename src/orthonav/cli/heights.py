@@ -27,7 +27,7 @@ def dem_of(options: argparse.Namespace) -> "Dem | None":
 
     if options.dem is None:
         if options.dem_datum is not None:
-            raise FlightError("--dem-datum is that of a terrain model: give --dem too")
+            raise FlightError("--dem-datum needs a terrain model: give --dem too")
         return None
     if getattr(options, "ground_alt_m", None) is not None:
         raise FlightError("--ground-alt-m assumes level ground: give it or --dem")

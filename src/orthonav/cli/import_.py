@@ -40,7 +40,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=int,
         choices=range(1, 101),
         metavar="1..100",
-        help="write images that are not encoded yet as JPEG (default: PNG, lossless)",
+        help="quality of JPEG images; raw images and frames of a video are then stored as JPEG "
+        "(default: PNG, lossless)",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 

@@ -17,7 +17,7 @@ from orthonav.cli.common import add_search, print_json, progress, search_plan
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
-from orthonav.cli.setups import Counts, Doubts
+from orthonav.cli.setups import Counts, SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
@@ -56,80 +56,97 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="fixes.jsonl", help="file to write"
     )
-    parser.add_argument(
-        "--atlas",
-        action="store_true",
-        help="the first argument is an atlas (folder or URL); no prior is used, and a fix needs "
-        "the agreement of several views",
-    )
-    parser.add_argument(
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    _add_views(parser.add_argument_group("placing views"))
+    _add_track(parser.add_argument_group("tracking"))
+    _add_outputs(parser.add_argument_group("further outputs"))
+    add_signature(parser.add_argument_group("signed maps"))
+    add_source(parser)
+
+
+def _add_views(group: argparse._ActionsContainer) -> None:
+    """How each view is searched for, and which fixes count as confident."""
+    group.add_argument(
         "--heading",
         choices=("known", "unknown"),
         default="known",
         help="known: from telemetry (default); unknown: all headings are tried",
     )
-    parser.add_argument(
+    group.add_argument(
         "--prior",
         choices=("telemetry", "none"),
         default="telemetry",
-        help="telemetry: search around the prior position in the telemetry, if any (default)",
+        help="telemetry: search around the prior position in the telemetry, if any (default); "
+        "none: search the whole map",
     )
-    parser.add_argument(
+    group.add_argument(
+        "--accept",
+        metavar="NAME:MIN",
+        default="confidence:0.9",
+        help="criterion of a confident fix and its threshold: confidence:0.9 (default), "
+        "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); other fixes are "
+        'written too, marked "confident": false',
+    )
+    group.add_argument(
+        "--atlas",
+        action="store_true",
+        help="the first argument is an atlas (folder or URL); no prior is used, and a fix needs "
+        "the agreement of several views",
+    )
+    group.add_argument(
         "--registration",
         choices=("on", "off"),
         default="on",
         help="on: positions within a pixel, where the map has a registration layer (default); off: "
         "positions at tile level, as in the paper",
     )
-    parser.add_argument(
+    group.add_argument(
         "--position",
         choices=("peak", "best", "neighbours", "weighted"),
         default="peak",
         help="with --registration off, how scores become a position: interpolated peak (default), "
         "best tile (the paper), mean of the best tile and its neighbours, or weighted mean of all",
     )
-    parser.add_argument(
-        "--accept",
-        metavar="NAME:MIN",
-        default="confidence:0.9",
-        help="fixes from this threshold on count as confident: confidence:0.9 (default), "
-        "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); the best guess "
-        "of the other views is written too, marked",
-    )
-    add_search(parser)
-    parser.add_argument(
+    add_search(group)
+    group.add_argument(
         "--skip-bad-images",
         action="store_true",
         help="write images that cannot be decoded as no_fix instead of stopping",
     )
-    parser.add_argument(
+
+
+def _add_track(group: argparse._ActionsContainer) -> None:
+    group.add_argument(
         "--track",
         action="store_true",
         help="track the aircraft: every position also uses the views before it",
     )
-    parser.add_argument(
+    group.add_argument(
         "--smooth",
         action="store_true",
         help="track, then smooth: every position uses all views of the flight",
     )
-    parser.add_argument(
+    group.add_argument(
         "--lag",
         type=int,
         metavar="VIEWS",
         help="with --smooth: number of later views that a position uses (default: all)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--mount",
         type=Path,
         metavar="mount.json",
         help="correct heading, height and tilt with a calibration by `orthonav calibrate`",
     )
-    parser.add_argument(
+    group.add_argument(
         "--as-flown",
         action="store_true",
         help="flight log: use the options of the flight",
     )
-    parser.add_argument(
+
+
+def _add_outputs(group: argparse._ActionsContainer) -> None:
+    group.add_argument(
         "--export",
         action="append",
         default=[],
@@ -138,10 +155,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "(OpenDroneMap's geo.txt) or exif (a table for `exiftool -csv=PATH FOLDER`); heights above "
         "sea need a terrain; can be repeated",
     )
-    add_report_changes(parser)
-    add_signature(parser)
-    add_source(parser)
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    add_report_changes(group)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -192,7 +206,7 @@ def _on_map(options: argparse.Namespace) -> None:
     if mount:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
-    results, doubts = [], Doubts(options, flight, localizer, mount, heights)
+    results, advisor = [], SetupAdvice(options, flight, localizer, mount, heights)
     with progress(options) as shown:
         for result in localize_flight(
             locator,
@@ -200,10 +214,10 @@ def _on_map(options: argparse.Namespace) -> None:
             skip_bad_images=options.skip_bad_images,
             accept=accept,
             heights=heights,
-            views=doubts.watching(),
+            views=advisor.watching(),
         ):
             results.append(result)
-            doubts.take(result)
+            advisor.take(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
         if tracker is not None and options.smooth:
@@ -212,7 +226,7 @@ def _on_map(options: argparse.Namespace) -> None:
             compare_with_flight(flight, results)
         write_results(options.out, results)
         export_all(exports, results, dem or TerrainLayer.of(opened))
-        advice, tried = doubts.advice(results, accept, shown)
+        advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
         changed = report_changes(options, opened, [(seen_by, results)], shown)
     _print_summary(options, results, accept, advice, tried, changed)

@@ -22,19 +22,19 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="FLIGHT_DIR",
-        help="flight folder that was localized: camera, pitch and roll",
+        help="flight folder that was localized, for camera, pitch and roll",
     )
     parser.add_argument(
         "--map",
         type=Path,
         metavar="MAP.onav",
-        help="map whose terrain the ground is (default: level ground)",
+        help="map of the flight, whose terrain is the ground (default: level ground)",
     )
     parser.add_argument(
         "--mount",
         type=Path,
         metavar="mount.json",
-        help="calibration of the mount with which the flight was localized",
+        help="calibration by `orthonav calibrate` with which the flight was localized",
     )
     parser.add_argument("--json", action="store_true", help="print the point as JSON")
 

@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
 
     route = read_route(options.route) if options.route else None
     if options.dem_datum is not None and options.dem is None:
-        raise RouteError("--dem-datum is that of a terrain model: give --dem too")
+        raise RouteError("--dem-datum needs a terrain model: give --dem too")
     if route is None and (options.band_m is not None or options.dem or options.out):
         raise RouteError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:

@@ -47,14 +47,14 @@ class Counts:
 
     @property
     def few(self) -> bool:
-        """Whether so few views are confident that the set-up is doubted."""
+        """Whether so few views are confident that the set-up may be wrong."""
         from orthonav.onboard.setups import FEW
 
         return self.confident < FEW * self.views
 
 
-class Doubts:
-    """Views and doubts of a run, from which its summary advises what to check."""
+class SetupAdvice:
+    """Views of low confidence of a run, from which its summary advises what to check."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Doubts:
         mount: Any,
         heights: "FlownHeights | None",
     ) -> None:
-        from orthonav.onboard.setups import DoubtedViews
+        from orthonav.onboard.setups import LowConfidenceViews
 
         self._options, self._flight, self._localizer = options, flight, localizer
 
@@ -72,13 +72,13 @@ class Doubts:
             made = telemetry if heights is None else heights.corrected(telemetry)
             return mount.corrected(made) if mount else made
 
-        self._doubted = DoubtedViews(flight.camera, corrected)
+        self._low = LowConfidenceViews(flight.camera, corrected)
         self._nearest: tuple[float, str] | None = None
         self._yaw_deg: list[float] = []
 
     def watching(self) -> "Iterator[SourceView]":
         """The views of the flight."""
-        for view in self._doubted.watching(self._flight.views):
+        for view in self._low.watching(self._flight.views):
             found = far_from_map(view, self._localizer)
             if found is not None and (self._nearest is None or found < self._nearest):
                 self._nearest = found
@@ -87,12 +87,15 @@ class Doubts:
 
     def take(self, result: "ViewResult") -> None:
         """The result of the newest view."""
-        self._doubted.take(result)
+        self._low.take(result)
 
     def advice(
         self, results: "Sequence[ViewResult]", accept: "Acceptance", shown: "Progress"
     ) -> "tuple[list[str], list[dict[str, Any]]]":
-        """Sentences on what to check, and what was tried as JSON values; nothing without doubt."""
+        """Sentences on what to check, and the set-ups that were tried as JSON values.
+
+        Both are empty where enough views are confident.
+        """
         from orthonav.geo.headings import RADIANS, seem_radians
         from orthonav.onboard.setups import try_setups
 
@@ -105,11 +108,11 @@ class Doubts:
             return [*lines, far_text("the recorded positions are", *self._nearest)], []
         if counts.low and not any(_states(result, accept) for result in results):
             return [*lines, _SILENT.format(criterion=accept.criterion)], []
-        if not self._doubted.views:
+        if not self._low.views:
             return lines, []
         tried = try_setups(
             self._localizer,
-            self._doubted.views,
+            self._low.views,
             accept.accepts,
             use_prior=options.prior == "telemetry",
             heading_known=known,

@@ -24,18 +24,20 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--agl-m",
         type=float,
         help="height above ground (default: the shorter image side covers 256 px of imagery); with "
-        "--dem that at the first view of a route, which is flown at a constant altitude",
+        "--dem the height at the first view of a route, which is flown at a constant altitude",
     )
     add_dem(
         parser,
-        "over which is flown and which views show in perspective; a surface model has its houses "
-        "and trees stand up; heights above sea level and take-off are reported, not ground",
+        "which the views show in perspective (a surface model also shows houses and trees "
+        "standing up); telemetry then reports heights above sea level and take-off instead of "
+        "heights above ground",
     )
     parser.add_argument(
         "--camera-pitch-deg",
         type=float,
         default=0.0,
-        help="angle by which the camera looks ahead of straight down, 0 to 65 (default 0)",
+        help="angle by which the camera looks ahead of straight down, 0 to 65; reported "
+        "(default 0)",
     )
     parser.add_argument(
         "--spacing-m",
@@ -44,10 +46,16 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--airspeed-mps", type=float, default=25.0, help="airspeed (default 25)")
     parser.add_argument(
-        "--turn-radius-m", type=float, default=0.0, help="fly the corners of the route as arcs"
+        "--turn-radius-m",
+        type=float,
+        default=0.0,
+        help="radius of the arcs at the corners of the route (default 0: sharp corners)",
     )
     parser.add_argument(
-        "--wind-mps", type=float, help="mean wind, with gusts; the aircraft crabs along its route"
+        "--wind-mps",
+        type=float,
+        help="speed of the mean wind, with gusts; the aircraft crabs along its route (default: no "
+        "wind)",
     )
     parser.add_argument(
         "--wind-from-deg", type=float, help="direction the wind comes from (default 270, west)"
@@ -61,27 +69,46 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--camera",
         type=Path,
         metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (default 1280 x 960, 65 deg)",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: "
+        "1280 x 960 px, 65 deg wide",
     )
-    errors = parser.add_argument_group("telemetry noise (standard deviations)")
-    errors.add_argument("--yaw-std-deg", type=float, default=0.0, help="reported heading")
+    errors = parser.add_argument_group("telemetry noise")
+    errors.add_argument(
+        "--yaw-std-deg",
+        type=float,
+        default=0.0,
+        help="standard deviation of the reported heading (default 0)",
+    )
     errors.add_argument(
         "--agl-std",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="reported height, as a share of it: 0.05 is 5 %%",
+        help="standard deviation of the reported height, as a share of it (default 0)",
     )
-    errors.add_argument("--tilt-std-deg", type=float, default=0.0, help="reported pitch and roll")
-    errors.add_argument("--attitude-std-deg", type=float, default=0.0, help="true pitch and roll")
     errors.add_argument(
-        "--prior-std-m", type=float, help="report a prior position with this standard deviation"
+        "--tilt-std-deg",
+        type=float,
+        default=0.0,
+        help="standard deviation of the error of the reported pitch and roll (default 0)",
+    )
+    errors.add_argument(
+        "--attitude-std-deg",
+        type=float,
+        default=0.0,
+        help="standard deviation of the true pitch and roll (default 0)",
+    )
+    errors.add_argument(
+        "--prior-std-m",
+        type=float,
+        help="standard deviation of the prior position, per axis (default: no prior is reported)",
     )
     errors.add_argument(
         "--velocity-drift",
         type=float,
         metavar="SHARE",
-        help="report a velocity whose scale (a share) and direction (rad) drift this much",
+        help="standard deviation of the scale error (a share) and the direction error (rad) of the "
+        "reported velocity (default: no velocity is reported)",
     )
     biases = parser.add_argument_group("constant telemetry biases")
     biases.add_argument(
@@ -112,7 +139,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="share of the views with clouds: 0.2",
+        help="share of the views with clouds, 0 to 1 (default 0)",
     )
     effects.add_argument(
         "--exposure-std",
@@ -137,7 +164,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=90,
         choices=range(1, 101),
         metavar="1..100",
-        help="JPEG quality of the images (default 90)",
+        help="quality of JPEG images (default 90)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of all random draws (default 0)")
     parser.add_argument(

@@ -1,7 +1,8 @@
-"""Options for reading a recording, shared by `import` and `localize`."""
+"""Options for reading a recording, shared by `import`, `localize` and `calibrate`."""
 
 import argparse
 import logging
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,7 +50,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="S",
-        help="added to the times of images to get times of the log",
+        help="offset that is added to the times of images to get times of the log (default 0)",
     )
     group.add_argument(
         "--mount-deg",
@@ -57,7 +58,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         nargs=3,
         default=(0.0, 0.0, 0.0),
         metavar=("YAW", "PITCH", "ROLL"),
-        help="mounting of the camera: 0 0 0 (default) looks straight down, top forward",
+        help="orientation of the camera in the aircraft; 0 0 0 (default) looks straight down with "
+        "the top of the image forward",
     )
     group.add_argument(
         "--topic",
@@ -68,7 +70,11 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         help="ROS topic for image, camera_info, attitude, velocity, position or height",
     )
     group.add_argument(
-        "--rate-hz", type=float, default=1.0, metavar="HZ", help="views per second of a video"
+        "--rate-hz",
+        type=float,
+        default=1.0,
+        metavar="HZ",
+        help="views per second taken from a recording: of a video (default 1)",
     )
     group.add_argument(
         "--sensor-width-mm",
@@ -93,13 +99,14 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         "--prior-std-m",
         type=float,
         metavar="M",
-        help="use the recorded position as the prior, with this standard deviation",
+        help="standard deviation of the prior position, per axis; the recorded position is then "
+        "the prior (default: no prior)",
     )
 
 
-def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str] | None:
-    """Distance (m) of the recorded position of a view and of its prior from the map, the larger
-    one, 0 on the map, and a hint where swapped coordinates explain it; None without a position."""
+def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -> tuple[float, str]:
+    """Distance of a position from the map (m, 0 on the map), and a hint where swapped latitude and
+    longitude explain it, else an empty text."""
     import numpy as np
 
     from orthonav.geo.swapped import swapped_hint
@@ -112,14 +119,18 @@ def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str
         position = frame.en_from_latlon(lat_deg, lon_deg)
         return float(np.hypot(*np.maximum(np.maximum(low - position, position - high), 0.0)))
 
+    hint = swapped_hint(*latlon_deg, lambda lat, lon: beyond_m(lat, lon) <= FAR_M)
+    return beyond_m(*latlon_deg), hint
+
+
+def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str] | None:
+    """`distance_from_map` of the recorded position of a view or of its prior, the farther one; None
+    without a position."""
     prior, recorded = view.telemetry.prior, view.truth_latlon_deg
     places = [] if recorded is None else [recorded]
     places += [] if prior is None else [(prior.lat_deg, prior.lon_deg)]
-    found = [(beyond_m(*place), place) for place in places if np.isfinite(place).all()]
-    if not found:
-        return None
-    far_m, place = max(found)
-    return far_m, swapped_hint(*place, lambda lat, lon: beyond_m(lat, lon) <= FAR_M)
+    known = [place for place in places if all(map(math.isfinite, place))]
+    return max((distance_from_map(place, localizer) for place in known), default=None)
 
 
 def far_text(what: str, far_m: float, hint: str) -> str:

@@ -31,7 +31,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--flight",
         type=Path,
         metavar="FLIGHT_DIR",
-        help="images of the views: a flight folder or a flight log (not needed if RUN is a log)",
+        help="flight folder or flight log with the images (not needed if RUN is a log)",
     )
     parser.add_argument(
         "--truth",
@@ -43,8 +43,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--mount",
         type=Path,
         metavar="mount.json",
-        help="calibration of the mount with which the flight was localized (default: that of the "
-        "flight log, if RUN is one)",
+        help="calibration by `orthonav calibrate` with which the flight was localized (default: "
+        "that of the flight log, if RUN is one)",
     )
     parser.add_argument(
         "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"

@@ -82,7 +82,7 @@ class CovarianceConsistency:
     within: Mapping[float, float]
 
 
-def promised_radius_m(own_radius_m: FloatArray, radius_m: float) -> FloatArray:
+def stated_radius_m(own_radius_m: FloatArray, radius_m: float) -> FloatArray:
     """(N,) metres: the radius that each fix states, or `radius_m` where it states none."""
     return np.where(_is_radius(own_radius_m), own_radius_m, radius_m)
 
@@ -104,7 +104,7 @@ def calibrate(
     stated = confidence[known]
     if not np.all((stated >= 0.0) & (stated <= 1.0)):
         raise ValueError(f"a confidence must be 0 to 1, got {stated.min():g} to {stated.max():g}")
-    right = errors_m[known] <= promised_radius_m(own_radius_m[known], radius_m)
+    right = errors_m[known] <= stated_radius_m(own_radius_m[known], radius_m)
     edges = np.arange(N_BINS + 1) / N_BINS
     place = np.searchsorted(edges[1:-1], stated, side="right")
     bins = tuple(
@@ -136,7 +136,7 @@ def check_covariance(
     deviations, right fixes have no tails, and more than 99 % lie inside the outer bound.
     """
     errors_m = np.hypot(errors_en_m[:, 0], errors_en_m[:, 1])
-    right = errors_m <= promised_radius_m(own_radius_m, radius_m)  # NaN is never right
+    right = errors_m <= stated_radius_m(own_radius_m, radius_m)  # NaN is never right
     cov_en_m2 = cov_en_m2[right]
     without = np.isnan(cov_en_m2).any(axis=(1, 2))
     usable = is_covariance(cov_en_m2)

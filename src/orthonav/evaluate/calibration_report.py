@@ -66,7 +66,7 @@ def consistency_to_json(consistency: CovarianceConsistency) -> dict[str, object]
     }
 
 
-def trust_lines(metrics: Metrics) -> list[str]:
+def calibration_lines(metrics: Metrics) -> list[str]:
     """Standard figures, confidence and covariance in lines for a terminal."""
     standard = metrics.standard
     cep50, cep95 = (measure_text(each, " m") for each in (standard.cep50_m, standard.cep95_m))
@@ -177,7 +177,7 @@ def confidence_text(metrics: Metrics) -> str:
     default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
     return (
         f"{calibration.n_fixes} fixes state {calibration.mean_confidence:.3f} on average, and "
-        f"{calibration.share_right:.3f} of them err by at most the radius they state{default}; "
+        f"{calibration.share_right:.3f} of them are within the stated radius{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
 
@@ -193,14 +193,14 @@ def covariance_text(consistency: CovarianceConsistency) -> str:
     levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
     found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
     return (
-        f"{nees_words(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))}; "
+        f"{nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))}; "
         f"NEES of {consistency.nees.size} correct fixes has mean {consistency.nees_mean:.3g} "
         f"(2 expected), median {consistency.nees_median:.3g} ({nees_bound(0.5):.2f} expected); "
         f"{found} % within the bounds of {levels} %" + (f"; {left_out}" if left_out else "")
     )
 
 
-def nees_words(nees: float, low: float, high: float) -> str:
+def nees_text(nees: float, low: float, high: float) -> str:
     """What a mean NEES says, given the 95 % interval of that of a consistent covariance."""
     times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
     if nees > high:

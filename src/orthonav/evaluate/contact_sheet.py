@@ -43,7 +43,7 @@ _GREY_LEVELS = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class Cutout:
     """A north-up image.
 
     `grey`: grey levels (H, W), masked where there is no imagery.
@@ -73,9 +73,9 @@ class Row:
     side_m: float
     shift_en_m: NDArray[np.float64]
     centre_en_m: NDArray[np.float64]
-    view: Patch | None
-    at_estimate: Patch | None
-    at_truth: Patch | None
+    view: Cutout | None
+    at_estimate: Cutout | None
+    at_truth: Cutout | None
     why_not: str = ""
     why_no_map: str = ""
 
@@ -153,15 +153,15 @@ def _row(
     fix_en_m, truth_en_m = comparison.fix_en_m[place], comparison.truth_en_m[place]
     covariance = comparison.cov_en_m2[place]
     usable = bool(is_covariance(covariance[None])[0])
-    shown: Patch | None = None
+    shown: Cutout | None = None
     side_m, centre_en_m, why_not = USUAL_SIDE_M, np.zeros(2), "this view is not in the flight"
     if view is not None:
         try:
-            side_m, centre_en_m, shown = _view_patch(view, flight.camera, result)
+            side_m, centre_en_m, shown = _view_cutout(view, flight.camera, result)
             why_not = ""
         except FlightError as error:
             why_not = str(error).removesuffix(f": {view.where}")
-    maps = [_map_patch(pyramid, grid, at, centre_en_m, side_m) for at in (fix_en_m, truth_en_m)]
+    maps = [_map_cutout(pyramid, grid, at, centre_en_m, side_m) for at in (fix_en_m, truth_en_m)]
     return Row(
         frame=result.frame,
         state=result.state or "",
@@ -179,9 +179,9 @@ def _row(
     )
 
 
-def _view_patch(
+def _view_cutout(
     view: RecordedView, camera: Camera, result: ViewResult
-) -> tuple[float, NDArray[np.float64], Patch]:
+) -> tuple[float, NDArray[np.float64], Cutout]:
     """Width of the image in metres, its middle from the camera (2,), and the image.
 
     Raises `FlightError` with the reason where there is none.
@@ -204,7 +204,7 @@ def _view_patch(
     east, north = (float(value) for value in made.offset_en_m)
     half = side_m / 2
     extent_m = east - half, east + half, north - half, north + half
-    return side_m, made.offset_en_m, Patch(np.ma.masked_where(~made.valid, made.grey), extent_m)
+    return side_m, made.offset_en_m, Cutout(np.ma.masked_where(~made.valid, made.grey), extent_m)
 
 
 def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
@@ -223,13 +223,13 @@ def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
     )
 
 
-def _map_patch(
+def _map_cutout(
     pyramid: GreyPyramid,
     grid: TileGrid,
     position_en_m: NDArray[np.float64],
     centre_en_m: NDArray[np.float64],
     side_m: float,
-) -> Patch | None:
+) -> Cutout | None:
     """The map `side_m` wide, at the coarsest level that is fine enough; None where none is."""
     fine = math.log2(max(side_m / SIDE_PX / grid.gsd_m, 1.0))
     level = min(int(fine), pyramid.levels - 1)
@@ -245,7 +245,7 @@ def _map_patch(
     north = grid.north_m - row * step_m - position_en_m[1]
     extent_m = tuple(map(float, (west, west + size * step_m, north - size * step_m, north)))
     assert len(extent_m) == 4
-    return Patch(np.ma.masked_where(~valid, grey), extent_m)
+    return Cutout(np.ma.masked_where(~valid, grey), extent_m)
 
 
 def _draw_row(part: "SubFigure", row: Row) -> None:
@@ -253,36 +253,36 @@ def _draw_row(part: "SubFigure", row: Row) -> None:
     part.suptitle(row_text(row), fontsize=10, color=colour, parse_math=False)
     titles = ("view", "map at the fix", "map at the true position")
     why = (row.why_not, row.why_no_map, row.why_no_map)
-    patches = (row.view, row.at_estimate, row.at_truth)
+    cutouts = (row.view, row.at_estimate, row.at_truth)
     nothing = np.zeros(2)
     marks = (
         {"estimate": nothing},
         {"estimate": nothing, "truth": -row.shift_en_m},
         {"estimate": row.shift_en_m, "truth": nothing},
     )
-    for axes, title, patch, reason, marked in zip(
-        part.subplots(1, 3), titles, patches, why, marks, strict=True
+    for axes, title, cutout, reason, marked in zip(
+        part.subplots(1, 3), titles, cutouts, why, marks, strict=True
     ):
         axes.set_title(title, fontsize=9, color=SOFT)
         axes.set(facecolor=_NOTHING, xticks=[], yticks=[])
         axes.grid(visible=False)
-        if patch is None:
+        if cutout is None:
             axes.text(
                 *(0.5, 0.5), _wrapped(reason), ha="center", va="center", color=SOFT, fontsize=9
             )
             axes.set(aspect="equal")
             continue
-        _draw_patch(axes, row, patch)
+        _draw_cutout(axes, row, cutout)
         _draw_marks(axes, marked)
 
 
-def _draw_patch(axes: "Axes", row: Row, patch: Patch) -> None:
-    known = patch.grey.compressed()
+def _draw_cutout(axes: "Axes", row: Row, cutout: Cutout) -> None:
+    known = cutout.grey.compressed()
     low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 255.0)
     axes.imshow(
-        patch.grey,
+        cutout.grey,
         cmap=_few_greys(),
-        extent=patch.extent_m,
+        extent=cutout.extent_m,
         vmin=float(low),
         vmax=max(float(high), float(low) + 1.0),
         interpolation="none",

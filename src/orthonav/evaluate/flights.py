@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from orthonav.evaluate.calibration_report import (
+    calibration_lines,
     calibration_to_json,
     consistency_to_json,
     row_to_json,
-    trust_lines,
 )
 from orthonav.evaluate.contact_sheet import Row
 from orthonav.evaluate.figures import or_none
@@ -156,7 +156,7 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
 
     `whole`: what `total` gives.
     """
-    lines = trust_lines(whole)
+    lines = calibration_lines(whole)
     for flight in flights:
         if flight.track is not None:
             lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")
@@ -168,17 +168,17 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
 def verdict(metrics: Metrics) -> str:
     """A sentence that answers whether any confident fix was wrong."""
     confident, wrong = metrics.n_confident, metrics.n_confident_wrong
-    above = f"{metrics.wrong_above_m:g} m and the radius that it states"
+    above = f"{metrics.wrong_above_m:g} m and the stated radius"
     if not confident:
         guesses = metrics.n_fixes
-        return f"No fix is confident: no position may be relied on ({guesses} are best guesses)."
+        return f"No fix is confident: rely on no position ({guesses} are best guesses)."
     errors = (
         f"median error {measure_text(metrics.confident_median_m, ' m')}, largest "
         f"{measure_text(metrics.confident_max_m, ' m')}"
     )
     if not wrong:
         return (
-            f"No confident fix is wrong: none of {confident} errs by more than {above}; {errors}."
+            f"No confident fix is wrong: none of {confident} has an error above {above}; {errors}."
         )
     verb = "is" if wrong == 1 else "are"
     return f"{wrong} of {confident} confident fixes {verb} WRONG, by more than {above}; {errors}."

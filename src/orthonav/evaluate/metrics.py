@@ -83,7 +83,7 @@ class Comparison:
         return self.errors_m.size + self.n_without_result
 
     def confident_wrong(self, least_m: float) -> BoolArray:
-        """(N,): confident fixes that err by more than `least_m` and the radius they state."""
+        """(N,): confident fixes with an error above `least_m` and above the stated radius."""
         wrong: BoolArray = self.confident & (self.errors_m > np.fmax(least_m, self.own_radius_m))
         return wrong
 
@@ -225,7 +225,7 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
     Raises `ValueError` for no flight at all.
     """
     if not comparisons:
-        raise ValueError("nothing to pool: expected at least one flight")
+        raise ValueError("no results: expected at least one flight")
     parts = list(comparisons)
     starts: list[int] = []
     views = 0

@@ -89,7 +89,7 @@ def track_map_picture(
     radius_m: float,
     background: Background | None = None,
 ) -> Drawing:
-    """True way, estimates coloured by state, 95 % ellipses of some, lines from wrong ones."""
+    """True path, estimates coloured by state, 95 % ellipses of some, lines from wrong ones."""
     box = view_box(comparison, radius_m)
     wrong = comparison.errors_m > radius_m
     size = 7.0 if len(series.states) < 120 else 5.0
@@ -205,9 +205,9 @@ def _draw_ellipses(
     seen = is_covariance(comparison.cov_en_m2) & np.isfinite(comparison.errors_m)
     usable = np.flatnonzero(seen & (np.nan_to_num(series.bound_95_m, nan=math.inf) < side_m / 3))
     for i in usable[:: max(1, math.ceil(usable.size / MOST_ELLIPSES))]:
-        sizes, ways = np.linalg.eigh(comparison.cov_en_m2[i])
+        sizes, axes_en = np.linalg.eigh(comparison.cov_en_m2[i])
         width, height = 2 * np.sqrt(nees_bound(0.95) * np.maximum(sizes[::-1], 0.0))
-        turn_deg = math.degrees(math.atan2(ways[1, 1], ways[0, 1]))
+        turn_deg = math.degrees(math.atan2(axes_en[1, 1], axes_en[0, 1]))
         colour = STATE_STYLES.get(series.states[i], (GREY, ""))[0]
         at = tuple(map(float, comparison.fix_en_m[i]))
         shape = Ellipse((at[0], at[1]), width, height, angle=turn_deg, fill=False, zorder=5)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from orthonav.evaluate.calibration import nees_bound
-from orthonav.evaluate.calibration_report import nees_words
+from orthonav.evaluate.calibration_report import nees_text
 from orthonav.evaluate.figures import FloatArray, or_none
 from orthonav.evaluate.metrics import radius_key
 from orthonav.evaluate.track import Longest, Spread, TrackConsistency, TrackMetrics, TrackSeries
@@ -61,7 +61,7 @@ def consistency_text(found: TrackConsistency) -> str:
         return "unknown, no tracking view has a usable one and a true position"
     left_out = f"; {found.n_left_out} without a usable one" if found.n_left_out else ""
     return (
-        f"{nees_words(found.nees_mean, found.effective_low, found.effective_high)}; "
+        f"{nees_text(found.nees_mean, found.effective_low, found.effective_high)}; "
         f"NEES of {found.n_views} tracking views has mean {found.nees_mean:.3g} "
         f"(2 expected; 95 % interval {found.effective_low:.2f} to {found.effective_high:.2f} for "
         f"{found.n_effective:.0f} effective views, as errors are correlated; for independent views "

@@ -19,7 +19,7 @@ FAULTS = (
     *("gnss_lost", "gnss_frozen", "gnss_jump", "gnss_step", "gnss_drift"),
     *("gnss_velocity", "gnss_offset", "gnss_disagrees", "gnss_returning"),
 )
-"""Reasons by the code, from 1, that evidence has as `gnss_fault`; 0 is none (docs/onboard.md)."""
+"""Reasons by the code, from 1, that evidence has as `gnss_fault`; 0 is none (docs/gnss.md)."""
 BIASES = (
     ("gnss_map_east_m", "gnss_map_east_std_m"),
     ("gnss_map_north_m", "gnss_map_north_std_m"),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthonav.errors import AreaError
+from orthonav.geo.swapped import swapped_hint
 
 WGS84_A_M = 6378137.0
 WGS84_F = 1 / 298.257223563
@@ -40,6 +41,7 @@ class LocalFrame:
             raise AreaError(
                 f"centre of a sheet must be a latitude within 89.9 and a longitude within 360 "
                 f"degrees, got {self.lat_deg}, {self.lon_deg}"
+                f"{swapped_hint(self.lat_deg, self.lon_deg)}"
             )
 
     @property

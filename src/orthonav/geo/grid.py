@@ -51,7 +51,9 @@ class TileGrid:
         if not 0 <= overlap < 1:
             raise AreaError(f"overlap must be at least 0 and below 1, got {overlap}")
         if not (np.isfinite(extent_en_m).all() and east >= west and north >= south):
-            raise AreaError(f"area is empty or endless: west, south, east, north = {extent_en_m} m")
+            raise AreaError(
+                f"area is empty or not finite: west, south, east, north {extent_en_m} m"
+            )
         stride_px = max(1, round(tile_px * (1 - overlap)))
         stride_m = stride_px * gsd_m
         cols = max(1, int(np.ceil((east - west) / stride_m - 1e-9)))

@@ -56,7 +56,7 @@ class WorldSheets:
         """Name of the sheet that contains a position. Raises `AreaError` if it is invalid."""
         if not (abs(lat_deg) <= 90 and math.isfinite(lon_deg)):
             hint = swapped_hint(lat_deg, lon_deg)
-            raise AreaError(f"no position on Earth: {lat_deg}, {lon_deg}{hint}")
+            raise AreaError(f"not a latitude and longitude in degrees: {lat_deg}, {lon_deg}{hint}")
         row = min(self.rows - 1, max(0, int((lat_deg + 90) / 180 * self.rows)))
         cols = self.cols(row)
         turned = (lon_deg + 180) % 360

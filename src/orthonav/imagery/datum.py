@@ -62,7 +62,7 @@ def horizontal_and_vertical(
     found = stated or named
     if found is None:
         raise ImageryError(
-            "terrain file does not state what its heights count from; its documentation does: "
+            "terrain file does not state its vertical datum; see its documentation and "
             f"give {OPTION}: {path}"
         )
     if named is not None and found.above_ellipsoid != named.above_ellipsoid:

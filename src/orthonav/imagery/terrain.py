@@ -254,7 +254,7 @@ def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
         )
     stated = None if data.nodata is None else float(data.nodata)
     if len(odd) and stated is None:
-        log.warning("terrain: %g is taken as no data: %s", odd[0], path)
+        log.warning("terrain: %g is treated as no data: %s", odd[0], path)
         return float(odd[0])
     return stated
 

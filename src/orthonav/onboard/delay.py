@@ -20,8 +20,8 @@ from orthonav.onboard.delay_fit import (
     SUMS,
     Array,
     Coarse,
+    MotionPrior,
     Pairs,
-    Prior,
     coarse,
     explained,
     fitted,
@@ -183,15 +183,15 @@ class DelayEstimator:
         return _estimate(pairs, prior, nothing)
 
 
-def _prior(reported: Array, *, heading_known: bool) -> Prior:
+def _prior(reported: Array, *, heading_known: bool) -> MotionPrior:
     unknown = ~np.isfinite(reported[..., 3]) & np.isfinite(reported[..., 0])
     constant = FREE_STD if unknown.any() else CONSTANT_STD
     gain = (SCALE_STD, ACROSS_STD) if heading_known else (ANY_STD, ANY_STD)
     mean = np.array([1.0 if heading_known else 0.0, 0.0, 0.0, 0.0, 0.0])
-    return Prior(mean, np.array([*gain, MOUNT_STD_RAD, constant, constant]))
+    return MotionPrior(mean, np.array([*gain, MOUNT_STD_RAD, constant, constant]))
 
 
-def _estimate(pairs: Pairs, prior: Prior, nothing: DelayEstimate) -> DelayEstimate:
+def _estimate(pairs: Pairs, prior: MotionPrior, nothing: DelayEstimate) -> DelayEstimate:
     noise, weights = pairs.noise(), np.ones(len(pairs.turn))
     least = noise
     for _ in range(3):  # robust: pairs that the best candidate does not explain count less

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class MotionPrior:
     """Mean and standard deviations (5,) of the linear parameters."""
 
     mean: Array
@@ -134,7 +134,7 @@ def pair_sums(seconds: float, turn: float, shift: Array, reported: Array) -> Arr
     return np.asarray(np.concatenate(parts, axis=1) * known[:, None])
 
 
-def coarse(sums: Array, weights: Array, noise: Array, prior: Prior) -> Coarse:
+def coarse(sums: Array, weights: Array, noise: Array, prior: MotionPrior) -> Coarse:
     """Fit of every candidate with `weights` (N,) of the pairs."""
     total = (weights @ sums.reshape(len(weights), -1)).reshape(sums.shape[1:])
     count = np.maximum(total[:, 32], 1e-9)
@@ -149,7 +149,7 @@ def coarse(sums: Array, weights: Array, noise: Array, prior: Prior) -> Coarse:
     return Coarse(cost, linear, np.linalg.inv(normal) * ALIKE, known)
 
 
-def fitted(pairs: Pairs, reported: Array, noise: Array, prior: Prior) -> Fit:
+def fitted(pairs: Pairs, reported: Array, noise: Array, prior: MotionPrior) -> Fit:
     """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
     known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
     reported = np.nan_to_num(reported)
@@ -181,7 +181,7 @@ def at_delays(pairs: Pairs, delays: Array, first: float, step: float) -> tuple[A
 
 
 def refined(
-    pairs: Pairs, delay: float, noise: Array, prior: Prior, grid: tuple[float, float, float]
+    pairs: Pairs, delay: float, noise: Array, prior: MotionPrior, grid: tuple[float, float, float]
 ) -> tuple[Array, Array, Fit]:
     """Delay at the end of the window and its drift (2,), their covariance (2, 2), and the fit, by
     Gauss-Newton steps from a delay. `grid`: first candidate, step, and the standard deviation of

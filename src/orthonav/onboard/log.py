@@ -81,7 +81,7 @@ Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class _Waiting:
+class _WaitingMessage:
     """A message to be encoded; `size_bytes` is the memory that it holds in the queue."""
 
     make: "Callable[[], list[Message]]"
@@ -148,7 +148,7 @@ class FlightLog:
         self._segment: Segment | None = None
         self._no_views_until = -math.inf
         self._warned = False
-        self._queue: list[_Waiting] = []
+        self._queue: list[_WaitingMessage] = []
         self._queued_bytes = 0
         self._closing = False
         self._change = threading.Condition()
@@ -262,7 +262,7 @@ class FlightLog:
         with self._change:
             room = self._queued_bytes + size_bytes <= QUEUE_BYTES + SPARE_BYTES
             if not self._closing and room and len(self._queue) < QUEUE_MESSAGES:
-                self._queue.append(_Waiting(make, size_bytes, has_view))
+                self._queue.append(_WaitingMessage(make, size_bytes, has_view))
                 self._queued_bytes += size_bytes
                 if self._queued_bytes >= CHUNK_BYTES:
                     self._change.notify()
@@ -298,7 +298,7 @@ class FlightLog:
             if closing:
                 return
 
-    def _made(self, waiting: _Waiting) -> "list[Message]":
+    def _made(self, waiting: _WaitingMessage) -> "list[Message]":
         try:
             return waiting.make()
         except Exception as error:

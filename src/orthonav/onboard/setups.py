@@ -23,8 +23,8 @@ from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 
 V = TypeVar("V", bound=RecordedView)
 FEW = 0.5
-"""Below this share of confident views the set-up is doubted, and from this share on a change
-explains the doubt."""
+"""Below this share of confident views the set-up may be wrong, and from this share on a change
+explains it."""
 SAMPLE = 8
 """At most so many views are placed again."""
 _GIVE_UP = 4
@@ -99,7 +99,7 @@ class Tried:
         return self.confident >= FEW * self.views and self.confident > 0
 
 
-class DoubtedViews:
+class LowConfidenceViews:
     """Some of the views of a flight that are not confident, spread evenly over them."""
 
     def __init__(self, camera: Camera, corrected: Callable[[Telemetry], Telemetry]) -> None:
@@ -145,7 +145,7 @@ def try_setups(
 ) -> list[Tried]:
     """What each change of the set-up does to the views, in the order in which they were tried.
 
-    `accepts` says whether an outcome is confident. The first change that explains the doubt ends
+    `accepts` says whether an outcome is confident. The first change that explains it ends
     the search; at most ten are tried, each on at most `SAMPLE` views. `tracked`: the views were
     judged as a track, so they are first placed one by one as reported.
     """

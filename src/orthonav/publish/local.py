@@ -14,6 +14,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
+from orthonav.geo.swapped import swapped_hint
 from orthonav.publish.estimate import EstimateError
 
 PX4_RADIUS_M = 6371000.0
@@ -45,7 +46,7 @@ class Origin:
         if not (placed and math.isfinite(self.alt_amsl_m)):
             raise EstimateError(
                 f"an origin needs latitude, longitude and altitude, got {self.lat_deg}, "
-                f"{self.lon_deg}, {self.alt_amsl_m}"
+                f"{self.lon_deg}, {self.alt_amsl_m}{swapped_hint(self.lat_deg, self.lon_deg)}"
             )
 
 

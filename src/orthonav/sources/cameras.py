@@ -60,7 +60,7 @@ def read_camera_file(path: Path) -> Camera:
         # Kalibr chains may begin with OpenCV's header, which is not YAML.
         chain = _CHAIN.search(text) is not None
         if name is not None and not chain:
-            raise CameraError(f"file is no Kalibr chain; give it without #{name:.60}")
+            raise CameraError(f"file is not a Kalibr chain; give it without #{name:.60}")
         if not chain and (text.startswith(_OPENCV_HEADER) or "opencv-matrix" in text):
             return _opencv(text)
         if text.lstrip().startswith("{"):

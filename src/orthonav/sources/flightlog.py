@@ -88,7 +88,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     image was logged or no chunk is complete, `CameraError` or `MissingExtraError`.
     """
     if options.telemetry is not None:
-        raise FlightError(f"a flight log has its own telemetry; leave out --telemetry: {path}")
+        raise FlightError(f"a flight log has its own telemetry; omit --telemetry: {path}")
     files = files_of_run(path)
     index = _Index()
     for file in files:

@@ -83,9 +83,7 @@ def _is_video(path: Path) -> bool:
 def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
     """A flight folder as a recording; truth may become the prior, the camera may be replaced."""
     if options.telemetry is not None:
-        raise FlightError(
-            f"a flight folder has its own telemetry; leave out --telemetry: {folder.path}"
-        )
+        raise FlightError(f"a flight folder has its own telemetry; omit --telemetry: {folder.path}")
     camera = folder.camera
     if options.camera is not None:
         given = read_camera_file(options.camera)

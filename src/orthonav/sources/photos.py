@@ -23,12 +23,12 @@ from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
-    doubts_of,
     fitted,
     height_warnings,
     jump_warnings,
     known_at,
     rounded,
+    warnings_of,
     with_options,
 )
 from orthonav.sources.track import RecordedTrack
@@ -76,7 +76,7 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
     if options.telemetry is not None:
         track = read_log(options.telemetry, options.mount_deg)
         check_overlap(track, taken[0].time_ns, taken[-1].time_ns, options.telemetry)
-        warnings += doubts_of(track, options)
+        warnings += warnings_of(track, options)
     else:
         poses, doubts = poses_of([one.photo for one in taken])
         taken = [replace(one, pose=pose) for one, pose in zip(taken, poses, strict=True)]

@@ -140,7 +140,7 @@ LEVEL_GROUND_IN_GAPS = (
 )
 
 
-def doubts_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
+def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
     """Warnings about a track for people: its own, what its heights are, and jumps."""
     warnings, series = list(track.warnings), track.position
     known = bool(track.heights) or track.home is not None

@@ -23,9 +23,9 @@ from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
-    doubts_of,
     fitted,
     known_at,
+    warnings_of,
 )
 from orthonav.sources.ros_images import camera_of_info, grey_of_message
 from orthonav.sources.ros_limits import bound_inflation, check_held
@@ -71,7 +71,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         note=f"{path.name}: {topics.summary()}",
         expected=expected,
         stream=partial(_views, path, topics.image.topic, track, options),
-        warnings=(*warnings, *doubts_of(track, options)),
+        warnings=(*warnings, *warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
 

@@ -38,7 +38,7 @@ def check_held(readers: Iterable[Any]) -> None:
             _require(max((chunk.uncompressed_size for chunk in chunks), default=0))
             if (held := _most_held(chunks)) > MAX_HELD_BYTES:
                 raise ValueError(
-                    f"chunks of the same time claim {held} bytes, more than {MAX_HELD_BYTES}"
+                    f"chunks of the same time state {held} bytes, more than {MAX_HELD_BYTES}"
                 )
 
 
@@ -58,7 +58,7 @@ def _most_held(chunks: Iterable[Any]) -> int:
 
 def _require(size: int) -> None:
     if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk claims {size} bytes, more than {MAX_CHUNK_BYTES}")
+        raise ValueError(f"a chunk states {size} bytes, more than {MAX_CHUNK_BYTES}")
 
 
 def _zstd(data: bytes, size: int) -> bytes:

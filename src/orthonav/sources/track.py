@@ -114,7 +114,7 @@ def attitude_of_angles(
 
 
 def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> TimeSeries | None:
-    """A series of (lat_deg, lon_deg, alt_m) that crosses the 180th meridian the short way.
+    """A series of (lat_deg, lon_deg, alt_m) that crosses the 180th meridian on the shorter side.
 
     Altitudes may be NaN. Samples at 0, 0 are dropped: recorders write that for "no position".
     """

@@ -23,9 +23,9 @@ from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
-    doubts_of,
     fitted,
     known_at,
+    warnings_of,
 )
 from orthonav.sources.subtitles import end_ns
 from orthonav.sources.track import RecordedTrack
@@ -58,7 +58,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         note=f"video {path.name}, telemetry of {telemetry_path.name}",
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=partial(_views, path, track, options),
-        warnings=tuple(doubts_of(track, options)),
+        warnings=tuple(warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
 

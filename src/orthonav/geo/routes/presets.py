@@ -14,6 +14,7 @@ import numpy as np
 from orthonav.errors import RouteError
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.routes.record import Height, Route
+from orthonav.geo.swapped import swapped_hint
 
 PREFIX = "paper:"
 EAST_DEG = 90.0
@@ -59,7 +60,10 @@ def preset(text: str) -> Route:
         raise RouteError(f"preset must be {_FORM} with numbers in degrees, got '{text:.60}'")
     lat_deg, lon_deg, *bearing = numbers
     if not (abs(lat_deg) <= 89 and abs(lon_deg) <= 360):
-        raise RouteError(f"centre of a preset is no place within 89 deg: {lat_deg}, {lon_deg}")
+        raise RouteError(
+            "the centre of a preset needs a latitude of -89 to 89 and a longitude of -360 to 360, "
+            f"got {lat_deg}, {lon_deg}{swapped_hint(lat_deg, lon_deg)}"
+        )
     turn = math.radians(bearing[0] if bearing else EAST_DEG)
     half_m = shape.length_m / 2
     ends = np.array([[-half_m], [half_m]]) * [math.sin(turn), math.cos(turn)]

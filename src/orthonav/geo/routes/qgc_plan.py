@@ -68,7 +68,8 @@ def _items(raw: Any, index: int) -> list[MissionItem]:
         return _landing(raw, f"{where} ({name})")
     raise RouteError(
         f"{where} is a {name!r:.40}: only surveys, corridor scans and landing patterns are read "
-        "besides waypoints, for in others the camera does not look down; take it out of the plan"
+        "besides waypoints, because in others the camera does not look down; remove it from the "
+        "plan"
     )
 
 

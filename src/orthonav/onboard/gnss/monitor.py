@@ -26,9 +26,9 @@ from orthonav.onboard.gnss.records import (
     NANOSECONDS,
     Array,
     Fault,
+    GnssState,
     GnssStatus,
     MapPosition,
-    State,
 )
 from orthonav.onboard.gnss.rolling import Rolling
 
@@ -192,7 +192,7 @@ class GnssMonitor:
         self.status = replace(self.status, difference_en_m=(east, north))
         if (now_ns - self._fault_ns) * NANOSECONDS < CLEAR_S:
             return  # the receiver has a fault by itself
-        if self.status.state in (State.WAITING, State.GOOD):
+        if self.status.state in (GnssState.WAITING, GnssState.GOOD):
             found = (
                 self._window.finding(self._learner.learnt)
                 or self._too_far(recent, value)
@@ -201,42 +201,42 @@ class GnssMonitor:
             if found is not None:
                 self._alarm(self._attributed(found, now_ns), now_ns, found)
                 return
-        if self.status.state in (State.WAITING, State.GOOD):
+        if self.status.state in (GnssState.WAITING, GnssState.GOOD):
             self._learner.add(value)
         self._count_agreement(recent, value, now_ns)
 
     def _count_agreement(self, recent: list[Difference], value: Difference, now_ns: int) -> None:
         """Count the time of agreement with the anchor, and change the state."""
-        anchor = self._learner.learnt if self.status.state is State.GOOD else self._anchor
+        anchor = self._learner.learnt if self.status.state is GnssState.GOOD else self._anchor
         limit_m = max(AGREE_M, AGREE_SIGMAS * self._std_m(value, anchor))
-        if self.status.state is State.WAITING and anchor.agreed_s == 0:
+        if self.status.state is GnssState.WAITING and anchor.agreed_s == 0:
             limit_m = max(limit_m, LARGEST_M)  # nothing is known of the map
         if float(np.hypot(*_residual(recent, anchor))) > limit_m:
             self._agreed_s = 0.0
-            if self.status.state is State.WAITING:
+            if self.status.state is GnssState.WAITING:
                 self._learner.discard()
-            if self.status.state in (State.ALARM, State.RETURNING):
+            if self.status.state in (GnssState.ALARM, GnssState.RETURNING):
                 fault = self.status.fault
                 named = fault if fault is None else _LEFT.get(fault, fault)
                 self.status = replace(self.status, fault=named)
-                self._enter(State.ALARM, now_ns)
+                self._enter(GnssState.ALARM, now_ns)
             return
         self._agreed_s += BIN_S
-        if self.status.state is State.ALARM and self._agreed_s >= RECENT_S:
-            self._enter(State.RETURNING, now_ns)
-        if self.status.state is not State.GOOD and self._agreed_s >= RETURN_S:
-            self._enter(State.GOOD, now_ns)
+        if self.status.state is GnssState.ALARM and self._agreed_s >= RECENT_S:
+            self._enter(GnssState.RETURNING, now_ns)
+        if self.status.state is not GnssState.GOOD and self._agreed_s >= RETURN_S:
+            self._enter(GnssState.GOOD, now_ns)
             self.status = replace(self.status, fault=None, fault_en_m=(math.nan, math.nan))
 
     def _alarm(self, fault: Fault, now_ns: int, found: Finding | None) -> None:
         """Raise an alarm: learning stops, and what waits to be learnt is discarded."""
-        if self.status.state in (State.WAITING, State.GOOD):
+        if self.status.state in (GnssState.WAITING, GnssState.GOOD):
             begin_s = now_ns * NANOSECONDS if found is None else found.onset_s
             if fault is Fault.OFFSET:
                 self._learner.restore()
             is_old = found is not None and found.fault is Fault.OFFSET
             self._anchor = self._learner.until(-math.inf if is_old else begin_s - BEFORE_S)
-        if self.status.state is State.ALARM and (
+        if self.status.state is GnssState.ALARM and (
             self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
         ):
             return
@@ -244,10 +244,10 @@ class GnssMonitor:
         self._forget()
         size = (math.nan, math.nan) if found is None else found.en_m
         self.status = replace(self.status, fault=fault, fault_en_m=size)
-        self._enter(State.ALARM, now_ns)
+        self._enter(GnssState.ALARM, now_ns)
 
-    def _enter(self, state: State, now_ns: int) -> None:
-        if state is State.ALARM:
+    def _enter(self, state: GnssState, now_ns: int) -> None:
+        if state is GnssState.ALARM:
             self._agreed_s = 0.0
         if state is not self.status.state:
             self.status = replace(self.status, state=state, since_ns=now_ns)

@@ -44,7 +44,7 @@ RETURNING = FAULTS[-1]
 RETURNING_CODE = len(FAULTS)
 
 
-class State(Enum):
+class GnssState(Enum):
     """State of the comparison."""
 
     WAITING = "waiting"
@@ -90,7 +90,7 @@ class GnssStatus:
     `fault_en_m`: estimated change of the difference by the fault; NaN where it has none.
     """
 
-    state: State = State.WAITING
+    state: GnssState = GnssState.WAITING
     fault: Fault | None = None
     since_ns: int = 0
     difference_en_m: tuple[float, float] = (math.nan, math.nan)
@@ -99,13 +99,13 @@ class GnssStatus:
     @property
     def reason(self) -> str | None:
         """Reason in the health; None while there is no alarm."""
-        if self.state is State.RETURNING:
+        if self.state is GnssState.RETURNING:
             return RETURNING
-        return self.fault.value if self.state is State.ALARM and self.fault else None
+        return self.fault.value if self.state is GnssState.ALARM and self.fault else None
 
     @property
     def code(self) -> int:
         """0 without a fault, else that of the fault, or `RETURNING_CODE`."""
-        if self.state is State.RETURNING:
+        if self.state is GnssState.RETURNING:
             return RETURNING_CODE
-        return self.fault.code if self.state is State.ALARM and self.fault else 0
+        return self.fault.code if self.state is GnssState.ALARM and self.fault else 0

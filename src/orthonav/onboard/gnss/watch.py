@@ -23,9 +23,9 @@ from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
     Array,
+    GnssState,
     GnssStatus,
     MapPosition,
-    State,
 )
 from orthonav.publish.estimate import error_ellipse
 from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
@@ -318,10 +318,15 @@ def _change(
     name: str, before: GnssStatus, now: GnssStatus, correction_en_m: Array
 ) -> GnssText | None:
     """Message about a change; None without one that matters to an operator."""
-    if now.state is State.ALARM and (before.state is not State.ALARM or before.fault != now.fault):
+    if now.state is GnssState.ALARM and (
+        before.state is not GnssState.ALARM or before.fault != now.fault
+    ):
         kind = now.fault.value.removeprefix("gnss_") if now.fault else "fault"
         return GnssText(ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}")
-    if now.state is State.GOOD and before.state in (State.ALARM, State.RETURNING):
+    if now.state is GnssState.GOOD and before.state in (
+        GnssState.ALARM,
+        GnssState.RETURNING,
+    ):
         east, north = (np.array(now.difference_en_m) - correction_en_m).tolist()
         return GnssText(RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}")
     return None

@@ -38,7 +38,7 @@ IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/Compres
 
 
 @dataclass(frozen=True, eq=False)
-class _Waiting:
+class _WaitingImage:
     """An image that waits for its telemetry since `arrived_ns` of our clock."""
 
     message: Any
@@ -66,7 +66,7 @@ class Ros2Reader:
         self.log_gnss: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._camera: Camera | None = None
         self._camera_error: CameraError | None = None
-        self._images: deque[_Waiting] = deque()
+        self._images: deque[_WaitingImage] = deque()
         self._clock: tuple[int, int] | None = None
         self._number, self._image_ns, self._attitude_ns = 0, 0, 0
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
@@ -172,7 +172,7 @@ class Ros2Reader:
         self._image_ns = time_ns
         while len(self._images) > 1:
             self._images.pop()
-        self._images.append(_Waiting(message, time_ns, self._clocks.mono_ns()))
+        self._images.append(_WaitingImage(message, time_ns, self._clocks.mono_ns()))
 
     def _take_camera_info(self, message: Any, cdr: bytes) -> None:
         """Use the first one: the camera does not change in flight."""
@@ -226,13 +226,13 @@ class Ros2Reader:
             )
             self.log_gnss(time_ns, cdr)
 
-    def _is_ready(self, image: _Waiting) -> bool:
+    def _is_ready(self, image: _WaitingImage) -> bool:
         covered_ns = self._buffer.covered_ns
         if covered_ns is not None and covered_ns >= image.stamp_ns:
             return True
         return self._clocks.mono_ns() - image.arrived_ns >= self._wait_ns
 
-    def _camera_image(self, image: _Waiting) -> CameraImage:
+    def _camera_image(self, image: _WaitingImage) -> CameraImage:
         self._number += 1
         exposed_ns = image.stamp_ns - (self._ahead_ns() or 0)
         off_s = (self._clocks.mono_ns() - exposed_ns) / 1e9

@@ -90,7 +90,7 @@ CLEARING_YEARS = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Appearance:
     """Appearance of M parcels at one date, in the order of the given plans; row 0 is bare meadow.
 
     - `rgb` (M, 3): display colour.
@@ -112,7 +112,7 @@ class Looks:
     lane_m: Float32
 
 
-def looks(plans: Sequence[CellPlan], epoch: Epoch) -> Looks:
+def appearance_of(plans: Sequence[CellPlan], epoch: Epoch) -> Appearance:
     """Return the appearance of the parcels of `plans`, in order, at `epoch`."""
     time = epoch.time_years
     merged = _gather([plan.merge_year for plan in plans], np.inf) <= time
@@ -125,7 +125,7 @@ def looks(plans: Sequence[CellPlan], epoch: Epoch) -> Looks:
     rgb, rows, lanes, row_m = _colours(cover, identity, epoch)
     arable = cover == LandCover.ARABLE
     strength = _draw("patch", identity, epoch)
-    return Looks(
+    return Appearance(
         rgb=rgb.astype(np.float32),
         cover=cover,
         soil=np.where(arable, 0.15 * (1.4 * strength - 0.25), 0.07).astype(np.float32),

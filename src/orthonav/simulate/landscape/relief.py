@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.simulate.landscape.crops import Looks
+from orthonav.simulate.landscape.crops import Appearance
 from orthonav.simulate.landscape.epoch import Epoch, Season
 from orthonav.simulate.landscape.noise import (
     Float32,
@@ -41,7 +41,7 @@ _NEEDLE_RGB = (58.0, 78.0, 52.0)
 def paint_wood(
     rgb: Float32,
     labels: Labels,
-    look: Looks,
+    appearance: Appearance,
     closed: Mask,
     window: PixelWindow,
     seed: int,
@@ -52,7 +52,7 @@ def paint_wood(
     Crowns stand on a jittered lattice, so a wood has the same trees at all dates.
     """
     height = np.zeros(window.shape, np.float32)
-    wood = ((look.cover == LandCover.FOREST)[labels]) & (closed < 100)
+    wood = ((appearance.cover == LandCover.FOREST)[labels]) & (closed < 100)
     rows, cols = np.nonzero(wood)
     if len(rows) == 0:
         return height
@@ -76,17 +76,17 @@ def paint_orchards(
     rgb: Float32,
     height: Float32,
     labels: Labels,
-    look: Looks,
+    appearance: Appearance,
     closed: Mask,
     window: PixelWindow,
     epoch: Epoch,
 ) -> None:
     """Draw fruit trees in straight rows into colour (H, W, 3) and height (H, W)."""
-    rows, cols = np.nonzero((look.cover == LandCover.ORCHARD)[labels] & (closed < 100))
+    rows, cols = np.nonzero((appearance.cover == LandCover.ORCHARD)[labels] & (closed < 100))
     if len(rows) == 0:
         return
     parcel = labels[rows, cols]
-    turn = look.row_turn[parcel]
+    turn = appearance.row_turn[parcel]
     x, y = window.east_m[cols], window.north_m[rows]
     across = (turn[:, 0] * x + turn[:, 1] * y) / _FRUIT_M[0]
     along = (turn[:, 0] * y - turn[:, 1] * x) / _FRUIT_M[1]

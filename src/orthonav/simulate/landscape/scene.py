@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import AreaError
-from orthonav.simulate.landscape.crops import looks
+from orthonav.simulate.landscape.crops import appearance_of
 from orthonav.simulate.landscape.epoch import Epoch
 from orthonav.simulate.landscape.network import Network
 from orthonav.simulate.landscape.noise import Float32
@@ -100,11 +100,11 @@ class Landscape:
         )
         plans = self._plans_in(wide)
         labels = label_parcels(plans, wide)
-        look = looks(plans, date)
-        rgb = paint_parcels(labels, look, wide, self.seed, date)
+        appearance = appearance_of(plans, date)
+        rgb = paint_parcels(labels, appearance, wide, self.seed, date)
         closed = paint_lines(rgb, plans, self._network, wide, date)
-        height = paint_wood(rgb, labels, look, closed, wide, self.seed, date)
-        paint_orchards(rgb, height, labels, look, closed, wide, date)
+        height = paint_wood(rgb, labels, appearance, closed, wide, self.seed, date)
+        paint_orchards(rgb, height, labels, appearance, closed, wide, date)
         paint_trees(rgb, height, plans, wide, date)
         image = np.clip(rgb, 0.0, 255.0).astype(np.uint8)
         roofs = paint_buildings(image, height, plans, wide, date)

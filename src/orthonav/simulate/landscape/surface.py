@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.simulate.landscape.crops import Looks
+from orthonav.simulate.landscape.crops import Appearance
 from orthonav.simulate.landscape.epoch import Epoch, Season
 from orthonav.simulate.landscape.lines import Line, ribbon
 from orthonav.simulate.landscape.network import LineKind, Network
@@ -49,7 +49,7 @@ def label_parcels(plans: Sequence[CellPlan], window: PixelWindow) -> Labels:
 
 
 def paint_parcels(
-    labels: Labels, look: Looks, window: PixelWindow, seed: int, epoch: Epoch
+    labels: Labels, appearance: Appearance, window: PixelWindow, seed: int, epoch: Epoch
 ) -> Float32:
     """Return the colour (H, W, 3) of the parcels with patches, grain, rows and lanes."""
     east, north = window.east_m, window.north_m
@@ -60,12 +60,12 @@ def paint_parcels(
     grain = fractal_grid(
         key_of(seed, "grain", epoch.name), east, north, (13.0, 6.1, 2.9, 1.4, 0.7, 0.4), 0.95
     )
-    soil *= look.soil[labels]
-    growth *= look.growth[labels]
-    rows = _rows(labels, look, window, growth)
-    grain *= look.grain[labels]
+    soil *= appearance.soil[labels]
+    growth *= appearance.growth[labels]
+    rows = _rows(labels, appearance, window, growth)
+    grain *= appearance.grain[labels]
     tone = 1.0 + soil + growth + grain + rows
-    rgb: Float32 = _soft_borders(look.rgb[labels], labels)
+    rgb: Float32 = _soft_borders(appearance.rgb[labels], labels)
     rgb[..., 0] *= tone * (1.0 + 0.5 * growth + 0.3 * soil)
     rgb[..., 1] *= tone
     rgb[..., 2] *= tone * (1.0 + 0.3 * growth - 0.2 * soil)
@@ -84,20 +84,22 @@ def _soft_borders(rgb: Float32, labels: Labels) -> Float32:
     return rgb
 
 
-def _rows(labels: Labels, look: Looks, window: PixelWindow, wander: Float32) -> Float32:
+def _rows(labels: Labels, appearance: Appearance, window: PixelWindow, wander: Float32) -> Float32:
     """Return the relative brightness (H, W) of rows and tractor lanes."""
-    turn = look.row_turn[labels]
+    turn = appearance.row_turn[labels]
     across = turn[..., 0] * window.east_m[None, :] + turn[..., 1] * window.north_m[:, None]
-    row_m, lane_m = look.row_m[labels], look.lane_m[labels]
+    row_m, lane_m = appearance.row_m[labels], appearance.lane_m[labels]
     phase = across / row_m
     phase -= np.floor(phase)
     rows = np.cos(np.float32(2.0 * np.pi) * phase.astype(np.float32))
     visible = np.clip((row_m / window.gsd_m - 1.5) / 1.5, 0.0, 1.0)
-    rows *= look.row[labels] * visible * (1.0 + 3.0 * wander)
+    rows *= appearance.row[labels] * visible * (1.0 + 3.0 * wander)
     lanes = (across - lane_m * np.floor(across / lane_m) - 0.5 * lane_m).astype(np.float32)
     distance = np.abs(np.abs(lanes) - np.float32(0.95))
     half = max(0.45, 0.75 * window.gsd_m)
-    rows += look.lane[labels] * np.clip(1.0 - distance / half, 0.0, 1.0) * np.float32(0.45 / half)
+    rows += (
+        appearance.lane[labels] * np.clip(1.0 - distance / half, 0.0, 1.0) * np.float32(0.45 / half)
+    )
     return np.asarray(rows, np.float32)
 
 
