@@ -18,10 +18,10 @@ from orthonav.check.envelope import (
     heights_of,
     heights_work,
 )
+from orthonav.check.request import CheckRequest
 from orthonav.check.views import TrialPlan
-from orthonav.geo.camera import Camera
 
-PLAN = TrialPlan(Path("a.onav"), Camera(640, 480, 600.0, 600.0, 320.0, 240.0), 100.0)
+PLAN = TrialPlan(CheckRequest(Path("a.onav")), 100.0)
 PLACES = np.zeros((20, 2))
 MIDDLE = AGL_OFF.index(0.0)
 
@@ -43,7 +43,7 @@ def test_work_is_at_the_same_places_for_every_error():
     assert [(plan.yaw_off_deg, plan.agl_off) for plan, _ in work][: len(AGL_OFF)] == [
         (0.0, off) for off in AGL_OFF
     ]
-    assert all(places is PLACES and plan.seed == PLAN.seed for plan, places in work)
+    assert all(places is PLACES and plan.request is PLAN.request for plan, places in work)
 
 
 def test_errors_are_fine_up_to_the_first_that_is_not():

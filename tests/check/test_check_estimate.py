@@ -24,10 +24,7 @@ def predictor(trials, other_date=(), **changed):
 
 def half_good(count=300):
     """Right in the west, lost in the east."""
-    return [
-        right(en, index=i) if en[0] < SIDE_M / 2 else lost(en, index=i)
-        for i, en in enumerate(places(count))
-    ]
+    return [right(en) if en[0] < SIDE_M / 2 else lost(en) for i, en in enumerate(places(count))]
 
 
 WEST, EAST = np.array([[150.0, 500.0]]), np.array([[850.0, 500.0]])

@@ -6,7 +6,7 @@ the regression counts as `PRIOR_TRIALS` trials.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +110,8 @@ class Predictor:
         """Predictions at places (N, 2)."""
         chunk = max(1, _PAIRS_AT_ONCE // max(len(self._points), 1))
         starts = range(0, max(len(points_en_m), 1), chunk)
-        parts = [self._part(points_en_m[start : start + chunk]) for start in starts]
-        names = [field.name for field in fields(Prediction)]
-        return Prediction(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+        parts = [vars(self._part(points_en_m[start : start + chunk])) for start in starts]
+        return Prediction(*(np.concatenate([part[name] for part in parts]) for name in parts[0]))
 
     def _part(self, points: Array) -> Prediction:
         from scipy.stats import beta

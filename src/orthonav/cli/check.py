@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import ROUTE_HELP, add_dem, print_json, progress
+from orthonav.cli.common import ROUTE_HELP, add_dem, add_number, print_json, progress
 
 EVERYDAY = (
     *(
@@ -95,51 +95,34 @@ def add(parser: argparse.ArgumentParser) -> None:
 def _add_errors(parser: argparse.ArgumentParser) -> None:
     """Accuracy of telemetry and prior, motion, and the confidence that is asked for."""
     heading = parser.add_mutually_exclusive_group()
-    heading.add_argument(
-        "--yaw-std-deg",
-        type=float,
-        default=5.0,
-        help="standard deviation of the reported heading (default 5)",
-    )
+    add_number(heading, "--yaw-std-deg", 5.0, "standard deviation of the reported heading")
     heading.add_argument(
         "--heading",
         choices=("known", "unknown"),
         default="known",
         help="unknown: search all headings",
     )
-    parser.add_argument(
-        "--agl-std",
-        type=float,
-        metavar="SHARE",
-        default=0.05,
-        help="standard deviation of the reported height, a share of it (default 0.05)",
-    )
+    share = "standard deviation of the reported height, a share of it"
+    add_number(parser, "--agl-std", 0.05, share, "SHARE")
     prior = parser.add_mutually_exclusive_group()
-    prior.add_argument(
-        "--prior-std-m",
-        type=float,
-        default=150.0,
-        help="standard deviation of the prior position, per axis (default 150)",
-    )
+    add_number(prior, "--prior-std-m", 150.0, "standard deviation of the prior position, per axis")
     prior.add_argument(
         "--prior",
         choices=("telemetry", "none"),
         default="telemetry",
         help="none: search the whole map",
     )
-    parser.add_argument(
+    add_number(
+        parser,
         "--relief-m",
-        type=float,
-        default=3.0,
-        help="standard deviation of the height of houses and trees, which causes relief "
-        "displacement (default 3)",
+        3.0,
+        "standard deviation of the height of houses and trees, which causes relief displacement",
     )
-    parser.add_argument(
+    add_number(
+        parser,
         "--tilt-std-deg",
-        type=float,
-        default=1.5,
-        help="standard deviation of the pitch and roll that are not reported; they displace fixes "
-        "(default 1.5)",
+        1.5,
+        "standard deviation of the pitch and roll that are not reported; they displace fixes",
     )
     parser.add_argument(
         "--other-sensor",
@@ -147,36 +130,20 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         help="the camera differs from the map's sensor by more than years do (a drone over "
         "satellite imagery, infrared, another season only): fixes are predicted to be rarer",
     )
-    parser.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
-    parser.add_argument(
-        "--drift",
-        type=float,
-        metavar="SHARE",
-        default=0.03,
-        help="error of dead reckoning per metre flown without a fix (default 0.03)",
-    )
-    parser.add_argument(
-        "--min-confidence",
-        type=float,
-        metavar="P",
-        default=0.9,
-        help="confidence that a fix needs to be accepted (default 0.9)",
-    )
+    add_number(parser, "--speed-mps", 20.0, "ground speed")
+    drift = "error of dead reckoning per metre flown without a fix"
+    add_number(parser, "--drift", 0.03, drift, "SHARE")
+    confidence = "confidence that a fix needs to be accepted"
+    add_number(parser, "--min-confidence", 0.9, confidence, "P")
 
 
 def _add_effort(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--effort",
-        type=float,
-        default=1.0,
-        metavar="FACTOR",
-        help="factor on the number of trials (default 1)",
-    )
+    add_number(parser, "--effort", 1.0, "factor on the number of trials", "FACTOR")
     parser.add_argument(
         "--quick", action="store_true", help="skip the trials of other errors and other heights"
     )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the trials (default 1)")
+    add_number(parser, "--seed", 1, "seed of the trials")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -73,6 +73,23 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
+def add_number(
+    parser: argparse._ActionsContainer,
+    name: str,
+    default: float,
+    text: str,
+    metavar: str | None = None,
+) -> None:
+    """Add an option for a number, of the type of its default, which the help names."""
+    parser.add_argument(
+        name,
+        type=type(default),
+        default=default,
+        metavar=metavar,
+        help=f"{text} (default {default:g})",
+    )
+
+
 def add_area(parser: argparse._ActionsContainer, group: Any) -> None:
     """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser."""
     group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
