@@ -124,8 +124,6 @@ def _run_jobs(plans: list[TrialPlan], jobs: list[_Job], workers: int) -> Iterato
 def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[_Outcome]:
     """Outcomes in the order of the jobs. Ctrl-C is blocked while workers start, which inherit that:
     only the parent handles it."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        return pool.map(_work, jobs, chunksize=AT_ONCE)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.map(_work, jobs, chunksize=AT_ONCE)

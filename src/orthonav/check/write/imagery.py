@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import CheckResult
-from orthonav.errors import MapFileError
 from orthonav.mapfile.layer import GreyLayer, preview
 from orthonav.mapfile.reader import MapFile
 from orthonav.report import Background
@@ -27,9 +26,7 @@ Box = tuple[float, float, float, float]
 def jpeg(grey: Grey) -> bytes:
     """An image (rows, cols) as JPEG of the best quality within `MAX_BYTES`."""
     for quality in _QUALITIES:
-        done, data = cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])
-        if not done:
-            raise MapFileError("the imagery of the map cannot be encoded as JPEG")
+        data = cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1]
         if data.size <= MAX_BYTES:
             break
     return bytes(data.tobytes())

@@ -185,8 +185,8 @@ def _page_data(result: CheckResult, image: Background) -> str:
         "risks": [vars(risk) for risk in RISKS],
         "edge_px": EDGE_PX,
         "most": {
-            "error_m": _two_digits(max(most_m, 1.0)),
-            "wrong": _two_digits(max(0.05, most_wrong)),
+            "error_m": float(f"{max(most_m, 1.0):.2g}"),
+            "wrong": float(f"{max(0.05, most_wrong):.2g}"),
         },
         "route": None if along is None else along.points_en_m,
         "segments": [] if along is None else segments(along.probability),
@@ -234,10 +234,6 @@ def _colours() -> list[str]:
     from matplotlib.colors import to_hex
 
     return [to_hex(colour) for colour in colormaps["cividis"](np.linspace(0, 1, 10))]
-
-
-def _two_digits(value: float) -> float:
-    return float(f"{value:.2g}")
 
 
 def _band(result: CheckResult) -> list[Any]:
