@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_area, bounds, print_json, progress
+from orthonav.cli.common import add_area, add_number, bounds, print_json, progress
 from orthonav.cli.needs import require_extras
 from orthonav.errors import FetchError
 
@@ -39,9 +39,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "area", nargs="?", metavar="ROUTE|W,S,E,N", help="planned route, or an area in degrees"
     )
     add_area(parser, parser)
-    parser.add_argument(
-        "--margin-m", type=float, default=200.0, help="fetched around the area (default 200)"
-    )
+    add_number(parser, "--margin-m", 200.0, "fetched around the area")
     parser.add_argument(
         "--source",
         metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
@@ -99,7 +97,7 @@ def _add_file(parser: argparse.ArgumentParser) -> None:
         default="jpeg",
         help="compression of the GeoTIFF (default jpeg)",
     )
-    group.add_argument("--quality", type=int, default=90, help="of JPEG, 1 to 100 (default 90)")
+    add_number(group, "--quality", 90, "of JPEG, 1 to 100")
     group.add_argument(
         "--allow-holes", action="store_true", help="write the file although tiles failed"
     )
@@ -110,19 +108,13 @@ def _add_requests(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--key-env", metavar="VARIABLE", help="environment variable with the key for {key}"
     )
-    group.add_argument("--parallel", type=int, default=4, help="at the same time (default 4)")
+    add_number(group, "--parallel", 4, "at the same time")
     group.add_argument(
         "--per-second", type=float, metavar="N", help="per second and host (default 10)"
     )
-    group.add_argument(
-        "--retries", type=int, default=5, help="repetitions after a failure (default 5)"
-    )
-    group.add_argument(
-        "--max-tiles", type=int, default=50_000, help="refuse to fetch more (default 50000)"
-    )
-    group.add_argument(
-        "--max-mb", type=float, default=4000.0, help="refuse to fetch more (default 4000)"
-    )
+    add_number(group, "--retries", 5, "repetitions after a failure")
+    add_number(group, "--max-tiles", 50_000, "refuse to fetch more")
+    add_number(group, "--max-mb", 4000.0, "refuse to fetch more")
     group.add_argument(
         "--cache",
         type=Path,
@@ -298,7 +290,7 @@ def _summary(out: Path, result: "FetchResult") -> str:
     lines = {
         "file": out,
         "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
-        "tiles": f"{estimate.tiles}, {result.fetched.from_cache} of them from the cache",
+        "tiles": f"{estimate.tiles}, {result.cells.from_cache} of them from the cache",
         "missing": result.holes() or "none",
         "layer": terms.layer,
         "date": terms.date or "unknown",

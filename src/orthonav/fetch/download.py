@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class FetchedCells:
-    """Result of a download."""
+    """What became of the cells of a selection: first fetched, then written."""
 
     digests: np.ndarray
     """(N,) uint64 digest of each cell's image, 0 where there is none."""
@@ -35,9 +35,17 @@ class FetchedCells:
     """Number of failed cells by reason."""
     examples: dict[str, str] = field(default_factory=dict)
     """One whole message for each reason."""
+    images: int = 0
+    """Cells with imagery that were written."""
+    blank: int = 0
+    """Cells that came without any imagery."""
+    placeholders: int = 0
+    """Cells that hold a placeholder."""
+    valid_px: int = 0
+    """Valid pixels of all cells that were written."""
 
     @property
-    def placeholders(self) -> np.ndarray:
+    def are_placeholders(self) -> np.ndarray:
         """Which cells (N,) hold an image that another cell holds too."""
         values, inverse, counts = np.unique(self.digests, return_inverse=True, return_counts=True)
         return np.asarray((counts[inverse] >= PLACEHOLDER_CELLS) & (values[inverse] != 0))

@@ -44,15 +44,15 @@ def wms_cells(
     if wanted not in _VERSIONS:
         raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, not {wanted}")
     url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": wanted})
-    document = get_xml(client, url)
-    version = document.root.get("version", "")
+    body, root = get_xml(client, url)
+    version = root.get("version", "")
     if version not in _VERSIONS:
-        found = version or document.root.tag
+        found = version or root.tag
         raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, got '{found}': {url}")
     with capabilities("WMS", url):
         from owslib.wms import WebMapService
 
-        service = WebMapService(url, version=version, xml=document.body)
+        service = WebMapService(url, version=version, xml=body)
         get_map = service.getOperationByName("GetMap")
         layers = {name: layer for name, layer in service.contents.items() if name}
         layer = layers[choose_layer(list(layers), options.layer, url, named=True)]
@@ -60,7 +60,7 @@ def wms_cells(
         times = [value.strip() for value in layer.timepositions or [] if value]
         address = next(each["url"] for each in get_map.methods if each["type"].lower() == "get")
         formats, styles = tuple(get_map.formatOptions), list(layer.styles)
-        max_px = _max_px(document.root)
+        max_px = _max_px(root)
     if options.style is not None:
         choose(styles, options.style, f"layer {layer.name} has no style")
     crs = _crs(names, options.crs, frame, layer.name)

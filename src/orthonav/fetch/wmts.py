@@ -49,11 +49,11 @@ def wmts_tiles(
     """The tiles of a layer of a service. Raises `FetchError` with the available choices."""
     if not _is_document(url):
         url = with_query(url, {"SERVICE": "WMTS", "REQUEST": "GetCapabilities", "VERSION": "1.0.0"})
-    document = get_xml(client, url)
+    body, _ = get_xml(client, url)
     with capabilities("WMTS", url):
         from owslib.wmts import WebMapTileService
 
-        service = WebMapTileService(url, xml=document.body)
+        service = WebMapTileService(url, xml=body)
         layer = service.contents[choose_layer(list(service.contents), options.layer, url)]
         default = [name for name, style in layer.styles.items() if style.get("isDefault")]
         styles = list(dict.fromkeys(name or "" for name in [*default, *layer.styles]))

@@ -41,16 +41,6 @@ class Packing:
     quality: int = 90
 
 
-@dataclass
-class CellCounts:
-    """Cells by content, and the number of valid pixels of all of them."""
-
-    images: int = 0
-    blank: int = 0
-    placeholders: int = 0
-    valid_px: int = 0
-
-
 def write_mosaic(
     out: Path,
     source: CellSource,
@@ -59,8 +49,8 @@ def write_mosaic(
     cache: FileCache,
     packing: Packing,
     progress: Progress,
-) -> CellCounts:
-    """Write the cells as one GeoTIFF, with missing ones masked, and count them by content.
+) -> None:
+    """Write the cells as one GeoTIFF, with missing ones masked, and count them in `fetched`.
 
     Raises `FetchError` where no pixel is valid, `OutputError` where the file cannot be written.
     """
@@ -73,8 +63,8 @@ def write_mosaic(
     ):
         raw = Path(folder) / "mosaic.tif"
         try:
-            counts = _write_raw(raw, source, selection, fetched, cache, progress)
-            if counts.valid_px == 0:
+            _write_raw(raw, source, selection, fetched, cache, progress)
+            if fetched.valid_px == 0:
                 raise FetchError("the service has no imagery of this area in this layer")
             progress("pack", 0.1)
             _pack(raw, temporary, source, packing)
@@ -82,7 +72,6 @@ def write_mosaic(
             progress("pack", 1.0)
         except (RasterioError, MemoryError) as error:
             raise not_written(error.__cause__ or error, out) from error
-    return counts
 
 
 def _write_raw(
@@ -92,10 +81,9 @@ def _write_raw(
     fetched: FetchedCells,
     cache: FileCache,
     progress: Progress,
-) -> CellCounts:
+) -> None:
     """The mosaic as a sparse tiled file."""
-    counts = CellCounts()
-    placeholders = fetched.placeholders
+    placeholders = fetched.are_placeholders
     with rasterio.open(raw, "w", **_profile(source, selection)) as dataset:
         dataset.update_tags(**tags_of(source.provenance, selection))
         if source.bands == 3:
@@ -104,11 +92,10 @@ def _write_raw(
             if fetched.digests[number] == 0:
                 continue
             if placeholders[number]:
-                counts.placeholders += 1
+                fetched.placeholders += 1
                 continue
-            _write_cell(dataset, source, cache, (row, col), selection.first, counts)
+            _write_cell(dataset, source, cache, (row, col), selection.first, fetched)
             progress("mosaic", (number + 1) / len(selection.cells))
-    return counts
 
 
 def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
@@ -149,21 +136,21 @@ def _write_cell(
     cache: FileCache,
     cell: tuple[int, int],
     first: tuple[int, int],
-    counts: CellCounts,
+    fetched: FetchedCells,
 ) -> None:
     entry = cache.read(source.address(*cell))
     if entry is None or entry.body is None:
         raise OutputError(f"a fetched cell is missing from the cache: {cache.folder}")
     pixels = source.decode(entry.body)
     if pixels.blank:
-        counts.blank += 1
+        fetched.blank += 1
         return
     height, width = pixels.valid.shape
     window = Window((cell[1] - first[1]) * width, (cell[0] - first[0]) * height, width, height)
     dataset.write(np.where(pixels.valid, pixels.bands, 0), window=window)
     dataset.write_mask(np.where(pixels.valid, 255, 0).astype(np.uint8), window=window)
-    counts.images += 1
-    counts.valid_px += int(pixels.valid.sum())
+    fetched.images += 1
+    fetched.valid_px += int(pixels.valid.sum())
 
 
 def _pack(raw: Path, out: Path, source: CellSource, packing: Packing) -> None:
