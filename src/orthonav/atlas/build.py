@@ -141,14 +141,15 @@ def build_sheet(task: SheetTask) -> SheetResult:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with scratch_folder() as folder:
         built = _built(task, mosaic, folder)
+    sheet = built or wanted  # of which nothing is known yet
     return SheetResult(
         wanted.id,
         "empty" if built is None else "built",
         cpu_s=time.process_time() - cpu_s,
         wall_s=time.perf_counter() - wall_s,
-        size_bytes=built.size_bytes if built else 0,
-        area_km2=built.area_km2 if built else 0.0,
-        tiles=built.tiles if built else 0,
+        size_bytes=sheet.size_bytes,
+        area_km2=sheet.area_km2,
+        tiles=sheet.tiles,
         peak_bytes=_peak_bytes(),
     )
 

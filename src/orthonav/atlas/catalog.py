@@ -185,7 +185,7 @@ class Atlas:
         are copied in any case."""
         for key, file in sheet.files.items():
             if file.name not in named or self.store.size(file.name) != file.size_bytes:
-                self.store.put(Path(files[key]), file.name)
+                self.store.write(file.name, Path(files[key]))
 
     def _remove_items(self, names: Iterable[str], there: Mapping[str, Sheet | None]) -> None:
         """Remove some of the items of a sheet, then the files that the others do not name."""

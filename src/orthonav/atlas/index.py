@@ -192,7 +192,7 @@ class _IndexBuilder:
         for path in sorted(self._folder.iterdir()):
             name = f"{FOLDER}/{path.name}"
             files[path.name] = StoredFile(name, path.stat().st_size, digest_of(path))
-            store.put(path, name)
+            store.write(name, path)
         manifest = IndexManifest(quantizers.recipe, tuple(shards), files)
         store.write(MANIFEST, manifest.to_json())
         used = {MANIFEST, *(file.name for file in files.values())}

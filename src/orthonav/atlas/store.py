@@ -124,19 +124,16 @@ class Store:
         return cached(file, size, fill)
 
     def download(self, name: str, path: Path) -> None:
-        """Copy a file of the atlas to `path`, not verified."""
+        """Copy a file of a remote atlas to `path`, not verified."""
         with storage_errors(self.shown(name), f"copy from the atlas to {path.parent}"):
-            self._files.get(checked_name(name), path)
+            name = checked_name(name)
+            assert isinstance(self._files, RemoteFiles)
+            self._files.get(name, path)
 
-    def put(self, path: Path, name: str) -> None:
-        """Copy a local file into the atlas, whole or not at all."""
+    def write(self, name: str, content: Path | bytes) -> None:
+        """Write a file, a copy of a local one or these bytes, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.save(path, checked_name(name))
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write a small file, whole or not at all."""
-        with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.save(data, checked_name(name))
+            self._files.save(content, checked_name(name))
 
     def remove(self, name: str) -> None:
         """Remove a file if it exists."""
