@@ -115,7 +115,8 @@ class Atlas:
         if before and before.request == described.request and before.files == stored:
             sheet = before
         else:
-            revision = 1 + max((_revision(each) for each in there), default=0)
+            revisions = [found[1] for found in map(split_name, there) if found]
+            revision = 1 + max(revisions, default=0)
             sheet = described.stored(revision, stored)
         self.require_place(sheet)
         self._upload(sheet, files, _named_by(there))
@@ -239,12 +240,6 @@ def _is_free(store: Store) -> bool:
     if store.is_local and (folder := Path(store.url)).exists():
         names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name]
     return all(name.startswith(".") for name in names)
-
-
-def _revision(name: str) -> int:
-    """Revision in the file name of an item."""
-    found = split_name(name)
-    return found[1] if found else 0
 
 
 def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:

@@ -79,11 +79,11 @@ def check_covered(
     """
     tiles = _some_tiles(area, grid)
     lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
-    covered = _covered(sources, lat, lon)
+    covered = np.any([source.covers(lat, lon) for source in sources], axis=0)
     if not covered.any():
         raise AreaError("no part of the area lies on a sheet of the atlas")
     route_lat, route_lon = area.frame.latlon_from_en(_route_en_m(area, grid))
-    missing = ~_covered(sources, route_lat, route_lon)
+    missing = ~np.any([source.covers(route_lat, route_lon) for source in sources], axis=0)
     under = _missing(lattice, route_lat[missing], route_lon[missing])
     elsewhere = _missing(lattice, lat[~covered], lon[~covered])
     lacks = "lies on sheets that the atlas lacks"
@@ -117,13 +117,6 @@ def _require_route(lacking: NDArray[np.bool_], lacks: str, allow_holes: bool) ->
 def _warn_area(lacking: NDArray[np.bool_], lacks: str) -> None:
     if lacking.any():
         log.warning("%.3g %% of the area %s", 100 * float(lacking.mean()), lacks)
-
-
-def _covered(sources: Sequence[SheetSource], lat: Array, lon: Array) -> NDArray[np.bool_]:
-    covered = np.zeros(len(lat), dtype=np.bool_)
-    for source in sources:
-        covered |= source.covers(lat, lon)
-    return covered
 
 
 def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:

@@ -71,7 +71,8 @@ def cut_map(
     area = _area(route, band_m, bounds_deg)
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
-    _check_out(atlas, out, cutter.members)
+    if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in cutter.members):
+        raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
     check_covered(area, cutter.grid, cutter.members, atlas.recipe.sheets, allow_holes)
     progress("sheets", 1.0)
     cutter.read(progress, workers)
@@ -153,11 +154,6 @@ def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) 
     if bounds_deg is None:
         raise AreaError("a map is cut for a route with a search band, or for bounds: give either")
     return Area.from_bounds(bounds_deg)
-
-
-def _check_out(atlas: Atlas, out: Path, members: Sequence[SheetSource]) -> None:
-    if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in members):
-        raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
 
 
 def _learnt(

@@ -8,6 +8,7 @@ after many changes the whole index is rebuilt.
 import hashlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,7 +79,10 @@ def make_index(
     sheets = indexed_sheets(atlas)
     if not sheets:
         return None
-    before = None if rebuild else _usable(atlas)
+    before = None
+    if not rebuild:
+        with suppress(AtlasError):  # a manifest that is damaged or of another schema
+            before = read_manifest(atlas)
     with tempfile.TemporaryDirectory(prefix="orthonav-index-") as name:
         builder = _IndexBuilder(atlas, Path(name), progress)
         if before is None:
@@ -94,14 +98,6 @@ def make_index(
         if total > FEW_ROWS and lost + added <= REBUILD_SHARE * total:
             return builder.update(before, [sheets[each] for each in new], stale)
         return builder.build(list(sheets.values()))
-
-
-def _usable(atlas: Atlas) -> IndexManifest | None:
-    """The present manifest; None for one that is damaged or of another schema."""
-    try:
-        return read_manifest(atlas)
-    except AtlasError:
-        return None
 
 
 class _IndexBuilder:

@@ -106,7 +106,8 @@ class Warp:
         """Affine (2, 3) from pixels of the grid to pixels of the sheet (pixel-is-area), fitted to
         the corners of a block."""
         corners = _corners(block)
-        there = self._source_px(corners)
+        places = _latlon_from_px(self.frame, self.grid, corners)
+        there = _px_from_latlon(self.source.frame, self.source.grid, *places)
         design = np.column_stack([corners - corners[0], np.ones(len(corners))])
         solved = np.linalg.lstsq(design, there, rcond=None)[0].T
         solved[:, 2] -= solved[:, :2] @ corners[0]
@@ -172,11 +173,6 @@ class Warp:
             raise AtlasError(
                 f"sheet {self.source.sheet.id} is damaged, rebuild it ({error})"
             ) from error
-
-    def _source_px(self, target_px: Array) -> Array:
-        """Pixels (N, 2), column and row, of the sheet at pixels of the grid."""
-        places = _latlon_from_px(self.frame, self.grid, target_px)
-        return _px_from_latlon(self.source.frame, self.source.grid, *places)
 
     @cached_property
     def _outline_px(self) -> Array:

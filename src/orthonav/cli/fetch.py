@@ -75,7 +75,7 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--wms-version", choices=("1.1.1", "1.3.0"), help="(default 1.3.0)")
     group.add_argument("--tile-px", type=int, help="width of tiles (xyz, tms) or images (wms)")
     group.add_argument("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
-    group.add_argument("--subdomains", default="abc", help="values of {s} (default abc)")
+    group.add_argument("--subdomains", help="values of {s} (default abc)")
     group.add_argument("--collection", help="collection of a STAC")
     group.add_argument("--asset", help="asset of each STAC item")
     group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")

@@ -56,8 +56,8 @@ class ImageryOptions:
     """Bands of a file, from 1."""
     version: str | None = None
     """Version of the WMS protocol, 1.1.1 or 1.3.0."""
-    subdomains: str = "abc"
-    """Values of {s} in a tile template, one letter each."""
+    subdomains: str | None = None
+    """Values of {s} in a tile template, one letter each; None means abc."""
     preferred_style: str | None = None
     """Style taken where the layer has it and `style` is None."""
     preferred_format: str | None = None
@@ -66,8 +66,6 @@ class ImageryOptions:
     def over(self, preset: "ImageryOptions") -> "ImageryOptions":
         """These options where they are set, else those of the preset."""
         given = {name: value for name, value in vars(self).items() if value is not None}
-        if self.subdomains == ImageryOptions.subdomains:
-            given.pop("subdomains")
         return replace(preset, **given)
 
     @property

@@ -47,7 +47,8 @@ def xyz_tiles(
     half, last = MERCATOR_HALF_M, 2**zoom - 1
     res = mercator_resolution(zoom, tile_px)
     grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
-    url_of = _url_of(template, zoom, options.subdomains, tile_px, rows_from_south)
+    subdomains = "abc" if options.subdomains is None else options.subdomains
+    url_of = _url_of(template, zoom, subdomains, tile_px, rows_from_south)
     return tile_source(provenance, grid, url_of, _format(template), options.empty)
 
 

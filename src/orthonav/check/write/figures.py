@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, BlindStretch, CheckResult, Envelope
-from orthonav.check.write.imagery import Box, shrunk, visible_box
+from orthonav.check.write.imagery import shrunk, visible_box
 from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
@@ -42,8 +42,11 @@ def figures(result: CheckResult, image: Background) -> list[Figure]:
 
 
 def _map(result: CheckResult, image: Background) -> Figure:
-    west, south, east, north = box = visible_box(result)
+    west, south, east, north = visible_box(result)
     visible = west, east, south, north
+    width, height = map_size_in(visible, 7.0, (4.0, 3.0))
+    marks = ["Black with a number: blind stretches."] if result.stretches else []
+    marks += ["Dotted: lookalikes."] if result.lookalikes else []
     background = replace(image, grey=shrunk(image.grey, _BACKGROUND_PX))
 
     def draw(axes: "Axes") -> None:
@@ -59,24 +62,9 @@ def _map(result: CheckResult, image: Background) -> Figure:
         f"Map of the probability of a fix, mean {share_text(result.mean)} over "
         f"{result.area_km2:.2f} square kilometres; {len(result.stretches)} blind stretches",
         "Probability of a correct, confident fix of one view; white where unknown. "
-        + _marks_text(result),
-        draw_axes(_map_size(box), draw),
+        + " ".join(marks),
+        draw_axes((width + 1.0, height), draw),
     )
-
-
-def _map_size(box: Box) -> tuple[float, float]:
-    west, south, east, north = box
-    width, height = map_size_in((west, east, south, north), 7.0, (4.0, 3.0))
-    return width + 1.0, height
-
-
-def _marks_text(result: CheckResult) -> str:
-    marks = []
-    if result.stretches:
-        marks.append("Black with a number: blind stretches.")
-    if result.lookalikes:
-        marks.append("Dotted: lookalikes.")
-    return " ".join(marks)
 
 
 def _draw_cells(axes: "Axes", result: CheckResult) -> None:

@@ -62,7 +62,11 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
         "note": "" if result.second_date else SIMULATED,
         "figures": {figure.name: figure for figure in figures},
         "layers": LAYERS,
-        "stretches": [_stretch_row(*each) for each in enumerate(result.stretches, start=1)],
+        "stretches": [
+            (*row, ("✓ " if stretch.recoverable else "✕ ") + outcome)
+            for number, stretch in enumerate(result.stretches, start=1)
+            for *row, outcome in [stretch_row(number, stretch)]
+        ],
         "lookalikes": _lookalike_rows(result),
         "max_rows": MAX_ROWS,
         "max_lookalikes": MAX_LOOKALIKES,
@@ -106,11 +110,6 @@ def _longest(longest: BlindStretch | None) -> tuple[str, str]:
     error = metres_text(longest.drift_m)
     text = f"longest blind stretch: {duration}, error {error} after it"
     return metres_text(longest.length_m), text
-
-
-def _stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    *values, outcome = stretch_row(number, stretch)
-    return (*values, ("✓ " if stretch.recoverable else "✕ ") + outcome)
 
 
 def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:

@@ -26,7 +26,9 @@ def text(result: CheckResult) -> str:
     """
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
     lines += _reasons(result)
-    lines += ["", *_rows(_figures(result))]
+    rows = _figures(result)
+    width = max(len(name) for name, _ in rows)
+    lines += ["", *(f"{name:<{width}}  {value}" for name, value in rows)]
     lines += _stretches(result)
     sentences = [better_sentence(result.alternatives, what) for what in ("agl_m", "band_m")]
     better = [sentence for sentence in sentences if sentence.startswith("A ")]
@@ -79,11 +81,6 @@ def _stretches(result: CheckResult) -> list[str]:
     more = len(result.stretches) - len(worst)
     head = f"blind stretches ({len(result.stretches)})" + (f", the {len(worst)} worst" * (more > 0))
     return ["", head, *_columns(rows)]
-
-
-def _rows(rows: list[tuple[str, str]]) -> list[str]:
-    width = max(len(name) for name, _ in rows)
-    return [f"{name:<{width}}  {value}" for name, value in rows]
 
 
 def _columns(rows: list[tuple[str, ...]]) -> list[str]:
