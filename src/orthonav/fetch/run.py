@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.errors import AreaError, FetchError, OutputError
-from orthonav.fetch.cache import FileCache
 from orthonav.fetch.client import Client
-from orthonav.fetch.download import FetchedCells, fetch_cells
+from orthonav.fetch.download import FetchedCells, FileCache, fetch_cells
 from orthonav.fetch.grid import Selection, select
 from orthonav.fetch.options import Provenance
 from orthonav.fetch.politeness import RequestLimits, Stopped

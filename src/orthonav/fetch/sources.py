@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from orthonav.errors import FetchError
@@ -46,20 +46,18 @@ def parse_source(
     licence: str | None = None,
     attribution: str | None = None,
     key_env: str | None = None,
-    environ: Mapping[str, str] | None = None,
 ) -> SourceSpec:
     """`NAME[:YEAR]` of a service known by name, or `wmts|wms|xyz|tms|stac|cog:ADDRESS`.
 
     Raises `FetchError` for unknown names, addresses that are not http or https, and missing keys.
     """
-    environ = os.environ if environ is None else environ
     if date is not None:
         check_date(date)
     head, _, rest = text.partition(":")
     if head in PROTOCOLS and rest:
         url, literal = without_literal_keys(checked(rest, head))
         provenance = Provenance(shown(url), options.layer or "", date, licence, attribution)
-        secrets = _secrets(url, key_env, literal, environ)
+        secrets = _secrets(url, key_env, literal)
         return SourceSpec(head, url, options, provenance, secrets)
     if head.lower() in ("http", "https", "file"):
         raise FetchError(
@@ -77,7 +75,7 @@ def parse_source(
         "; ".join(note for note in (layer.note, preset.note) if note) or None,
         preset.datum,
     )
-    secrets = _secrets(preset.url, key_env or preset.key_env, None, environ)
+    secrets = _secrets(preset.url, key_env or preset.key_env, None)
     return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)
 
 
@@ -140,9 +138,7 @@ def _cogs(client: Client, spec: SourceSpec, urls: list[str], area: Area) -> Cell
     return cog_source(client, urls, spec.options, area.frame, spec.provenance)
 
 
-def _secrets(
-    url: str, key_env: str | None, literal: str | None, environ: Mapping[str, str]
-) -> tuple[Secret, ...]:
+def _secrets(url: str, key_env: str | None, literal: str | None) -> tuple[Secret, ...]:
     """The key for `{key}` in an address. Raises `FetchError` where it is missing."""
     if literal is not None:
         return (Secret(KEY, origin_of(url), literal),)
@@ -154,7 +150,7 @@ def _secrets(
         return ()
     if KEY not in url:
         raise FetchError(f"--key-env needs {KEY} in the address, where the key goes: {shown(url)}")
-    value = environ.get(key_env, "").strip()
+    value = os.environ.get(key_env, "").strip()
     if not value:
         raise FetchError(
             f"this service needs a key; put yours into the environment variable {key_env}"

@@ -17,8 +17,7 @@ from rasterio.windows import Window
 
 from orthonav import __version__
 from orthonav.errors import FetchError, OutputError
-from orthonav.fetch.cache import FileCache
-from orthonav.fetch.download import FetchedCells
+from orthonav.fetch.download import FetchedCells, FileCache
 from orthonav.fetch.grid import Selection
 from orthonav.fetch.options import Provenance
 from orthonav.fetch.service import CellSource

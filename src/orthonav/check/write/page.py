@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from orthonav.check.outcome import CELL_VALUES, BlindStretch, CheckResult
-from orthonav.check.write.figures import MAX_LOOKALIKES
-from orthonav.check.write.imagery import jpeg, visible_box
+from orthonav.check.write.figures import MAX_LOOKALIKES, jpeg, visible_box
 from orthonav.check.write.plain import Plain, plain, to_plain
 from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
