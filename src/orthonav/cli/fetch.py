@@ -16,20 +16,8 @@ if TYPE_CHECKING:
 
 PACKAGE = "ign-package:"
 EVERYDAY = (
-    "--route",
-    "--bounds",
-    "--band-m",
-    "--source",
-    "--list",
-    "--out",
-    "--dry-run",
-    "--gsd-m",
-    "--layer",
-    "--time",
-    "--date",
-    "--key-env",
-    "--cache",
-    "--json",
+    *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
+    *("--layer", "--time", "--date", "--key-env", "--cache", "--json"),
 )
 
 
