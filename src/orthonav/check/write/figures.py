@@ -141,10 +141,10 @@ def _draw_lookalikes(axes: "Axes", result: CheckResult) -> None:
 
 
 def _profile(result: CheckResult, along: Along) -> Figure:
-    summary = summarize(result)
+    share = summarize(result).route_share_from_0_9
     return Figure(
         "profile",
-        f"Probability and expected drift along the route; {share_text(summary.confident_share)} of "
+        f"Probability and expected drift along the route; {share_text(share)} of "
         f"it at {CONFIDENT:g} or more, {len(result.stretches)} blind stretches",
         "Probability along the route with its 80 % interval and the lowest across the band; below, "
         "the expected position error (one standard deviation). Shaded: blind stretches.",

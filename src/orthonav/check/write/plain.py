@@ -17,7 +17,7 @@ from orthonav.check.write.summary import summarize
 from orthonav.geo.frames import LocalFrame
 
 FORMAT, VERSION = "orthonav-check", 1
-_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4}
+_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}
 """Decimals by the last word of a name: a centimetre; shares and others have `_SHARE`."""
 _SHARE, _EXACT = 3, 6
 
@@ -49,7 +49,7 @@ def to_plain(result: CheckResult) -> Plain:
             ],
         },
         "conditions": plain(asdict(result.conditions), _EXACT),
-        "summary": _summary(result),
+        "summary": plain(asdict(summarize(result))),
         "plane": {
             "origin_lat_deg": float(result.frame.lat_deg),
             "origin_lon_deg": float(result.frame.lon_deg),
@@ -83,27 +83,6 @@ def lookalikes_to_plain(result: CheckResult) -> list[Plain]:
         {"number": number, **plain(asdict(each))}
         for number, each in enumerate(result.lookalikes, start=1)
     ]
-
-
-def _summary(result: CheckResult) -> Plain:
-    summary = summarize(result)
-    longest = result.stretches.index(summary.longest) + 1 if summary.longest else None
-    return {
-        "area_km2": plain(result.area_km2, 4),
-        "second_date": bool(result.second_date),
-        **plain(
-            {
-                "mean_probability": result.mean,
-                "error_m": summary.error_m,
-                "route_m": summary.route_m,
-                "route_s": summary.route_s,
-                "route_share_from_0_9": summary.confident_share,
-            }
-        ),
-        "blind_stretches": len(result.stretches),
-        "unrecoverable_stretches": summary.unrecoverable,
-        "longest_stretch": longest,
-    }
 
 
 def _cells(frame: LocalFrame, cells: Cells) -> Plain:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.outcome import BlindStretch, CheckResult
+from orthonav.check.outcome import CheckResult
 from orthonav.records import CONFIDENT
 
 Array = NDArray[np.float64]
@@ -14,40 +14,51 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Summary:
-    """Key figures; those of a route are NaN or None without one.
+    """Key figures, as `check.json` has them; without a route those of one are NaN, 0 or None.
 
-    `route_m`, `route_s`: length and duration.
-    `confident_share`: share of the length with a probability of `CONFIDENT` or more, 0 to 1.
+    `route_share_from_0_9`: share of the length with a probability of `CONFIDENT` or more, 0 to 1.
     `error_m`: expected error of a correct fix (root mean square), along the route or over the map.
-    `longest`: longest blind stretch; `unrecoverable`: number of stretches without recovery.
+    `unrecoverable_stretches`: number of blind stretches without recovery.
+    `longest_stretch`: number of the longest blind stretch, from 1.
     """
 
+    area_km2: float
+    second_date: bool
+    mean_probability: float
+    error_m: float
     route_m: float
     route_s: float
-    confident_share: float
-    error_m: float
-    longest: BlindStretch | None
-    unrecoverable: int
+    route_share_from_0_9: float
+    blind_stretches: int
+    unrecoverable_stretches: int
+    longest_stretch: int | None
 
 
 def summarize(result: CheckResult) -> Summary:
     """The key figures of a check."""
-    along, cells = result.along, result.cells
+    along, cells, stretches = result.along, result.cells, result.stretches
+    route_m = share = math.nan
     if along is None or not len(along.distance_m):
         error_m = _rms(cells.error_m.ravel(), cells.probability.ravel())
-        return Summary(math.nan, math.nan, math.nan, error_m, None, 0)
-    length_m = float(along.distance_m[-1] - along.distance_m[0])
-    weights = _length_per_point_m(along.distance_m)
-    known = np.isfinite(along.probability)
-    confident = np.where(known, along.probability, 0.0) >= CONFIDENT
-    share = float(weights[confident].sum() / weights.sum()) if known.any() else math.nan
+    else:
+        route_m = float(along.distance_m[-1] - along.distance_m[0])
+        weights = _length_per_point_m(along.distance_m)
+        known = np.isfinite(along.probability)
+        confident = np.where(known, along.probability, 0.0) >= CONFIDENT
+        share = float(weights[confident].sum() / weights.sum()) if known.any() else math.nan
+        error_m = _rms(along.error_m, weights * np.nan_to_num(along.probability))
+    longest = max(stretches, key=lambda each: each.length_m, default=None)
     return Summary(
-        route_m=length_m,
-        route_s=length_m / result.conditions.speed_mps,
-        confident_share=share,
-        error_m=_rms(along.error_m, weights * np.nan_to_num(along.probability)),
-        longest=max(result.stretches, key=lambda each: each.length_m, default=None),
-        unrecoverable=sum(not each.recoverable for each in result.stretches),
+        area_km2=result.area_km2,
+        second_date=result.second_date,
+        mean_probability=result.mean,
+        error_m=error_m,
+        route_m=route_m,
+        route_s=route_m / result.conditions.speed_mps,
+        route_share_from_0_9=share,
+        blind_stretches=len(stretches),
+        unrecoverable_stretches=sum(not each.recoverable for each in stretches),
+        longest_stretch=None if longest is None else stretches.index(longest) + 1,
     )
 
 

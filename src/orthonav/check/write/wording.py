@@ -194,7 +194,7 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
     ]
     if result.along is not None:
         length = f"{metres_text(summary.route_m)}, {seconds_text(summary.route_s)}"
-        share = f"{share_text(summary.confident_share)} of it at {CONFIDENT:g} or more"
+        share = f"{share_text(summary.route_share_from_0_9)} of it at {CONFIDENT:g} or more"
         rows.append(("route", f"{length}; {share}"))
     rows.append(("error", f"{metres_text(summary.error_m)} expected for a correct fix"))
     if result.lookalikes:
