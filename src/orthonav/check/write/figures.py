@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, BlindStretch, CheckResult, Envelope
+from orthonav.check.write.plain import summarize
 from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
-from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import share_text, tolerance_sentence
 from orthonav.mapfile.layer import GreyLayer, preview
 from orthonav.mapfile.reader import MapFile
@@ -141,7 +141,7 @@ def _draw_lookalikes(axes: "Axes", result: CheckResult) -> None:
 
 
 def _profile(result: CheckResult, along: Along) -> Figure:
-    share = summarize(result).route_share_from_0_9
+    share = summarize(result)["route_share_from_0_9"]
     return Figure(
         "profile",
         f"Probability and expected drift along the route; {share_text(share)} of "

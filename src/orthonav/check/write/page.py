@@ -7,10 +7,9 @@ import numpy as np
 
 from orthonav.check.outcome import CELL_VALUES, CheckResult
 from orthonav.check.write.figures import MAX_LOOKALIKES, jpeg, visible_box
-from orthonav.check.write.plain import Plain, plain, to_plain
+from orthonav.check.write.plain import Plain, plain, summarize, to_plain
 from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
-from orthonav.check.write.summary import Summary, summarize
 from orthonav.check.write.wording import (
     SIMULATED,
     SYMBOLS,
@@ -87,9 +86,12 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
     area = f"{km2:.3g} km²" if km2 < 100 else f"{km2:.0f} km²"
     shown = [(share_text(result.mean), f"mean probability of a fix over {area}")]
     if result.along is not None:
-        route = f"of {metres_text(summary.route_m)} at a probability of {CONFIDENT:g} or more"
-        shown += [(share_text(summary.route_share_from_0_9), route), _longest(result, summary)]
-    shown.append((metres_text(summary.error_m), "expected error of a correct fix"))
+        route = f"of {metres_text(summary['route_m'])} at a probability of {CONFIDENT:g} or more"
+        shown += [
+            (share_text(summary["route_share_from_0_9"]), route),
+            _longest(result, summary["longest_stretch"]),
+        ]
+    shown.append((metres_text(summary["error_m"]), "expected error of a correct fix"))
     prior = conditions.prior_std_m
     if prior is None:
         shown.append(("no prior", "the whole map is searched"))
@@ -102,10 +104,10 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
     return shown
 
 
-def _longest(result: CheckResult, summary: Summary) -> tuple[str, str]:
-    if summary.longest_stretch is None:
+def _longest(result: CheckResult, number: int | None) -> tuple[str, str]:
+    if number is None:
         return "none", "blind stretches along the route"
-    longest = result.stretches[summary.longest_stretch - 1]
+    longest = result.stretches[number - 1]
     duration = seconds_text(longest.end_s - longest.start_s)
     error = metres_text(longest.drift_m)
     text = f"longest blind stretch: {duration}, error {error} after it"

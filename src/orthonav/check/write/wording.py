@@ -12,7 +12,7 @@ from orthonav.check.outcome import (
     Lookalike,
     Word,
 )
-from orthonav.check.write.summary import summarize
+from orthonav.check.write.plain import summarize
 from orthonav.records import CONFIDENT
 from orthonav.report.numbers import metres_text
 
@@ -193,10 +193,10 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
         ("views", f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m on the ground, {dates}"),
     ]
     if result.along is not None:
-        length = f"{metres_text(summary.route_m)}, {seconds_text(summary.route_s)}"
-        share = f"{share_text(summary.route_share_from_0_9)} of it at {CONFIDENT:g} or more"
+        length = f"{metres_text(summary['route_m'])}, {seconds_text(summary['route_s'])}"
+        share = f"{share_text(summary['route_share_from_0_9'])} of it at {CONFIDENT:g} or more"
         rows.append(("route", f"{length}; {share}"))
-    rows.append(("error", f"{metres_text(summary.error_m)} expected for a correct fix"))
+    rows.append(("error", f"{metres_text(summary['error_m'])} expected for a correct fix"))
     if result.lookalikes:
         near = sum(each.within_prior for each in result.lookalikes)
         rows.append(("lookalikes", f"{len(result.lookalikes)} pairs, {near} within the prior"))
