@@ -1,8 +1,9 @@
 """The check of a map: trials, predictions for all of it and along a route, verdict."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,6 @@ from orthonav.check.places import (
     checked_m2,
     trial_places,
 )
-from orthonav.check.recalibrate import Recalibration
 from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
 from orthonav.check.trials import Trial, registration_of, run_many
@@ -159,24 +159,12 @@ class _Check:
         """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
-        lasting = self.coverage.without(request.changes, self.sheet.frame)
         places = trial_places(
             self.coverage, self.area, self.extent, self.checked_m2, side_m, request.effort, rng
         )
         own, other = self._trials(places)
         envelope, heights = self._extra_trials(own, rng) if request.extras else (None, [])
-        predictor = Predictor(
-            own,
-            radius_m=self.radius_m,
-            accept=request.accept,
-            view_side_m=side_m,
-            spacing_m=math.sqrt(self.checked_m2 / max(len(own), 1)),
-            other_date=other,
-            least_error_m=self._least_error_m,
-            coverage=lambda points: lasting.seen_share(points, side_m),
-            recalibrated=self._recalibrated,
-            scenes_std=self._recalibration.std,
-        )
+        predictor = self._predictor(own, other)
         cells = self._cells(predictor, own)
         along = self._along(predictor)
         outside = 0.0
@@ -227,17 +215,28 @@ class _Check:
             alternatives=self._alternatives(heights, own, cells),
         )
 
-    @property
-    def _recalibration(self) -> Recalibration:
-        found = self.request.recalibration
-        return found.other_sensor() if self.request.other_sensor else found
-
-    def _recalibrated(self, share: Array) -> Array:
-        """Predicted shares (N,) from those of trials; a second date needs no recalibration."""
-        if self.request.other_date is not None:
-            return share
-        view_px = self.plan.side_m / self.sheet.grid.gsd_m
-        return self._recalibration(share, view_px, self.request.prior_std_m is not None)
+    def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
+        request, side_m = self.request, self.plan.side_m
+        lasting = self.coverage.without(request.changes, self.sheet.frame)
+        recalibration = request.recalibration
+        if request.other_sensor:
+            recalibration = recalibration.other_sensor()
+        recalibrated: Callable[[Array], Array] = np.asarray  # a second date needs no recalibration
+        if request.other_date is None:
+            view_px, has_prior = side_m / self.sheet.grid.gsd_m, request.prior_std_m is not None
+            recalibrated = partial(recalibration, view_px=view_px, has_prior=has_prior)
+        return Predictor(
+            own,
+            radius_m=self.radius_m,
+            accept=request.accept,
+            view_side_m=side_m,
+            spacing_m=math.sqrt(self.checked_m2 / max(len(own), 1)),
+            other_date=other,
+            least_error_m=self._least_error_m,
+            coverage=lambda points: lasting.seen_share(points, side_m),
+            recalibrated=recalibrated,
+            scenes_std=recalibration.std,
+        )
 
     @property
     def _least_error_m(self) -> float:
