@@ -12,10 +12,10 @@ from orthonav.errors import AreaError, FetchError, OutputError
 from orthonav.fetch.client import Client
 from orthonav.fetch.download import FetchedCells, FileCache, fetch_cells
 from orthonav.fetch.grid import Selection, select
-from orthonav.fetch.options import Provenance
+from orthonav.fetch.options import Provenance, SourceSpec
 from orthonav.fetch.politeness import RequestLimits, Stopped
 from orthonav.fetch.service import CellSource
-from orthonav.fetch.sources import SourceSpec, open_cells
+from orthonav.fetch.sources import open_cells
 from orthonav.fetch.write import Packing, write_mosaic
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area

@@ -3,11 +3,11 @@
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
-from orthonav.fetch.options import ImageryOptions, Provenance
+from orthonav.fetch.options import ImageryOptions, Provenance, SourceSpec
 from orthonav.fetch.presets import PROTOCOLS, find_preset
 from orthonav.fetch.service import CellSource
 from orthonav.fetch.stac import CatalogItem, date_of, find_items, sign
@@ -18,24 +18,6 @@ from orthonav.fetch.xyz import xyz_tiles
 from orthonav.geo.area import Area
 
 _DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?")
-
-
-@dataclass(frozen=True)
-class SourceSpec:
-    """A service and the imagery requested of it."""
-
-    protocol: str
-    """One of `PROTOCOLS`."""
-    url: str
-    """Its address, with `{key}` in place of a key."""
-    options: ImageryOptions
-    """Which imagery."""
-    provenance: Provenance
-    """Origin and terms, as far as they are known before the service is asked."""
-    secrets: tuple[Secret, ...] = ()
-    """The key, if the address holds one."""
-    token_url: str | None = None
-    """Address of a signing service for files."""
 
 
 def parse_source(
@@ -98,16 +80,15 @@ def open_cells(client: Client, spec: SourceSpec, area: Area) -> CellSource:
 
     Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
     """
-    url, wanted = spec.url, (spec.options, area.frame, spec.provenance)
-    openers: dict[str, Callable[[], CellSource]] = {
-        "wmts": lambda: wmts_tiles(client, url, *wanted),
-        "wms": lambda: wms_cells(client, url, *wanted),
-        "xyz": lambda: xyz_tiles(url, *wanted),
-        "tms": lambda: xyz_tiles(url, *wanted, rows_from_south=True),
-        "stac": lambda: _stac(client, spec, area),
-        "cog": lambda: _cogs(client, spec, [url], area),
+    openers: dict[str, Callable[[Client, SourceSpec, Area], CellSource]] = {
+        "wmts": wmts_tiles,
+        "wms": wms_cells,
+        "xyz": xyz_tiles,
+        "tms": xyz_tiles,
+        "stac": _stac,
+        "cog": lambda client, spec, area: _cogs(client, spec, area, [spec.url]),
     }
-    return openers[spec.protocol]()
+    return openers[spec.protocol](client, spec, area)
 
 
 def _stac(client: Client, spec: SourceSpec, area: Area) -> CellSource:
@@ -121,7 +102,7 @@ def _stac(client: Client, spec: SourceSpec, area: Area) -> CellSource:
         items = sign(client, spec.token_url, items)
     provenance = replace(spec.provenance, date=date_of(items) or spec.provenance.date)
     spec = replace(spec, provenance=provenance)
-    return _cogs(client, spec, [item.url for item in items], area)
+    return _cogs(client, spec, area, [item.url for item in items])
 
 
 def _newest_by_place(items: list[CatalogItem]) -> list[CatalogItem]:
@@ -132,10 +113,10 @@ def _newest_by_place(items: list[CatalogItem]) -> list[CatalogItem]:
     return list(newest.values())
 
 
-def _cogs(client: Client, spec: SourceSpec, urls: list[str], area: Area) -> CellSource:
+def _cogs(client: Client, spec: SourceSpec, area: Area, urls: list[str]) -> CellSource:
     from orthonav.fetch.cog import cog_source  # imports GDAL
 
-    return cog_source(client, urls, spec.options, area.frame, spec.provenance)
+    return cog_source(client, spec, area, urls)
 
 
 def _secrets(url: str, key_env: str | None, literal: str | None) -> tuple[Secret, ...]:

@@ -15,8 +15,7 @@ from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import (
     HEIGHTS_FORMAT,
     TERRAIN_GSD_M,
-    ImageryOptions,
-    Provenance,
+    SourceSpec,
     choose,
     choose_format,
     choose_layer,
@@ -24,6 +23,7 @@ from orthonav.fetch.options import (
 )
 from orthonav.fetch.service import CellSource, resolution, tile_source
 from orthonav.fetch.urls import with_query
+from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 
 CELL_PX = 1024
@@ -32,14 +32,9 @@ _MIN_CELL_PX = 64
 _VERSIONS = ("1.3.0", "1.1.1")
 
 
-def wms_cells(
-    client: Client,
-    url: str,
-    options: ImageryOptions,
-    frame: LocalFrame,
-    provenance: Provenance,
-) -> CellSource:
+def wms_cells(client: Client, spec: SourceSpec, area: Area) -> CellSource:
     """Cells of a layer of a service. Raises `FetchError` with the available choices."""
+    url, options, frame = spec.url, spec.options, area.frame
     wanted = options.version or _VERSIONS[0]
     if wanted not in _VERSIONS:
         raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, not {wanted}")
@@ -92,7 +87,7 @@ def wms_cells(
         box = (south, west, north, east) if swap else (west, south, east, north)
         return with_query(fixed, {"BBOX": ",".join(_number(value) for value in box)})
 
-    return tile_source(provenance, grid, url_of, format_, options.empty, tiled=False)
+    return tile_source(spec.provenance, grid, url_of, format_, options.empty, tiled=False)
 
 
 def _crs_names(options: list[str]) -> dict[str, str]:
