@@ -110,6 +110,12 @@ class FileCache:
 class FetchedCells:
     """What became of the cells of a selection: first fetched, then written."""
 
+    source: CellSource
+    """Where they come from."""
+    selection: Selection
+    """Which cells."""
+    cache: FileCache
+    """Where they are stored."""
     digests: np.ndarray
     """(N,) uint64 digest of each cell's image, 0 where there is none."""
     from_cache: int = 0
@@ -146,7 +152,7 @@ def fetch_cells(
     stored.
     """
     cells = selection.cells.tolist()
-    fetched = FetchedCells(np.zeros(len(cells), dtype=np.uint64))
+    fetched = FetchedCells(source, selection, cache, np.zeros(len(cells), dtype=np.uint64))
     in_a_row = 0
 
     def fetch_one(number: int) -> tuple[int, FetchError | None, int, bool]:

@@ -145,8 +145,8 @@ def fetch(
         started(estimate)
         cache = FileCache(request.cache or request.out.with_name(f"{request.out.name}.tiles"))
         fetched = _fetched(source, selection, client, cache, progress)
-        _refuse_holes(request, fetched, cache)
-        write_mosaic(request.out, source, selection, fetched, cache, request.packing, progress)
+        _refuse_holes(request, fetched)
+        write_mosaic(request.out, fetched, request.packing, progress)
         received_mb = client.received_bytes / 1e6
     if request.cache is None:
         cache.remove()
@@ -222,7 +222,7 @@ def _fetched(
         raise FetchError(f"{error}; {_resume_hint(cache)}") from None
 
 
-def _refuse_holes(request: FetchRequest, fetched: FetchedCells, cache: FileCache) -> None:
+def _refuse_holes(request: FetchRequest, fetched: FetchedCells) -> None:
     failed = fetched.failed.total()
     if not failed or request.allow_holes:
         return
@@ -230,7 +230,7 @@ def _refuse_holes(request: FetchRequest, fetched: FetchedCells, cache: FileCache
     reasons = ", ".join(f"{reason}: {count}" for reason, count in common)
     raise FetchError(
         f"{failed} of {len(fetched.digests)} tiles failed ({reasons}; for example "
-        f"{fetched.examples[common[0][0]]}); nothing was written; {_resume_hint(cache)}; "
+        f"{fetched.examples[common[0][0]]}); nothing was written; {_resume_hint(fetched.cache)}; "
         "--allow-holes writes the file without them"
     )
 
