@@ -17,7 +17,7 @@ def places(count, seed=1):
 
 
 def predictor(trials, other_date=(), **changed):
-    usual = {"radius_m": 35.0, "accept": 0.9, "view_side_m": 100.0, "spacing_m": 60.0} | changed
+    usual = {"view_side_m": 100.0, "spacing_m": 60.0} | changed
     whole = {"coverage": lambda points: np.ones(len(points))} | usual
     return Predictor(trials, other_date=other_date, **whole)
 

@@ -227,8 +227,6 @@ class _Check:
             recalibrated = partial(recalibration, view_px=view_px, has_prior=has_prior)
         return Predictor(
             own,
-            radius_m=self.radius_m,
-            accept=request.accept,
             view_side_m=side_m,
             spacing_m=math.sqrt(self.checked_m2 / max(len(own), 1)),
             other_date=other,
@@ -272,9 +270,8 @@ class _Check:
         self, own: Sequence[Trial], rng: np.random.Generator
     ) -> tuple[Envelope | None, list[list[Trial]]]:
         """The envelope of errors, and trials from other heights."""
-        accept, radius_m = self.request.accept, self.radius_m
         # Where views are not placed, errors of heading and height make no difference.
-        placed = [t.en_m for t in own if t.confidence >= accept and t.error_m <= radius_m]
+        placed = [each.en_m for each in own if each.right]
         order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
         exact = np.array([placed[i] for i in order], np.float64).reshape(-1, 2)
         places = np.array([each.en_m for each in own])
@@ -285,7 +282,7 @@ class _Check:
             self.workers,
             lambda share: self.progress("envelope", share),
         )
-        envelope = envelope_of(found[: len(errors)], accept, radius_m) if errors else None
+        envelope = envelope_of(found[: len(errors)]) if errors else None
         return envelope, found[len(errors) :]
 
     def _predict(
@@ -345,7 +342,7 @@ class _Check:
         """Other heights, where these were tried, and narrower bands, where all legs have one."""
         found: tuple[Alternative, ...] = ()
         if heights:
-            found = heights_of(self.plan, own, heights, self.request.accept, self.radius_m)
+            found = heights_of(self.plan, own, heights)
         route, widths = self.request.route, set(self.bands_m)
         if route is None or len(widths) != 1:
             return found

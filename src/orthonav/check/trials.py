@@ -57,6 +57,7 @@ class Trial:
     `error_m`: error of the fix; NaN without one.
     `confidence`: of the fix; 0 without one.
     `expected`: mean persistence of the view; NaN for a second date.
+    `right`, `wrong`: the fix is accepted, and within the radius of the map or not.
     `found_en_m`: position of the fix.
     `rival_en_m`: best other place at least a quarter of a view away.
     `rival_share`: its score as a share of the best score; NaN without a rival.
@@ -66,6 +67,8 @@ class Trial:
     error_m: float
     confidence: float
     expected: float
+    right: bool = False
+    wrong: bool = False
     found_en_m: tuple[float, float] = NOWHERE
     rival_en_m: tuple[float, float] = NOWHERE
     rival_share: float = math.nan
@@ -263,12 +266,17 @@ class Trier:
             score, placed = max(rivals, key=lambda each: each[0])
             east, north = registration.camera_en_m(prepared, placed.pose)
             rival, share = (float(east), float(north)), score / max(best.score, 1e-6)
-        confidence = registration.confidence
+        error_m, confidence = float(np.hypot(*(found - place_en_m))), 0.0
+        if registration.confidence is not None:
+            confidence = registration.confidence(best.evidence())
+        accepted, near = confidence >= plan.request.accept, error_m <= registration.radius_m
         return Trial(
             en_m=here,
-            error_m=float(np.hypot(*(found - place_en_m))),
-            confidence=0.0 if confidence is None else confidence(best.evidence()),
+            error_m=error_m,
+            confidence=confidence,
             expected=expected,
+            right=accepted and near,
+            wrong=accepted and not near,
             found_en_m=(float(found[0]), float(found[1])),
             rival_en_m=rival,
             rival_share=share,
