@@ -27,7 +27,6 @@ from orthonav.atlas.sheet_tasks import (
     AtlasRequest,
     Imagery,
     SheetTask,
-    is_same,
     margin_m,
     plan_sheets,
     request_digest,
@@ -84,10 +83,9 @@ def build_atlas(
     result = BuildReport(atlas.url, len(tasks), started_s)
     missing = []
     for task in tasks:
-        name = task.sheet.id
-        if name in known and is_same(task, known):
-            area_km2 = known[name].area_km2
-            result.results.append(SheetResult(name, "unchanged", area_km2=area_km2))
+        same = known.get(task.sheet.id)
+        if same is not None and same.request == task.sheet.request:
+            result.results.append(SheetResult(same.id, "unchanged", area_km2=same.area_km2))
         else:
             missing.append(task)
     there = len(result.results)

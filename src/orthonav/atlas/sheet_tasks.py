@@ -274,7 +274,8 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
     """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
-    other = [task.sheet for task in tasks if not is_same(task, known)]
+    sheets = [task.sheet for task in tasks if task.sheet.id in known]
+    other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
     if not other:
         return
     why = sorted(
@@ -290,9 +291,3 @@ def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None
         f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
         f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
     )
-
-
-def is_same(task: SheetTask, known: Mapping[str, Sheet]) -> bool:
-    """Whether the sheet of a task is not in the atlas, or is there as the task would make it."""
-    there = known.get(task.sheet.id)
-    return there is None or there.request == task.sheet.request
