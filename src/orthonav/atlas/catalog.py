@@ -66,9 +66,10 @@ class Atlas:
         """
         store = Store(str(url))
         if store.size(CATALOG) is None:
-            if not _is_free(store):
+            if _is_free(store):
+                store.write(CATALOG, _catalog(recipe))
+            elif store.size(CATALOG) is None:  # no other process has created it meanwhile
                 raise AtlasError(f"the folder holds other files; name another: {store}")
-            store.write(CATALOG, _catalog(recipe))
         return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:

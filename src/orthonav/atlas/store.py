@@ -13,7 +13,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -111,17 +111,23 @@ class Store:
             return self._files.read([checked_name(name) for name in names])
 
     def fetch(self, name: str, size: int, sha256: str) -> Path:
-        """A local file with that content, verified once: the file itself or a cached copy."""
+        """A local file with that content, verified once: the file itself or a cached copy.
+
+        Several processes may use the cache at the same time.
+        """
         if self.is_local:
             return self._verified_path(name, size, sha256)
-
-        def fill(path: Path) -> None:
+        folder, limit_bytes = cache_folder(), cache_limit_bytes()
+        path = folder / sha256[:2] / f"{sha256}{Path(checked_name(name)).suffix}"
+        with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
+            if path.is_file() and path.stat().st_size == size:
+                os.utime(path)  # last used now
+                return path
             with replacing(path) as temporary:
                 self.download(name, temporary)
                 _require(temporary, size, sha256, self.shown(name))
-
-        file = f"{sha256}{Path(checked_name(name)).suffix}"
-        return cached(file, size, fill)
+            _shrink(folder, limit_bytes, path)
+        return path
 
     def download(self, name: str, path: Path) -> None:
         """Copy a file of a remote atlas to `path`, not verified."""
@@ -199,22 +205,6 @@ def cache_limit_bytes() -> int:
         return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
     except (ValueError, OverflowError) as error:
         raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
-
-
-def cached(name: str, size: int, fill: Callable[[Path], None]) -> Path:
-    """The file of the cache that is named by its SHA-256; if missing, `fill` writes it, verified.
-
-    Several processes may use a cache at the same time.
-    """
-    folder, limit_bytes = cache_folder(), cache_limit_bytes()
-    path = folder / name[:2] / name
-    with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
-        if path.is_file() and path.stat().st_size == size:
-            os.utime(path)  # last used now
-            return path
-        fill(path)
-        _shrink(folder, limit_bytes, path)
-    return path
 
 
 def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
