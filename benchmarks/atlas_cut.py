@@ -237,7 +237,7 @@ def _child(folder: Path, out: Path, workers: int) -> int:
     begun, cpu = time.perf_counter(), time.process_time()
     atlas = Atlas.open(str(folder))
     done = cut_map(
-        atlas, out, route=route_of(km), band_m=BAND_M, workers=workers, progress=progress
+        atlas, out, Area.from_route(route_of(km), BAND_M), workers=workers, progress=progress
     )
     ended = time.perf_counter()
     sheet = done.manifest.sheets[0]

@@ -112,6 +112,10 @@ def bounds_around(frame, half_m):
     return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
 
 
+def area_around(frame, half_m):
+    return Area.from_bounds(bounds_around(frame, half_m))
+
+
 def line(frame, *points_en_m):
     return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
 
@@ -120,7 +124,7 @@ def line(frame, *points_en_m):
 def cut(folder, middle, tmp_path_factory):
     """A map across all of these sheets."""
     out = tmp_path_factory.mktemp("cut") / "cut.onav"
-    cut_map(Atlas.open(str(folder)), out, bounds_deg=bounds_around(middle, 150), workers=1)
+    cut_map(Atlas.open(str(folder)), out, area_around(middle, 150), workers=1)
     return open_map(out)
 
 
@@ -156,7 +160,7 @@ def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
     cut_map(
         Atlas.open(str(folder)),
         again,
-        bounds_deg=bounds_around(middle, 150),
+        area_around(middle, 150),
         workers=3,
         progress=lambda stage, share: stages.append((stage, share)),
     )
@@ -232,13 +236,15 @@ def test_imagery_of_all_sheets_is_named_once(atlas, names, middle, tmp_path):
     imagery = (older, *opened.manifest.imagery)
     write_map(tmp_path / "s.onav", replace(opened.manifest, imagery=imagery), opened.arrays)
     put(atlas, names[1], tmp_path / "s.onav")
-    done = cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 60), workers=1)
+    done = cut_map(atlas, tmp_path / "o.onav", area_around(middle, 60), workers=1)
     assert [each["date"] for each in done.manifest.imagery] == ["2011", "2019-06"]
 
 
 def test_tiles_outside_the_band_are_left_out(folder, middle, tmp_path):
     route = line(middle, [-150, -150], [150, 150])
-    done = cut_map(Atlas.open(str(folder)), tmp_path / "o.onav", route=route, band_m=40, workers=1)
+    done = cut_map(
+        Atlas.open(str(folder)), tmp_path / "o.onav", Area.from_route(route, 40), workers=1
+    )
     sheet = done.manifest.sheets[0]
     assert sheet.tiles < 0.7 * sheet.grid.rows * sheet.grid.cols
     area = Area.from_route(route, 40)
@@ -250,7 +256,7 @@ def test_a_missing_sheet_beside_the_route_is_a_warning(atlas, names, middle, tmp
     atlas.retire(names[3])
     here = middle.en_from_latlon(*centre_of(names[0]))
     route = line(middle, 1.2 * here, 0.5 * here)
-    done = cut_map(atlas, tmp_path / "o.onav", route=route, band_m=600, workers=1)
+    done = cut_map(atlas, tmp_path / "o.onav", Area.from_route(route, 600), workers=1)
     assert "the atlas lacks" in caplog.text and names[3] in caplog.text
     sheet = done.manifest.sheets[0]
     assert sheet.tiles < 0.9 * sheet.grid.rows * sheet.grid.cols
@@ -259,11 +265,11 @@ def test_a_missing_sheet_beside_the_route_is_a_warning(atlas, names, middle, tmp
 def test_a_missing_sheet_under_the_route_is_an_error(atlas, names, middle, tmp_path, names_in):
     atlas.retire(names[3])
     there = middle.en_from_latlon(*centre_of(names[3]))
-    request = {"route": line(middle, -there, there), "band_m": 40, "workers": 1}
+    area = Area.from_route(line(middle, -there, there), 40)
     with pytest.raises(AtlasError, match=rf"{names[3]}.*--allow-holes"):
-        cut_map(atlas, tmp_path / "out" / "o.onav", **request)
+        cut_map(atlas, tmp_path / "out" / "o.onav", area, workers=1)
     assert not (tmp_path / "out").exists()
-    done = cut_map(atlas, tmp_path / "o.onav", allow_holes=True, **request)
+    done = cut_map(atlas, tmp_path / "o.onav", area, workers=1, allow_holes=True)
     assert done.manifest.sheets[0].tiles > 0
 
 
@@ -288,10 +294,10 @@ def test_imagery_that_is_missing_under_the_route_is_an_error(middle, caplog):
 def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
-        cut_map(atlas, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
+        cut_map(atlas, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
     empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
     with pytest.raises(AreaError, match="no sheets yet"):
-        cut_map(empty, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
+        cut_map(empty, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
 
 
 @pytest.mark.parametrize(
@@ -306,7 +312,7 @@ def test_sheets_without_cells_or_layer_are_refused(atlas, names, middle, tmp_pat
     write_map(tmp_path / "s.onav", manifest, kept)
     put(atlas, names[2], tmp_path / "s.onav")
     with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*rebuild it"):
-        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
+        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
 
 @pytest.mark.parametrize("change", ["recipe", "grid", "method"])
@@ -325,7 +331,7 @@ def test_sheets_of_another_recipe_are_refused(atlas, names, middle, tmp_path, ch
     write_map(tmp_path / "s.onav", manifest, opened.arrays)
     put(atlas, sorted(names)[1], tmp_path / "s.onav")
     with pytest.raises(AtlasError, match=sorted(names)[1]):
-        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
+        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
 
 def test_a_damaged_sheet_is_named(atlas, names, middle, tmp_path):
@@ -334,7 +340,7 @@ def test_a_damaged_sheet_is_named(atlas, names, middle, tmp_path):
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
     with pytest.raises(StorageError, match=names[1]):
-        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
+        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
 
 def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
@@ -344,7 +350,7 @@ def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
     write_map(tmp_path / "s.onav", opened.manifest, parts)
     put(atlas, names[1], tmp_path / "s.onav")
     with pytest.raises(AtlasError, match=rf"sheet {names[1]} is damaged"):
-        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=2)
+        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=2)
 
 
 def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names_in):
@@ -356,7 +362,7 @@ def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names
         cut_map(
             Atlas.open(str(folder)),
             tmp_path / "o.onav",
-            bounds_deg=bounds_around(middle, 60),
+            area_around(middle, 60),
             workers=1,
         )
     assert names_in(tmp_path) == []
@@ -364,20 +370,14 @@ def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names
 
 def test_impossible_requests_are_refused(folder, middle, tmp_path):
     atlas, out = Atlas.open(str(folder)), tmp_path / "o.onav"
-    bounds = bounds_around(middle, 60)
-    with pytest.raises(AreaError, match="give either"):
-        cut_map(atlas, out)
-    with pytest.raises(AreaError, match="not both"):
-        cut_map(atlas, out, bounds_deg=bounds, route=line(middle, [0, 0], [50, 0]))
-    with pytest.raises(AreaError, match="needs a route"):
-        cut_map(atlas, out, bounds_deg=bounds, band_m=50)
+    area = area_around(middle, 60)
     with pytest.raises(AreaError, match="larger than the area"):
-        cut_map(atlas, out, bounds_deg=bounds_around(middle, 20))
+        cut_map(atlas, out, area_around(middle, 20))
     with pytest.raises(VariantError, match="workers"):
-        cut_map(atlas, out, bounds_deg=bounds, workers=0)
+        cut_map(atlas, out, area, workers=0)
     own = sheet_file(atlas, next(iter(atlas.sheets())))
     with pytest.raises(OutputError, match="replace a sheet"):
-        cut_map(atlas, own, bounds_deg=bounds, workers=1)
+        cut_map(atlas, own, area, workers=1)
 
 
 def test_the_box_of_an_area_goes_across_the_antimeridian():

@@ -20,6 +20,7 @@ from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.atlas.store import Store
 from orthonav.cli import main
 from orthonav.errors import AtlasError
+from orthonav.geo.area import Area
 from orthonav.mapfile import open_map
 
 RECIPE = AtlasRecipe(gsd_m=2.5, tile_px=128, calibration_views=24, coarse=None)
@@ -326,21 +327,21 @@ def test_options_reach_index_and_cut(near, capfd, monkeypatch):
     assert code == 0 and "nothing to index" in done.out
     asked = {}
 
-    def cut(atlas, out, **how):
-        asked.update(how, url=atlas.url, out=out)
+    def cut(atlas, out, area, **how):
+        asked.update(how, url=atlas.url, out=out, area=area)
         raise AtlasError("sheets are missing")
 
     monkeypatch.setattr("orthonav.atlas.cut.cut_map", cut)
     options = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
+    code, done = run(capfd, "cut", near.url, *options, "--band-m", "50")
+    assert code == 1 and "needs a route" in done.err
     code, done = run(capfd, "cut", near.url, *options)
     assert code == 1 and "sheets are missing" in done.err
     assert asked.pop("progress") is not None
     assert asked == {
         "url": near.url,
         "out": Path("MAP.onav"),
-        "route": None,
-        "band_m": None,
-        "bounds_deg": (1.8, 46.5, 1.9, 46.6),
+        "area": Area.from_bounds((1.8, 46.5, 1.9, 46.6)),
         "workers": 2,
         "allow_holes": False,
     }

@@ -84,7 +84,7 @@ def sha256(data):
 
 def test_files_that_are_put_are_there(store, tmp_path):
     (tmp_path / "file").write_bytes(b"some map")
-    store.put(tmp_path / "file", "sheets/a.onav")
+    store.write("sheets/a.onav", tmp_path / "file")
     store.write("items/b.1.json", b"{}")
     store.write("items/c.1.json", b"[1]")
     store.write("items/c.1.json", b"[1, 2]")
@@ -131,7 +131,7 @@ def test_names_outside_the_atlas_are_refused(store, name, tmp_path):
         lambda: store.age_s(name),
         lambda: store.fetch(name, 1, "0" * 64),
         lambda: store.download(name, tmp_path / "out"),
-        lambda: store.put(tmp_path / "file", name),
+        lambda: store.write(name, tmp_path / "file"),
         lambda: store.write(name, b""),
         lambda: store.remove(name),
     ):
@@ -184,7 +184,7 @@ def test_local_files_are_whole_or_absent(tmp_path, monkeypatch, error):
 
     monkeypatch.setattr("orthonav.atlas.filesystems.shutil.copyfile", half)
     with pytest.raises((KeyboardInterrupt, StorageError)) as caught:
-        store.put(tmp_path, "items/a")
+        store.write("items/a", tmp_path)
     assert "full" in str(caught.value) or isinstance(error, KeyboardInterrupt)
     assert store.names("items") == {"a": 3} and store.read("items/a") == b"old"
 

@@ -104,10 +104,10 @@ def made_up(work, workers, progress):
     """Views of the west are placed, those of the east and of a second date are not."""
     found = []
     for plan, places in work:
-        west = [place[0] < 0 and plan.other_path is None for place in places]
+        west = [place[0] < 0 and not plan.second_date for place in places]
         found.append(
             [
-                (right if good else lost)(tuple(place), index=i, expected=0.6 if good else 0.1)
+                (right if good else lost)(tuple(place), expected=0.6 if good else 0.1)
                 for i, (place, good) in enumerate(zip(places, west, strict=True))
             ]
         )
@@ -326,7 +326,7 @@ def test_another_date_that_shows_nothing_here(half_blank, checked, monkeypatch):
     def none_of_other(work, workers, progress):
         found = made_up(work, workers, progress)
         return [
-            [] if plan.other_path else each for (plan, _), each in zip(work, found, strict=True)
+            [] if plan.second_date else each for (plan, _), each in zip(work, found, strict=True)
         ]
 
     monkeypatch.setattr(check_run, "run_many", none_of_other)
@@ -404,7 +404,9 @@ def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
 @pytest.mark.parametrize("word", list(Word), ids=lambda word: word.value)
 def test_exit_codes(run, unwritten, half_blank, tmp_path, monkeypatch, word):
     judge = check_run.verdict_of
-    monkeypatch.setattr(check_run, "verdict_of", lambda found: Verdict(word, judge(found).reasons))
+    monkeypatch.setattr(
+        check_run, "verdict_of", lambda *found, **more: Verdict(word, judge(*found, **more).reasons)
+    )
     done = run("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
     assert (done.code, done.err) == (word.exit_code, "")
     assert json.loads(done.out)["verdict"]["word"] == word.value

@@ -12,16 +12,16 @@ from orthonav.check.envelope import (
     HEIGHTS,
     TOLERATED,
     YAW_OFF_DEG,
-    accepted_share,
     envelope_of,
     envelope_work,
     heights_of,
     heights_work,
+    right_share,
 )
+from orthonav.check.request import CheckRequest
 from orthonav.check.views import TrialPlan
-from orthonav.geo.camera import Camera
 
-PLAN = TrialPlan(Path("a.onav"), Camera(640, 480, 600.0, 600.0, 320.0, 240.0), 100.0)
+PLAN = TrialPlan(CheckRequest(Path("a.onav")), 100.0)
 PLACES = np.zeros((20, 2))
 MIDDLE = AGL_OFF.index(0.0)
 
@@ -34,7 +34,7 @@ def trials(share):
 
 def envelope(shares):
     shares = np.broadcast_to(shares, (len(YAW_OFF_DEG), len(AGL_OFF)))
-    return envelope_of([trials(each) for each in shares.ravel()], 0.9, 35.0)
+    return envelope_of([trials(each) for each in shares.ravel()])
 
 
 def test_work_is_at_the_same_places_for_every_error():
@@ -43,7 +43,7 @@ def test_work_is_at_the_same_places_for_every_error():
     assert [(plan.yaw_off_deg, plan.agl_off) for plan, _ in work][: len(AGL_OFF)] == [
         (0.0, off) for off in AGL_OFF
     ]
-    assert all(places is PLACES and plan.seed == PLAN.seed for plan, places in work)
+    assert all(places is PLACES and plan.request is PLAN.request for plan, places in work)
 
 
 def test_errors_are_fine_up_to_the_first_that_is_not():
@@ -76,7 +76,7 @@ def test_heights():
     work = heights_work(PLAN, PLACES)
     assert [plan.agl_m for plan, _ in work] == [100.0 * part for part in HEIGHTS]
     shares = [0.1 * (i + 1) for i in range(len(HEIGHTS))]
-    found = heights_of(PLAN, trials(0.7), [trials(each) for each in shares], 0.9, 35.0)
+    found = heights_of(PLAN, trials(0.7), [trials(each) for each in shares])
     assert [each.value for each in found] == sorted([100.0, *(100.0 * part for part in HEIGHTS)])
     chosen = [each for each in found if each.chosen]
     assert [(each.value, each.probability) for each in chosen] == [(100.0, 0.7)]
@@ -85,5 +85,5 @@ def test_heights():
 
 def test_kept_are_the_confident_and_right():
     some = [right((0, 0)), right((0, 0), error_m=40.0), right((0, 0), confidence=0.8), lost((0, 0))]
-    assert accepted_share(some, 0.9, 35.0) == 0.25
-    assert math.isnan(accepted_share([], 0.9, 35.0))
+    assert right_share(some) == 0.25
+    assert math.isnan(right_share([]))

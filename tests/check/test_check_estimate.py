@@ -17,17 +17,14 @@ def places(count, seed=1):
 
 
 def predictor(trials, other_date=(), **changed):
-    usual = {"radius_m": 35.0, "accept": 0.9, "view_side_m": 100.0, "spacing_m": 60.0} | changed
+    usual = {"view_side_m": 100.0, "spacing_m": 60.0} | changed
     whole = {"coverage": lambda points: np.ones(len(points))} | usual
     return Predictor(trials, other_date=other_date, **whole)
 
 
 def half_good(count=300):
     """Right in the west, lost in the east."""
-    return [
-        right(en, index=i) if en[0] < SIDE_M / 2 else lost(en, index=i)
-        for i, en in enumerate(places(count))
-    ]
+    return [right(en) if en[0] < SIDE_M / 2 else lost(en) for i, en in enumerate(places(count))]
 
 
 WEST, EAST = np.array([[150.0, 500.0]]), np.array([[850.0, 500.0]])

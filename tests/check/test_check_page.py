@@ -17,8 +17,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
 from orthonav.check.outcome import CELL_VALUES
-from orthonav.check.write import imagery, write_check
-from orthonav.check.write.imagery import MAX_SIDE_PX, jpeg, map_image, visible_box
+from orthonav.check.write import figures, write_check
+from orthonav.check.write.figures import MAX_SIDE_PX, jpeg, map_image, visible_box
 from orthonav.check.write.page import ZERO_IF_UNKNOWN, _known_cells
 from orthonav.check.write.plain import to_plain
 from orthonav.check.write.risk import RISKS, segments
@@ -185,7 +185,7 @@ def test_the_picture_lies_where_the_map_does(opened, frame):
 
 
 def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
-    monkeypatch.setattr(imagery, "GreyLayer", SimpleNamespace(of=lambda _: None))
+    monkeypatch.setattr(figures, "GreyLayer", SimpleNamespace(of=lambda _: None))
     found = map_image(opened, visible_box(made_check.tiny(frame)))
     grid = opened.manifest.sheets[0].grid
     assert found.west_m == grid.west_m and found.north_m == grid.north_m
@@ -194,7 +194,7 @@ def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
 
 def test_pictures_of_noise_stay_small():
     noise = np.random.default_rng(1).integers(0, 255, (1300, 2000), dtype=np.uint8)
-    assert len(jpeg(noise)) <= imagery.MAX_BYTES
+    assert len(jpeg(noise)) <= figures.MAX_BYTES
 
 
 def test_the_route_has_the_colours_of_the_cells():

@@ -15,7 +15,6 @@ from orthonav.check.places import (
     CellGrid,
     MapCoverage,
     cell_side_m,
-    checked_extent,
     checked_m2,
     trial_places,
 )
@@ -91,7 +90,7 @@ def test_covered_share_of_every_cell():
 
 def test_a_map_that_shows_nothing():
     with pytest.raises(AreaError, match="has no imagery"):
-        checked_extent(covering(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)), None)
+        covering(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)).extent_en_m  # noqa: B018
 
 
 @pytest.mark.parametrize(
@@ -108,20 +107,20 @@ def test_a_map_that_shows_nothing():
 def test_ground_of_a_band(points, bands, expected_m2):
     area = area_of(points, bands)
     assert checked_m2(WHOLE, area) == pytest.approx(expected_m2, rel=0.1)
-    assert checked_extent(WHOLE, area) == area.extent_en_m
 
 
 def test_a_band_outside_the_map_is_refused():
     with pytest.raises(AreaError, match=r"does not touch the map, \d\.\d km from it"):
-        checked_extent(WHOLE, area_of([[5000, 0], [6000, 0]], [300.0]))
+        checked_m2(WHOLE, area_of([[5000, 0], [6000, 0]], [300.0]))
     holes = covering(-1000.0, 1000.0, 2.0, np.zeros((1000, 1000), np.bool_))
     with pytest.raises(AreaError, match="no imagery"):
-        checked_extent(holes, area_of([[0, 0], [100, 0]], [300.0]))
+        checked_m2(holes, area_of([[0, 0], [100, 0]], [300.0]))
 
 
 def places(area=None, coverage=WHOLE, view_side_m=150.0, effort=1.0, seed=1):
-    extent = checked_extent(coverage, area)
-    return trial_places(coverage, area, extent, view_side_m, effort, np.random.default_rng(seed))
+    extent = coverage.extent_en_m if area is None else area.extent_en_m
+    rng, wanted_m2 = np.random.default_rng(seed), checked_m2(coverage, area)
+    return trial_places(coverage, area, extent, wanted_m2, view_side_m, effort, rng)
 
 
 def test_places_are_spread_over_all_ground():

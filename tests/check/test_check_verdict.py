@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_trials import CONDITIONS
 
 from orthonav.check.outcome import Along, BlindStretch, Lookalike, Word
-from orthonav.check.verdict import Findings, verdict_of
+from orthonav.check.verdict import verdict_of
 
 ZEROS = np.zeros(11)
 ALONG = Along(
@@ -20,8 +19,7 @@ ALONG = Along(
     error_m=ZEROS + 3,
     drift_m=ZEROS + 8,
 )
-FINE = Findings(
-    conditions=CONDITIONS,
+FINE = dict(
     mean=0.9,
     low=0.8,
     calibrated=True,
@@ -31,13 +29,15 @@ FINE = Findings(
     along=None,
     stretches=(),
     lookalikes=(),
+    changed=0.0,
+    allowed_m=50.0,
 )
-FLOWN = replace(FINE, along=ALONG)
+FLOWN = FINE | {"along": ALONG}
 
 
 def judged(findings):
     """The verdict, and the word of each reason."""
-    verdict = verdict_of(findings)
+    verdict = verdict_of(**findings)
     ranks = [(Word.NO_GO, Word.MARGINAL, Word.GO).index(each.word) for each in verdict.reasons]
     assert ranks == sorted(ranks) and verdict.word is verdict.reasons[0].word
     assert all(each.text and "nan" not in each.text for each in verdict.reasons)
@@ -57,8 +57,8 @@ def test_go():
 
 
 def test_changed_ground_is_a_warning_and_much_of_it_is_marginal():
-    assert judged(replace(FINE, changed=0.02))[1]["changed_ground"] is Word.GO
-    word, reasons = judged(replace(FINE, changed=0.2))
+    assert judged(FINE | dict(changed=0.02))[1]["changed_ground"] is Word.GO
+    word, reasons = judged(FINE | dict(changed=0.2))
     assert word is Word.MARGINAL and reasons["changed_ground"] is Word.MARGINAL
 
 
@@ -77,11 +77,11 @@ def test_exit_codes():
     ],
 )
 def test_go_rests_on_the_low_end(mean, low, code, word):
-    assert judged(replace(FINE, mean=mean, low=low)) == (word, {code: word})
+    assert judged(FINE | dict(mean=mean, low=low)) == (word, {code: word})
 
 
 def test_a_map_without_confidence_is_no_go():
-    word, reasons = judged(replace(FLOWN, calibrated=False))
+    word, reasons = judged(FLOWN | dict(calibrated=False))
     assert word is Word.NO_GO and reasons["no_confidence"] is Word.NO_GO
 
 
@@ -97,7 +97,7 @@ def test_a_map_without_confidence_is_no_go():
     ],
 )
 def test_wrong_with_confidence(wrong, trials, expected):
-    word, reasons = judged(replace(FINE, wrong=wrong, trials=trials))
+    word, reasons = judged(FINE | dict(wrong=wrong, trials=trials))
     assert reasons.get("wrong") is expected and word is (expected or Word.GO)
 
 
@@ -106,7 +106,7 @@ def test_wrong_with_confidence(wrong, trials, expected):
     [(0.0, None), (0.004, None), (0.05, Word.MARGINAL), (0.11, Word.NO_GO), (1.0, Word.NO_GO)],
 )
 def test_a_route_beyond_the_map(outside, expected):
-    word, reasons = judged(replace(FLOWN, outside=outside))
+    word, reasons = judged(FLOWN | dict(outside=outside))
     assert reasons.get("outside_map") is expected and word is (expected or Word.GO)
 
 
@@ -122,10 +122,9 @@ def test_a_route_beyond_the_map(outside, expected):
 def test_expected_drift(drift_m, prior_std_m, expected):
     drift = np.where(np.arange(11) == 4, drift_m, 3.0)
     along = replace(ALONG, drift_m=drift)
-    conditions = replace(CONDITIONS, prior_std_m=prior_std_m)
-    findings = replace(FINE, along=along, conditions=conditions)
+    findings = FINE | dict(along=along, allowed_m=prior_std_m)
     assert judged(findings) == (expected, {"fixes": Word.GO, "drift": expected})
-    assert any("2.0 km" in each.text for each in verdict_of(findings).reasons)
+    assert any("2.0 km" in each.text for each in verdict_of(**findings).reasons)
 
 
 @pytest.mark.parametrize(
@@ -146,20 +145,20 @@ def test_expected_drift(drift_m, prior_std_m, expected):
     ids=["one", "two", "long", "longer", "at the end", "one of two", "whole map searched"],
 )
 def test_blind_stretches(stretches, expected, said):
-    findings = replace(FLOWN, stretches=stretches)
+    findings = FLOWN | dict(stretches=stretches)
     word, reasons = judged(findings)
     assert word is expected and reasons["blind"] is expected
-    assert any(said in each.text for each in verdict_of(findings).reasons)
+    assert any(said in each.text for each in verdict_of(**findings).reasons)
 
 
 def test_lookalikes_never_worsen_the_verdict():
     like = Lookalike((46.0, 3.0), (46.01, 3.0), 1100.0, 0.9, 4, True)
     some = (like, replace(like, within_prior=False), replace(like, trials=1))
-    assert judged(replace(FINE, lookalikes=some)) == (
+    assert judged(FINE | dict(lookalikes=some)) == (
         Word.GO,
         {"fixes": Word.GO, "lookalikes": Word.GO},
     )
-    assert judged(replace(FINE, lookalikes=some[1:])) == (Word.GO, {"fixes": Word.GO})
+    assert judged(FINE | dict(lookalikes=some[1:])) == (Word.GO, {"fixes": Word.GO})
 
 
 @pytest.mark.parametrize(
@@ -174,11 +173,11 @@ def test_lookalikes_never_worsen_the_verdict():
 def test_the_chance_of_a_fix_is_a_sentence(mean, start):
     low = mean - 0.06
     rest = f" of a confident, correct fix on the map (mean), at least {100 * low:.0f} % on nine"
-    said = verdict_of(replace(FINE, mean=mean, low=low)).reasons[0].text
+    said = verdict_of(**(FINE | dict(mean=mean, low=low))).reasons[0].text
     assert said == f"{start}{rest} of ten scenes."
 
 
 def test_the_worst_reason_decides():
-    findings = replace(FLOWN, mean=0.3, low=0.2, outside=0.5, calibrated=False)
+    findings = FLOWN | dict(mean=0.3, low=0.2, outside=0.5, calibrated=False)
     word, reasons = judged(findings)
     assert word is Word.NO_GO and reasons["few_fixes"] is Word.MARGINAL and len(reasons) == 4

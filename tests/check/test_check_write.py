@@ -15,10 +15,10 @@ from made_check import EVIL, FILES, lost_in, made_cells, small_route
 
 from orthonav.check.outcome import Conditions
 from orthonav.check.write import require_free, write_check
+from orthonav.check.write.folder import tif_bytes
 from orthonav.check.write.plain import to_json, to_plain
-from orthonav.check.write.raster import tif_bytes
 from orthonav.check.write.shapes import features, to_geojson
-from orthonav.check.write.text import text
+from orthonav.check.write.wording import text
 from orthonav.errors import MissingExtraError, OutputError
 from orthonav.geo.frames import LocalFrame
 from orthonav.mapfile import open_map

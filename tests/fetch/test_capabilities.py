@@ -5,6 +5,7 @@ around: limits of zooms, names of grids, rows before columns, rounded scales.
 """
 
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -15,7 +16,7 @@ from orthonav.fetch import wms, wmts
 from orthonav.fetch.client import Client
 from orthonav.fetch.crs import MERCATOR_HALF_M
 from orthonav.fetch.documents import parse_xml
-from orthonav.fetch.options import ImageryOptions, Provenance
+from orthonav.fetch.options import ImageryOptions, Provenance, SourceSpec
 from orthonav.fetch.presets import presets
 from orthonav.geo.frames import LocalFrame
 
@@ -41,15 +42,20 @@ def answering(module, found):
     return mock.patch.object(module, "get_xml", lambda client, url: found)
 
 
+def asked(protocol, url, options, place):
+    """What is asked for, and an area of which only the place matters."""
+    return SourceSpec(protocol, url, options, PROVENANCE), SimpleNamespace(frame=place)
+
+
 def tiles(name, options, url="https://a.example/wmts"):
     with answering(wmts, document(f"{name}_wmts")):
         place = PLACES.get(name, PLACES["ign"])
-        return wmts.wmts_tiles(CLIENT, url, options, place, PROVENANCE)
+        return wmts.wmts_tiles(CLIENT, *asked("wmts", url, options, place))
 
 
 def cells(name, url, options, place):
     with answering(wms, document(name)):
-        return wms.wms_cells(CLIENT, url, options, place, PROVENANCE)
+        return wms.wms_cells(CLIENT, *asked("wms", url, options, place))
 
 
 def of_preset(name, id_, **rest):
@@ -196,7 +202,7 @@ def refused(module, body, words):
     opened = wms.wms_cells if module is wms else wmts.wmts_tiles
     place = PLACES["ign"]
     with answering(module, parse_xml(body)), pytest.raises(FetchError, match=words):
-        opened(CLIENT, "http://a/b", ImageryOptions(), place, PROVENANCE)
+        opened(CLIENT, *asked("", "http://a/b", ImageryOptions(), place))
 
 
 def test_a_deeply_nested_document_is_rejected():

@@ -13,7 +13,7 @@ import servers
 import terrain
 
 from orthonav.errors import FetchError, OutputError
-from orthonav.fetch.cache import FileCache
+from orthonav.fetch.download import FileCache
 
 NOISE = np.random.default_rng(1).integers(1, 255, (256, 256, 3), dtype=np.uint8)
 PLACEHOLDER = terrain.encoded(NOISE)
@@ -75,8 +75,8 @@ def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name)
         server.answer = servers.tiles
         result, path = take(source(server))  # the same command resumes
         asked_again = {asked.path for asked in server.log[before:]}
-    assert len(asked_again) + result.fetched.from_cache == result.estimate.tiles
-    assert result.fetched.from_cache > 0
+    assert len(asked_again) + result.cells.from_cache == result.estimate.tiles
+    assert result.cells.from_cache > 0
     shift, worst, valid = terrain.offset_px(path)
     assert np.abs(shift).max() < 0.05 and worst <= 1 and valid == 1.0
     assert not (tmp_path / "ortho.tif.tiles").exists()
@@ -86,7 +86,7 @@ def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name)
 def test_a_temporary_fault_is_overcome(take, name):
     with servers.serving(tiles_but(FAULTS[name], lasting=False)) as server:
         result, path = take(source(server))
-    assert not result.fetched.failed and terrain.offset_px(path)[1] <= 1
+    assert not result.cells.failed and terrain.offset_px(path)[1] <= 1
     assert terrain.offset_px(path)[2] == 1.0
 
 
@@ -94,7 +94,7 @@ def test_a_temporary_fault_is_overcome(take, name):
 def test_allowed_holes_are_masked(take, name, caplog):
     with servers.serving(tiles_but(FAULTS[name])) as server:
         result, path = take(source(server), allow_holes=True)
-    failed = result.fetched.failed.total()
+    failed = result.cells.failed.total()
     assert failed > 0 and f"{failed} failed" in caplog.text
     shift, worst, valid = terrain.offset_px(path)
     assert np.abs(shift).max() < 0.05 and worst <= 1
@@ -115,7 +115,7 @@ def test_missing_imagery_is_masked_and_counted(take, name, caplog):
 def test_identical_tiles_are_placeholders(take):
     with servers.serving(tiles_but(servers.Answer(PLACEHOLDER))) as server:
         result, path = take(source(server))
-    assert result.counts.placeholders > 1
+    assert result.cells.placeholders > 1
     assert terrain.offset_px(path)[1] <= 1
 
 
@@ -156,7 +156,7 @@ def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
         cells[2].write_bytes(flipped)
         before = len(server.log)
         again, path = take(source(server), cache=tmp_path / "cache")
-        assert len(server.log) - before == 3 == again.estimate.tiles - again.fetched.from_cache
+        assert len(server.log) - before == 3 == again.estimate.tiles - again.cells.from_cache
     assert terrain.offset_px(path)[1] <= 1
 
 
@@ -211,7 +211,7 @@ def test_a_killed_fetch_resumes(take, tmp_path, names_below):
             time.sleep(0.1)
         result, _ = take(source(server), half_m=200, margin_m=200.0)
         asked = len(server.log) - before
-    assert result.fetched.from_cache == len(stored)
+    assert result.cells.from_cache == len(stored)
     assert asked == result.estimate.tiles - len(stored) > 0
     shift, worst, valid = terrain.offset_px(out)
     assert np.abs(shift).max() < 0.05 and worst <= 1 and valid == 1.0

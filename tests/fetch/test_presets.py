@@ -34,7 +34,7 @@ def test_a_service_is_complete(name):
 
 
 @pytest.mark.parametrize("name", presets())
-def test_its_layers_are_complete(name):
+def test_its_layers_are_complete(name, monkeypatch):
     preset = presets()[name]
     coarsest_m = 1 if preset.datum is None else 30
     for id_, layer in preset.layers.items():
@@ -47,9 +47,10 @@ def test_its_layers_are_complete(name):
         else:
             check_date(layer.date)
             assert layer.date.partition("/")[0] in id_
-        environ = {preset.key_env: "x" * 8} if preset.key_env else {}
+        if preset.key_env:
+            monkeypatch.setenv(preset.key_env, "x" * 8)
         source = name if id_ == CURRENT else f"{name}:{id_}"
-        spec = parse_source(source, ImageryOptions(), environ=environ)
+        spec = parse_source(source, ImageryOptions())
         assert spec.provenance.licence and spec.provenance.attribution, id_
         assert spec.provenance.date == layer.date, id_
         assert spec.options.layer == layer.options.layer, id_
@@ -105,20 +106,18 @@ def test_options_of_the_user_take_precedence():
     )
 
 
-def test_keys_come_from_the_environment_only():
+def test_keys_come_from_the_environment_only(monkeypatch):
+    monkeypatch.delenv("DATAFORSYNINGEN_TOKEN", raising=False)
     with pytest.raises(FetchError, match="environment variable DATAFORSYNINGEN_TOKEN"):
-        parse_source("dataforsyningen", ImageryOptions(), environ={})
-    spec = parse_source(
-        "dataforsyningen", ImageryOptions(), environ={"DATAFORSYNINGEN_TOKEN": "abcdef"}
-    )
+        parse_source("dataforsyningen", ImageryOptions())
+    monkeypatch.setenv("DATAFORSYNINGEN_TOKEN", "abcdef")
+    spec = parse_source("dataforsyningen", ImageryOptions())
     assert "abcdef" not in repr(spec) and spec.secrets[0].value == "abcdef"
     with pytest.raises(FetchError, match="--key-env"):
-        parse_source("wmts:https://a.example/?token={key}", ImageryOptions(), environ={})
+        parse_source("wmts:https://a.example/?token={key}", ImageryOptions())
     with pytest.raises(FetchError, match=r"needs \{key\} in the address"):
-        parse_source(
-            "wmts:https://a.example/", ImageryOptions(), key_env="K", environ={"K": "abcd"}
-        )
-    literal = parse_source("wms:https://a.example/?apikey=abcdef", ImageryOptions(), environ={})
+        parse_source("wmts:https://a.example/", ImageryOptions(), key_env="DATAFORSYNINGEN_TOKEN")
+    literal = parse_source("wms:https://a.example/?apikey=abcdef", ImageryOptions())
     assert "abcdef" not in repr(literal) and literal.url == "https://a.example/?apikey={key}"
 
 

@@ -181,7 +181,9 @@ class Agreement:
             ]
             made.append(replace(chain, log_odds=chain.log_odds - MISSED, missed=chain.missed + 1))
         # New chains come last: of two equal chains the older one comes first.
-        made += [_begun(each, time_ns) for each in places]
+        for each in places:
+            odds = min(each.log_odds, MAX_LOG_ODDS)
+            made.append(Chain(each, time_ns, odds, 1.0, odds, (each,)))
         chains = _distinct(made, side_m)
         # Subtracted from all alike: the limit must not make them equal.
         excess = max(0.0, chains[0].log_odds - MAX_CHAIN_LOG_ODDS) if chains else 0.0
@@ -219,11 +221,6 @@ class Agreement:
 def _support(place: PlaceEvidence, gain: float) -> float:
     """Nats by which a view found at an expected place supports the chain."""
     return min(place.log_odds, MAX_LOG_ODDS) + gain
-
-
-def _begun(place: PlaceEvidence, time_ns: int) -> Chain:
-    odds = min(place.log_odds, MAX_LOG_ODDS)
-    return Chain(place, time_ns, odds, 1.0, odds, (place,))
 
 
 def _extended(

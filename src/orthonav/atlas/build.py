@@ -27,7 +27,6 @@ from orthonav.atlas.sheet_tasks import (
     AtlasRequest,
     Imagery,
     SheetTask,
-    is_same,
     margin_m,
     plan_sheets,
     request_digest,
@@ -84,10 +83,9 @@ def build_atlas(
     result = BuildReport(atlas.url, len(tasks), started_s)
     missing = []
     for task in tasks:
-        name = task.sheet.id
-        if name in known and is_same(task, known):
-            area_km2 = known[name].area_km2
-            result.results.append(SheetResult(name, "unchanged", area_km2=area_km2))
+        same = known.get(task.sheet.id)
+        if same is not None and same.request == task.sheet.request:
+            result.results.append(SheetResult(same.id, "unchanged", area_km2=same.area_km2))
         else:
             missing.append(task)
     there = len(result.results)
@@ -141,14 +139,15 @@ def build_sheet(task: SheetTask) -> SheetResult:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with scratch_folder() as folder:
         built = _built(task, mosaic, folder)
+    sheet = built or wanted  # of which nothing is known yet
     return SheetResult(
         wanted.id,
         "empty" if built is None else "built",
         cpu_s=time.process_time() - cpu_s,
         wall_s=time.perf_counter() - wall_s,
-        size_bytes=built.size_bytes if built else 0,
-        area_km2=built.area_km2 if built else 0.0,
-        tiles=built.tiles if built else 0,
+        size_bytes=sheet.size_bytes,
+        area_km2=sheet.area_km2,
+        tiles=sheet.tiles,
         peak_bytes=_peak_bytes(),
     )
 

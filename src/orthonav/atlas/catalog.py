@@ -66,9 +66,10 @@ class Atlas:
         """
         store = Store(str(url))
         if store.size(CATALOG) is None:
-            if not _is_free(store):
+            if _is_free(store):
+                store.write(CATALOG, _catalog(recipe))
+            elif store.size(CATALOG) is None:  # no other process has created it meanwhile
                 raise AtlasError(f"the folder holds other files; name another: {store}")
-            store.write(CATALOG, _catalog(recipe))
         return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:
@@ -115,7 +116,8 @@ class Atlas:
         if before and before.request == described.request and before.files == stored:
             sheet = before
         else:
-            revision = 1 + max((_revision(each) for each in there), default=0)
+            revisions = [found[1] for found in map(split_name, there) if found]
+            revision = 1 + max(revisions, default=0)
             sheet = described.stored(revision, stored)
         self.require_place(sheet)
         self._upload(sheet, files, _named_by(there))
@@ -185,7 +187,7 @@ class Atlas:
         are copied in any case."""
         for key, file in sheet.files.items():
             if file.name not in named or self.store.size(file.name) != file.size_bytes:
-                self.store.put(Path(files[key]), file.name)
+                self.store.write(file.name, Path(files[key]))
 
     def _remove_items(self, names: Iterable[str], there: Mapping[str, Sheet | None]) -> None:
         """Remove some of the items of a sheet, then the files that the others do not name."""
@@ -239,12 +241,6 @@ def _is_free(store: Store) -> bool:
     if store.is_local and (folder := Path(store.url)).exists():
         names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name]
     return all(name.startswith(".") for name in names)
-
-
-def _revision(name: str) -> int:
-    """Revision in the file name of an item."""
-    found = split_name(name)
-    return found[1] if found else 0
 
 
 def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:

@@ -122,7 +122,8 @@ class RayRunner:
         running: dict[Any, Item] = {}
         try:
             while True:
-                for item in itertools.islice(waiting, max(0, self._window - len(running))):
+                most = self.at_once * (WINDOW if self._workers is None else 1)
+                for item in itertools.islice(waiting, max(0, most - len(running))):
                     running[task.remote(work, item)] = item
                 if not running:
                     return
@@ -132,10 +133,6 @@ class RayRunner:
                     yield running.pop(ref), made
         finally:
             self._stop(list(running))
-
-    @property
-    def _window(self) -> int:
-        return self.at_once if self._workers is not None else WINDOW * self.at_once
 
     def _task(self, **options: Any) -> Any:
         # Errors of an item are returned as values: Ray tries again only where a process died.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.warp import SheetSource
+from orthonav.atlas.warp import SheetSource, outline
 from orthonav.embed.whitened import CellSheet
 from orthonav.errors import AreaError, AtlasError
 from orthonav.geo.area import Area, Extent
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 MAX_TILES = 20_000
 """Tiles of an area that are checked; more are checked at even spacing."""
-EDGE_POINTS = 34
+EDGE_POINTS = 33
 """Points along an edge of a box: edges are not straight in degrees."""
 NAMED = 8
 """Missing sheets named in a message, at most."""
@@ -31,13 +31,8 @@ def box_around(area: Area, margin_m: float) -> Extent:
     """West, south, east, north in degrees of an area and a margin around it; west and east may lie
     beyond 180 degrees."""
     west, south, east, north = area.extent_en_m
-    x = np.linspace(west - margin_m, east + margin_m, EDGE_POINTS)
-    y = np.linspace(south - margin_m, north + margin_m, EDGE_POINTS)
-    edge = np.concatenate(
-        [np.stack(np.broadcast_arrays(x, each), 1) for each in (y[0], y[-1])]
-        + [np.stack(np.broadcast_arrays(each, y), 1) for each in (x[0], x[-1])]
-    )
-    lat, lon = area.frame.latlon_from_en(edge)
+    box = west - margin_m, south - margin_m, east + margin_m, north + margin_m
+    lat, lon = area.frame.latlon_from_en(outline(box, EDGE_POINTS))
     lon = lon - 360 * np.round((lon - area.frame.lon_deg) / 360)
     return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
 
@@ -79,11 +74,11 @@ def check_covered(
     """
     tiles = _some_tiles(area, grid)
     lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
-    covered = _covered(sources, lat, lon)
+    covered = np.any([source.covers(lat, lon) for source in sources], axis=0)
     if not covered.any():
         raise AreaError("no part of the area lies on a sheet of the atlas")
     route_lat, route_lon = area.frame.latlon_from_en(_route_en_m(area, grid))
-    missing = ~_covered(sources, route_lat, route_lon)
+    missing = ~np.any([source.covers(route_lat, route_lon) for source in sources], axis=0)
     under = _missing(lattice, route_lat[missing], route_lon[missing])
     elsewhere = _missing(lattice, lat[~covered], lon[~covered])
     lacks = "lies on sheets that the atlas lacks"
@@ -117,13 +112,6 @@ def _require_route(lacking: NDArray[np.bool_], lacks: str, allow_holes: bool) ->
 def _warn_area(lacking: NDArray[np.bool_], lacks: str) -> None:
     if lacking.any():
         log.warning("%.3g %% of the area %s", 100 * float(lacking.mean()), lacks)
-
-
-def _covered(sources: Sequence[SheetSource], lat: Array, lon: Array) -> NDArray[np.bool_]:
-    covered = np.zeros(len(lat), dtype=np.bool_)
-    for source in sources:
-        covered |= source.covers(lat, lon)
-    return covered
 
 
 def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:

@@ -21,10 +21,9 @@ from orthonav.atlas.warp import SheetSource, Warp, joined_cells, joined_grey
 from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, learn
-from orthonav.errors import AreaError, OutputError, VariantError
+from orthonav.errors import OutputError, VariantError
 from orthonav.files import Progress, no_progress
-from orthonav.geo.area import Area, Extent, require_one_area
-from orthonav.geo.route import Route
+from orthonav.geo.area import Area
 from orthonav.geo.world import in_box
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
@@ -51,15 +50,13 @@ COARSER = 4
 def cut_map(
     atlas: Atlas,
     out: Path,
+    area: Area,
     *,
-    route: Route | None = None,
-    band_m: float | None = None,
-    bounds_deg: Extent | None = None,
     workers: int | None = None,
     allow_holes: bool = False,
     progress: Progress = no_progress,
 ) -> BuildResult:
-    """Cut the map of a route with its band, or of bounds, and write it to `out` as a whole.
+    """Cut the map of an area, which may be the band of a route, and write it to `out` as a whole.
 
     Missing sheets under the route are an error unless `allow_holes`; other missing sheets are a
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
@@ -68,10 +65,10 @@ def cut_map(
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
-    area = _area(route, band_m, bounds_deg)
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
-    _check_out(atlas, out, cutter.members)
+    if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in cutter.members):
+        raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
     check_covered(area, cutter.grid, cutter.members, atlas.recipe.sheets, allow_holes)
     progress("sheets", 1.0)
     cutter.read(progress, workers)
@@ -144,20 +141,6 @@ class _MapCutter:
         self.cells.put(block.row, block.col, parts["means"][part], parts["share"][part])
         self.preview.put(block, parts["preview"])
         put_layer_parts(self.layer, block, parts)
-
-
-def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> Area:
-    require_one_area(route, band_m, bounds_deg)
-    if route is not None:
-        return Area.from_route(route, band_m)
-    if bounds_deg is None:
-        raise AreaError("a map is cut for a route with a search band, or for bounds: give either")
-    return Area.from_bounds(bounds_deg)
-
-
-def _check_out(atlas: Atlas, out: Path, members: Sequence[SheetSource]) -> None:
-    if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in members):
-        raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
 
 
 def _learnt(

@@ -72,10 +72,6 @@ class LocalFolder:
             found[name] = (self.path(name) if path.is_symlink() else path).read_bytes()
         return found
 
-    def get(self, name: str, path: Path) -> None:
-        """Copy a file to a local path."""
-        shutil.copyfile(self.path(name), path)
-
     def save(self, content: Path | bytes, name: str) -> None:
         """Write a file with the content of a local file, or these bytes; whole or not at all."""
         with replacing(self.path(name)) as temporary:
@@ -147,7 +143,7 @@ class RemoteFiles:
         return {name: found[path] for name, path in zip(names, paths, strict=True)}
 
     def get(self, name: str, path: Path) -> None:
-        """See `LocalFolder.get`."""
+        """Copy a file to a local path."""
         fs, far_path = self._at(name)
         fs.get_file(far_path, str(path))
 

@@ -7,7 +7,8 @@ after many changes the whole index is rebuilt.
 
 import hashlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,6 +65,8 @@ BATCH_TILES = 4096
 LEARN_PASSES = 3
 """Passes over the coarse tiles: mean and scatter of the features, sample of the vectors."""
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
+Counted = tuple[Sheet, int]
+"""A sheet and the number of its coarse tiles."""
 
 
 def make_index(
@@ -78,7 +81,10 @@ def make_index(
     sheets = indexed_sheets(atlas)
     if not sheets:
         return None
-    before = None if rebuild else _usable(atlas)
+    before = None
+    if not rebuild:
+        with suppress(AtlasError):  # a manifest that is damaged or of another schema
+            before = read_manifest(atlas)
     with tempfile.TemporaryDirectory(prefix="orthonav-index-") as name:
         builder = _IndexBuilder(atlas, Path(name), progress)
         if before is None:
@@ -96,14 +102,6 @@ def make_index(
         return builder.build(list(sheets.values()))
 
 
-def _usable(atlas: Atlas) -> IndexManifest | None:
-    """The present manifest; None for one that is damaged or of another schema."""
-    try:
-        return read_manifest(atlas)
-    except AtlasError:
-        return None
-
-
 class _IndexBuilder:
     """Builds an index in a local folder and puts it into the atlas."""
 
@@ -112,8 +110,8 @@ class _IndexBuilder:
 
     def build(self, sheets: Sequence[Sheet]) -> IndexManifest:
         """The index of these sheets."""
-        counts = self._counts(sheets)
-        total = sum(counts)
+        counted = self._counted(sheets)
+        total = sum(count for _, count in counted)
         if total < MIN_TILES:
             raise AtlasError(
                 f"the atlas has {total} coarse tiles with imagery, too few for an index; build it "
@@ -121,8 +119,7 @@ class _IndexBuilder:
             )
         embedder, quantizers = self._learnt(sheets, total)
         empty = IndexManifest(quantizers.recipe, (), {})
-        rows = {sheet.id: count for sheet, count in zip(sheets, counts, strict=True)}
-        return self._extended(empty, embedder, quantizers, _groups(sheets, counts), rows)
+        return self._extended(empty, embedder, quantizers, _groups(counted))
 
     def _learnt(self, sheets: Sequence[Sheet], total: int) -> tuple[WhitenedEmbedder, Quantizers]:
         """Whitening and quantizers of an index of `total` tiles, written to the folder."""
@@ -160,39 +157,37 @@ class _IndexBuilder:
             for shard in before.shards
         )
         left = replace(before, shards=shards)
-        rows = {sheet.id: count for sheet, count in zip(new, self._counts(new), strict=True)}
-        return self._extended(left, embedder, quantizers, [new] if new else [], rows)
+        groups = [self._counted(new)] if new else []
+        return self._extended(left, embedder, quantizers, groups)
 
     def _extended(
         self,
         index: IndexManifest,
         embedder: WhitenedEmbedder,
         quantizers: Quantizers,
-        groups: Sequence[Sequence[Sheet]],
-        counts: Mapping[str, int],
+        groups: Sequence[Sequence[Counted]],
     ) -> IndexManifest:
         """The index with a further shard for each group of sheets, put into the atlas: the manifest
-        after the files; then files that are not used any more are removed.
-
-        `counts`: tiles of each sheet, by its id.
-        """
+        after the files; then files that are not used any more are removed."""
         shards, files, store = list(index.shards), dict(index.files), self._atlas.store
         shares = _shares(sum(map(len, groups)))
         for group in groups:
             base = shards[-1].base + shards[-1].rows if shards else 0
-            digests = [sheet.files["coarse"].sha256 for sheet in group]
+            digests = [sheet.files["coarse"].sha256 for sheet, _ in group]
             content = hashlib.sha256("".join([quantizers.digest, *digests]).encode()).hexdigest()
             name = f"shard-{base:012d}-{content[:12]}"
-            tiles = self._tiles(group, "index", shares)
+            tiles = self._tiles([sheet for sheet, _ in group], "index", shares)
             rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
             write_shard(self._folder, name, quantizers, rows)
-            ids = [sheet.id for sheet in group]
-            parts = tuple(map(Part, ids, digests, [counts[each] for each in ids]))
-            shards.append(ShardInfo(name, base, parts))
+            parts = [
+                Part(sheet.id, digest, count)
+                for (sheet, count), digest in zip(group, digests, strict=True)
+            ]
+            shards.append(ShardInfo(name, base, tuple(parts)))
         for path in sorted(self._folder.iterdir()):
             name = f"{FOLDER}/{path.name}"
             files[path.name] = StoredFile(name, path.stat().st_size, digest_of(path))
-            store.put(path, name)
+            store.write(name, path)
         manifest = IndexManifest(quantizers.recipe, tuple(shards), files)
         store.write(MANIFEST, manifest.to_json())
         used = {MANIFEST, *(file.name for file in files.values())}
@@ -201,8 +196,8 @@ class _IndexBuilder:
                 store.remove(f"{FOLDER}/{name}")
         return manifest
 
-    def _counts(self, sheets: Sequence[Sheet]) -> list[int]:
-        return [tile_count(self._atlas.path(sheet, "coarse")) for sheet in sheets]
+    def _counted(self, sheets: Sequence[Sheet]) -> list[Counted]:
+        return [(sheet, tile_count(self._atlas.path(sheet, "coarse"))) for sheet in sheets]
 
     def _tiles(
         self, sheets: Sequence[Sheet], stage: str, shares: Iterator[float], step: int = 1
@@ -224,15 +219,15 @@ def _shares(count: int) -> Iterator[float]:
     return (number / count for number in range(1, count + 1))
 
 
-def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[list[Sheet]]:
+def _groups(counted: Sequence[Counted]) -> list[list[Counted]]:
     """The sheets of each shard, of about `SHARD_ROWS` rows at most."""
-    groups: list[list[Sheet]] = [[]]
+    groups: list[list[Counted]] = [[]]
     rows = 0
-    for sheet, count in zip(sheets, counts, strict=True):
+    for sheet, count in counted:
         if groups[-1] and rows + count > SHARD_ROWS:
             groups.append([])
             rows = 0
-        groups[-1].append(sheet)
+        groups[-1].append((sheet, count))
         rows += count
     return groups
 

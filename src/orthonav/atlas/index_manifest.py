@@ -89,14 +89,7 @@ class IndexManifest:
 
     def to_json(self) -> bytes:
         """Canonical JSON."""
-        plain = {
-            "format": FORMAT,
-            "schema": SCHEMA,
-            "recipe": asdict(self.recipe),
-            "shards": [asdict(shard) for shard in self.shards],
-            "files": {name: asdict(file) for name, file in sorted(self.files.items())},
-        }
-        return canonical(plain) + b"\n"
+        return canonical({"format": FORMAT, "schema": SCHEMA, **asdict(self)}) + b"\n"
 
     @classmethod
     def from_json(cls, data: bytes) -> "IndexManifest":

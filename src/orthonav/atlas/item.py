@@ -231,10 +231,10 @@ def item_name(sheet_id: str, revision: int, data: bytes) -> str:
     return f"{sheet_id}.{revision:04d}.{hashlib.sha256(data).hexdigest()[:12]}.json"
 
 
-def split_name(name: str) -> tuple[str, int, str] | None:
-    """Sheet, revision and digest in the file name of an item; None for any other file."""
+def split_name(name: str) -> tuple[str, int] | None:
+    """Sheet and revision in the file name of an item; None for any other file."""
     match = _ITEM_NAME.fullmatch(name)
-    return (match.group(1), int(match.group(2)), match.group(3)) if match else None
+    return (match.group(1), int(match.group(2))) if match else None
 
 
 def read_item(name: str, data: bytes, plain: Any = None) -> Sheet:

@@ -244,16 +244,12 @@ def _rotation(vectors: Array, groups: int) -> Array:
     weight = np.zeros(groups)
     logs = np.log(np.maximum(variances, 1e-9 * variances[0]))
     logs -= logs.min() - 1e-3
+    # The two halves are balanced as well: groups are filled from either half in turn.
+    in_turn = np.arange(groups).reshape(2, -1).T.ravel().tolist()
     for axis, log in enumerate(logs):
-        open_groups = [group for group in range(groups) if len(assigned[group]) < room]
-        # The two halves are balanced as well: groups are filled from either half in turn.
-        least = min(open_groups, key=lambda group: (weight[group], _interleaved(group, groups)))
+        open_groups = [group for group in in_turn if len(assigned[group]) < room]
+        least = min(open_groups, key=weight.__getitem__)
         assigned[least].append(axis)
         weight[least] += log
     order = [axis for group in assigned for axis in group]
     return np.ascontiguousarray(axes[:, order], dtype=np.float32)
-
-
-def _interleaved(group: int, groups: int) -> int:
-    half = groups // 2
-    return 2 * group if group < half else 2 * (group - half) + 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.atlas.coarse import coarse_grid
-from orthonav.atlas.coverage import box_around, turned
+from orthonav.atlas.coverage import box_around, box_deg, turned
 from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
@@ -115,12 +115,12 @@ def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> l
     made_by, terrain = versions(), (request.dem, request.dem_datum)
     tasks = []
     for name in names:
-        box_deg = recipe.sheets.bounds_deg(name)
-        _require_possible(recipe, box_deg, mosaic.gsd_m)
-        part = imagery.under(box_deg, margin_m(recipe))
+        bounds_deg = recipe.sheets.bounds_deg(name)
+        _require_possible(recipe, bounds_deg, mosaic.gsd_m)
+        part = imagery.under(bounds_deg, margin_m(recipe))
         sheet = Sheet(
             id=name,
-            bounds_deg=box_deg,
+            bounds_deg=bounds_deg,
             gsd_m=recipe.gsd_m,
             tiles=0,
             area_km2=0.0,
@@ -225,22 +225,19 @@ def _along(
     world = recipe.sheets
     for part in sheets_of_route(route, band_m):
         area = Area.from_route(part, band_m)
-        west, south, east, north = box_around(area, 0.0)
-        first = turned(west)
-        for name in there.intersection(world.over((first, south, first + east - west, north))):
-            box_deg = world.bounds_deg(name)
+        for name in there.intersection(world.over(box_deg(area, 0.0))):
+            west, south, east, north = world.bounds_deg(name)
             lon, lat = np.meshgrid(
-                np.linspace(box_deg[0], box_deg[2], _POINTS),
-                np.linspace(box_deg[1], box_deg[3], _POINTS),
+                np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS)
             )
             points = area.frame.en_from_latlon(lat.ravel(), lon.ravel())
             if area.contains(points, world.side_m / (_POINTS - 1) * math.sqrt(0.5)).any():
                 yield name
 
 
-def _overlap(box_deg: Extent, other: Extent) -> bool:
+def _overlap(bounds_deg: Extent, other: Extent) -> bool:
     """Whether two boxes share more than an edge."""
-    west, south, east, north = box_deg
+    west, south, east, north = bounds_deg
     shift = 360 * round(((other[0] + other[2]) / 2 - (west + east) / 2) / 360)
     across = min(east + shift, other[2]) - max(west + shift, other[0])
     return across > TOUCH_DEG and min(north, other[3]) - max(south, other[1]) > TOUCH_DEG
@@ -277,7 +274,8 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
     """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
-    other = [task.sheet for task in tasks if not is_same(task, known)]
+    sheets = [task.sheet for task in tasks if task.sheet.id in known]
+    other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
     if not other:
         return
     why = sorted(
@@ -293,9 +291,3 @@ def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None
         f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
         f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
     )
-
-
-def is_same(task: SheetTask, known: Mapping[str, Sheet]) -> bool:
-    """Whether the sheet of a task is not in the atlas, or is there as the task would make it."""
-    there = known.get(task.sheet.id)
-    return there is None or there.request == task.sheet.request

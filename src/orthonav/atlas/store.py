@@ -13,7 +13,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -111,32 +111,35 @@ class Store:
             return self._files.read([checked_name(name) for name in names])
 
     def fetch(self, name: str, size: int, sha256: str) -> Path:
-        """A local file with that content, verified once: the file itself or a cached copy."""
+        """A local file with that content, verified once: the file itself or a cached copy.
+
+        Several processes may use the cache at the same time.
+        """
         if self.is_local:
             return self._verified_path(name, size, sha256)
-
-        def fill(path: Path) -> None:
+        folder, limit_bytes = cache_folder(), cache_limit_bytes()
+        path = folder / sha256[:2] / f"{sha256}{Path(checked_name(name)).suffix}"
+        with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
+            if path.is_file() and path.stat().st_size == size:
+                os.utime(path)  # last used now
+                return path
             with replacing(path) as temporary:
                 self.download(name, temporary)
                 _require(temporary, size, sha256, self.shown(name))
-
-        file = f"{sha256}{Path(checked_name(name)).suffix}"
-        return cached(file, size, fill)
+            _shrink(folder, limit_bytes, path)
+        return path
 
     def download(self, name: str, path: Path) -> None:
-        """Copy a file of the atlas to `path`, not verified."""
+        """Copy a file of a remote atlas to `path`, not verified."""
         with storage_errors(self.shown(name), f"copy from the atlas to {path.parent}"):
-            self._files.get(checked_name(name), path)
+            name = checked_name(name)
+            assert isinstance(self._files, RemoteFiles)
+            self._files.get(name, path)
 
-    def put(self, path: Path, name: str) -> None:
-        """Copy a local file into the atlas, whole or not at all."""
+    def write(self, name: str, content: Path | bytes) -> None:
+        """Write a file, a copy of a local one or these bytes, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.save(path, checked_name(name))
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write a small file, whole or not at all."""
-        with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.save(data, checked_name(name))
+            self._files.save(content, checked_name(name))
 
     def remove(self, name: str) -> None:
         """Remove a file if it exists."""
@@ -202,22 +205,6 @@ def cache_limit_bytes() -> int:
         return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
     except (ValueError, OverflowError) as error:
         raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
-
-
-def cached(name: str, size: int, fill: Callable[[Path], None]) -> Path:
-    """The file of the cache that is named by its SHA-256; if missing, `fill` writes it, verified.
-
-    Several processes may use a cache at the same time.
-    """
-    folder, limit_bytes = cache_folder(), cache_limit_bytes()
-    path = folder / name[:2] / name
-    with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
-        if path.is_file() and path.stat().st_size == size:
-            os.utime(path)  # last used now
-            return path
-        fill(path)
-        _shrink(folder, limit_bytes, path)
-    return path
 
 
 def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:

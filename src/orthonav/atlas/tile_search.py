@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav import represent
-from orthonav.atlas.agreement import Placement
+from orthonav.atlas.agreement import Placement, nearest_m
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coarse import EDGES
 from orthonav.atlas.index import WHITENING_NAME, half_whitened, index_file, load_whitening
@@ -16,7 +15,6 @@ from orthonav.atlas.index_shards import ShardedIndex
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.embed.bank import embed_poses
 from orthonav.errors import AtlasError
-from orthonav.geo.frames import distances_m
 from orthonav.localizer.rectify import RectifiedView
 from orthonav.variants import make_variant
 
@@ -89,22 +87,13 @@ class TileSearch:
         order = np.argsort(-flat_scores, kind="stable")
         apart_m = APART_STRIDES * self.recipe.tile_m * (1 - self.recipe.overlap)
         found: list[Placement] = []
-        taken = np.zeros((count, 2))
         for at in order[np.isfinite(flat_scores[order])].tolist():
             place = self._index.place_deg(int(flat_ids[at]))
             if place is None or abs(place[0]) > MAX_LAT_DEG or abs(place[1]) > 180:
                 continue
-            if found and _nearest_m(place, taken[: len(found)]) < apart_m:
+            if nearest_m(place, [each.latlon_deg for each in found]) < apart_m:
                 continue
-            taken[len(found)] = place
             found.append(Placement(*place, *poses[int(pose_of[at])]))
             if len(found) == count:
                 break
         return found
-
-
-def _nearest_m(place: tuple[float, float], others: NDArray[np.float64]) -> float:
-    """Distance to the nearest of places (N, 2); infinite where all are a degree away or more."""
-    if np.abs(others[:, 0] - place[0]).min() > 1.0:
-        return float("inf")
-    return float(distances_m([place] * len(others), others).min())

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import TypeVar
 
 import cv2
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from orthonav.atlas.item import Sheet
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AtlasError, MapFileError
+from orthonav.geo.area import Extent
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.mapfile.layer import GreyLayer
@@ -29,7 +31,7 @@ from orthonav.represent.gradients import HARMONICS
 
 KERNEL_PX = 3
 """Margin of cubic interpolation, 2 pixels, and one more for rounding."""
-EDGE_POINTS = 17
+EDGE_POINTS = 16
 """Points along an edge of a box, which is not straight in another plane."""
 FILL_PX = 5
 """Pixels by which imagery is extended beyond its edge: the kernel of cubic interpolation."""
@@ -70,17 +72,6 @@ class SheetSource:
         px = _px_from_latlon(self.frame, self.grid, lat_deg, lon_deg)
         return np.asarray(((px >= 0) & (px <= [self.grid.width_px, self.grid.height_px])).all(-1))
 
-    def outline_deg(self) -> tuple[Array, Array]:
-        """Latitudes and longitudes of points around its box."""
-        west, south, east, north = self.sheet.bounds_deg
-        share = np.linspace(0, 1, EDGE_POINTS)[:-1]
-        lon, lat = west + (east - west) * share, south + (north - south) * share
-        fixed = np.ones(len(share))
-        return (
-            np.concatenate([fixed * south, lat, fixed * north, lat[::-1] + lat[1] - lat[0]]),
-            np.concatenate([lon, fixed * east, lon[::-1] + lon[1] - lon[0], fixed * west]),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Warp:
@@ -106,7 +97,8 @@ class Warp:
         """Affine (2, 3) from pixels of the grid to pixels of the sheet (pixel-is-area), fitted to
         the corners of a block."""
         corners = _corners(block)
-        there = self._source_px(corners)
+        places = _latlon_from_px(self.frame, self.grid, corners)
+        there = _px_from_latlon(self.source.frame, self.source.grid, *places)
         design = np.column_stack([corners - corners[0], np.ones(len(corners))])
         solved = np.linalg.lstsq(design, there, rcond=None)[0].T
         solved[:, 2] -= solved[:, :2] @ corners[0]
@@ -173,15 +165,11 @@ class Warp:
                 f"sheet {self.source.sheet.id} is damaged, rebuild it ({error})"
             ) from error
 
-    def _source_px(self, target_px: Array) -> Array:
-        """Pixels (N, 2), column and row, of the sheet at pixels of the grid."""
-        places = _latlon_from_px(self.frame, self.grid, target_px)
-        return _px_from_latlon(self.source.frame, self.source.grid, *places)
-
     @cached_property
     def _outline_px(self) -> Array:
         """The box of the sheet in pixels of the grid."""
-        return _px_from_latlon(self.frame, self.grid, *self.source.outline_deg())
+        lon, lat = outline(self.source.sheet.bounds_deg, EDGE_POINTS).T
+        return _px_from_latlon(self.frame, self.grid, lat, lon)
 
     @cached_property
     def _box_px(self) -> tuple[float, float, float, float]:
@@ -192,6 +180,14 @@ class Warp:
         points = _px_from_latlon(self.frame, self.grid, *places)
         (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
         return left - 1, top - 1, right + 1, bottom + 1
+
+
+def outline(box: Extent, points: int) -> Array:
+    """Points (4 * points, 2), x and y, around a box (west, south, east, north) from its corner."""
+    west, south, east, north = box
+    corners = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
+    share = np.arange(points)[:, None] / points
+    return np.concatenate([start + (end - start) * share for start, end in pairwise(corners)])
 
 
 def _px_from_latlon(frame: LocalFrame, grid: TileGrid, lat_deg: Array, lon_deg: Array) -> Array:

@@ -29,9 +29,9 @@ def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
     ]
 
 
-def envelope_of(trials: Sequence[Sequence[Trial]], accept: float, radius_m: float) -> Envelope:
+def envelope_of(trials: Sequence[Sequence[Trial]]) -> Envelope:
     """The envelope from the trials of `envelope_work`."""
-    shares = [accepted_share(each, accept, radius_m) for each in trials]
+    shares = [right_share(each) for each in trials]
     share = np.array(shares, np.float64).reshape(len(YAW_OFF_DEG), len(AGL_OFF))
     middle = AGL_OFF.index(0.0)
     tolerated = (share >= TOLERATED * share[0, middle]) & (share > 0)
@@ -52,21 +52,16 @@ def heights_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
 
 
 def heights_of(
-    plan: TrialPlan,
-    planned: Sequence[Trial],
-    others: Sequence[Sequence[Trial]],
-    accept: float,
-    radius_m: float,
+    plan: TrialPlan, planned: Sequence[Trial], others: Sequence[Sequence[Trial]]
 ) -> tuple[Alternative, ...]:
     """Alternatives from `planned` trials at `plan.agl_m` and those of `heights_work`, by height."""
     tried = sorted({1.0: planned, **dict(zip(HEIGHTS, others, strict=True))}.items())
     return tuple(
-        Alternative("agl_m", plan.agl_m * part, accepted_share(each, accept, radius_m), part == 1.0)
+        Alternative("agl_m", plan.agl_m * part, right_share(each), part == 1.0)
         for part, each in tried
     )
 
 
-def accepted_share(trials: Sequence[Trial], accept: float, radius_m: float) -> float:
+def right_share(trials: Sequence[Trial]) -> float:
     """Share of trials that were confident and correct; NaN without trials."""
-    accepted = [each.confidence >= accept and each.error_m <= radius_m for each in trials]
-    return float(np.mean(accepted)) if accepted else float("nan")
+    return float(np.mean([each.right for each in trials])) if trials else float("nan")

@@ -6,7 +6,7 @@ the regression counts as `PRIOR_TRIALS` trials.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +57,6 @@ class Predictor:
         self,
         trials: Sequence[Trial],
         *,
-        radius_m: float,
-        accept: float,
         view_side_m: float,
         spacing_m: float,
         other_date: Sequence[Trial] = (),
@@ -76,9 +74,8 @@ class Predictor:
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
         self._error = np.array([each.error_m for each in every], np.float64)
-        confident = np.array([each.confidence >= accept for each in every], np.bool_)
-        near = np.nan_to_num(self._error, nan=np.inf) <= radius_m
-        self.right, self.wrong = confident & near, confident & ~near
+        self.right = np.array([each.right for each in every], np.bool_)
+        self.wrong = np.array([each.wrong for each in every], np.bool_)
         self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
         self._bandwidth_m = max(BANDWIDTH_VIEWS * view_side_m, BANDWIDTH_SPACINGS * spacing_m)
         self._least_error_m = least_error_m
@@ -110,9 +107,8 @@ class Predictor:
         """Predictions at places (N, 2)."""
         chunk = max(1, _PAIRS_AT_ONCE // max(len(self._points), 1))
         starts = range(0, max(len(points_en_m), 1), chunk)
-        parts = [self._part(points_en_m[start : start + chunk]) for start in starts]
-        names = [field.name for field in fields(Prediction)]
-        return Prediction(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+        parts = [vars(self._part(points_en_m[start : start + chunk])) for start in starts]
+        return Prediction(*(np.concatenate([part[name] for part in parts]) for name in parts[0]))
 
     def _part(self, points: Array) -> Prediction:
         from scipy.stats import beta

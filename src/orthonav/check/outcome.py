@@ -30,19 +30,11 @@ class Word(Enum):
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions that a check assumes; defaults are those of `CheckRequest`.
+    """The conditions that a check assumes; fields that are not listed are those of `CheckRequest`.
 
     `width_m`, `height_m`: footprint of a vertical view on the ground.
-    `agl_m`: height above ground.
-    `yaw_std_deg`: standard deviation of the reported heading; None: heading unknown.
-    `agl_std`: standard deviation of the reported height, as a share of the height.
-    `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
-    `accept`: confidence from which a fix counts as confident, 0 to 1.
+    `agl_m`: height above ground, known here.
     `radius_m`: largest error of a correct fix, from the map.
-    `speed_mps`: ground speed.
-    `drift`: error of dead reckoning in metres per metre flown without a fix.
-    `tilt_std_deg`: standard deviation of the tilt that is not reported.
-    `other_sensor`: the camera differs from the map's sensor by more than years do.
     """
 
     width_m: float

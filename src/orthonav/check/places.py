@@ -150,26 +150,11 @@ class MapCoverage:
         return float(self.valid.sum()) * self.pixels.side_m**2
 
 
-def checked_extent(coverage: MapCoverage, area: Area | None) -> Extent:
-    """Extent of the check: the band of a route, beyond the map too, or all imagery of the map.
+def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
+    """Area of the map's imagery within `area`, the band of a route; all of it without one.
 
     Raises `AreaError` where the band does not touch the imagery.
     """
-    if area is None:
-        return coverage.extent_en_m
-    if not checked_m2(coverage, area):
-        west, south, east, north = coverage.extent_en_m
-        left, below, right, above = area.extent_en_m
-        far_m = math.hypot(max(left - east, west - right, 0), max(below - north, south - above, 0))
-        raise AreaError(
-            f"the band of the route does not touch the map, {far_m / 1000:,.1f} km from it; give "
-            "the map of this route, and check that latitude and longitude are not swapped"
-        )
-    return area.extent_en_m
-
-
-def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
-    """Area of the map's imagery within `area`; all of it without one."""
     if area is None:
         return coverage.area_m2
     west, south, east, north = area.extent_en_m
@@ -178,7 +163,15 @@ def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
         side_m = min(side_m, min(area.route.bands_m(area.band_m) or (1.0,)) / _PROBES_PER_BAND)
     side_m = max(side_m, math.sqrt((east - west) * (north - south) / _MAX_POINTS))
     points = CellGrid.over(area.extent_en_m, side_m).centres_en_m
-    return float((area.contains(points) & coverage.covers(points)).sum()) * side_m**2
+    count = np.count_nonzero(area.contains(points) & coverage.covers(points))
+    if not count:
+        left, below, right, above = coverage.extent_en_m
+        far_m = math.hypot(max(west - right, left - east, 0), max(south - above, below - north, 0))
+        raise AreaError(
+            f"the band of the route does not touch the map, {far_m / 1000:,.1f} km from it; give "
+            "the map of this route, and check that latitude and longitude are not swapped"
+        )
+    return float(count) * side_m**2
 
 
 def cell_side_m(area_m2: float, view_side_m: float) -> float:
@@ -190,12 +183,12 @@ def trial_places(
     coverage: MapCoverage,
     area: Area | None,
     extent: Extent,
+    wanted_m2: float,
     view_side_m: float,
     effort: float,
     rng: np.random.Generator,
 ) -> Array:
-    """Places (N, 2) of trials, spread evenly at random over the checked imagery."""
-    wanted_m2 = checked_m2(coverage, area)
+    """Places (N, 2) of trials, spread evenly at random over `wanted_m2` of checked imagery."""
     per_view = wanted_m2 / view_side_m**2
     count = min(max(TRIALS_PER_VIEW * per_view, MIN_TRIALS), MAX_TRIALS) * effort
     side_m = math.sqrt(wanted_m2 / max(count, FEWEST_TRIALS))

@@ -1,9 +1,9 @@
 """The check of a map: trials, predictions for all of it and along a route, verdict."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import fields, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from orthonav.check.envelope import (
 )
 from orthonav.check.estimate import Prediction, Predictor
 from orthonav.check.lookalikes import found_lookalikes
-from orthonav.check.ortho import require_overlap
 from orthonav.check.outcome import (
     Along,
     Alternative,
@@ -29,16 +28,14 @@ from orthonav.check.places import (
     CellGrid,
     MapCoverage,
     cell_side_m,
-    checked_extent,
     checked_m2,
     trial_places,
 )
-from orthonav.check.recalibrate import Recalibration
 from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
 from orthonav.check.trials import Trial, registration_of, run_many
-from orthonav.check.verdict import Findings, verdict_of
-from orthonav.check.views import MIN_VALID, TrialPlan
+from orthonav.check.verdict import verdict_of
+from orthonav.check.views import MIN_VALID, TrialPlan, require_overlap
 from orthonav.cores import usable_cores
 from orthonav.errors import AreaError, CameraError, MapFileError
 from orthonav.files import Progress, no_progress
@@ -106,27 +103,18 @@ class _Check:
             request.tilt_std_deg,
             request.other_sensor,
         )
+        self.bands_m = self._leg_bands_m()
         self.area = self._area()
         if request.other_date is not None:
             require_overlap(request.other_date, self.sheet)
-        self.extent = checked_extent(self.coverage, self.area)
+        self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
+        self.checked_m2 = checked_m2(self.coverage, self.area)
 
     def _plan(self) -> TrialPlan:
-        request, camera = self.request, self.request.camera
-        agl_m = request.agl_m
+        request, agl_m = self.request, self.request.agl_m
         if agl_m is None:
-            agl_m = self.sheet.grid.tile_m / min(camera.extent)
-        plan = TrialPlan(
-            request.map_path,
-            camera,
-            agl_m,
-            request.yaw_std_deg,
-            request.agl_std,
-            request.prior_std_m,
-            request.relief_m,
-            request.seed,
-            changes=request.changes,
-        )
+            agl_m = self.sheet.grid.tile_m / min(request.camera.extent)
+        plan = TrialPlan(request, agl_m)
         short_m, long_m = sorted((plan.width_m, plan.height_m))
         if long_m > MAX_ASPECT * short_m:
             raise CameraError(
@@ -140,60 +128,43 @@ class _Check:
             )
         return plan
 
-    @property
-    def _band_m(self) -> float | None:
-        """Width of the band for legs without one."""
-        request = self.request
-        if request.route is None or request.band_m is not None:
-            return request.band_m
-        if request.prior_std_m is None:
-            return BAND_PRIORS * self.plan.side_m
-        return max(BAND_PRIORS * request.prior_std_m, MIN_BAND_VIEWS * self.plan.side_m)
-
-    @cached_property
     def _leg_bands_m(self) -> tuple[float, ...]:
-        """Width of the band of every leg of the route."""
-        route = self.request.route
-        return () if route is None else route.bands_m(self._band_m) or ()
+        """Width of the band of every leg of the route, which is validated."""
+        route, band_m, prior_std_m = (
+            self.request.route,
+            self.request.band_m,
+            self.request.prior_std_m,
+        )
+        if route is None:
+            return ()
+        if band_m is None:
+            priors = BAND_PRIORS * (self.plan.side_m if prior_std_m is None else prior_std_m)
+            band_m = max(priors, MIN_BAND_VIEWS * self.plan.side_m)
+        Area.from_route(route, band_m)
+        return route.bands_m(band_m) or ()
 
     def _area(self) -> Area | None:
         """The band of the route in the plane of the map."""
         route = self.request.route
         if route is None:
             return None
-        Area.from_route(route, self._band_m)  # validates the route
         line = route.points_en_m(self.sheet.frame)
-        min_m = MIN_BAND_VIEWS * self.plan.side_m
-        bands_m = tuple(max(each, min_m) for each in self._leg_bands_m)
+        bands_m = tuple(max(each, MIN_BAND_VIEWS * self.plan.side_m) for each in self.bands_m)
         half = max(bands_m) / 2
         (west, south), (east, north) = line.min(axis=0) - half, line.max(axis=0) + half
         extent = (float(west), float(south), float(east), float(north))
         return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
 
-    @cached_property
-    def _checked_m2(self) -> float:
-        return checked_m2(self.coverage, self.area)
-
     def result(self) -> CheckResult:
         """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
-        lasting = self.coverage.without(request.changes, self.sheet.frame)
-        places = trial_places(self.coverage, self.area, self.extent, side_m, request.effort, rng)
+        places = trial_places(
+            self.coverage, self.area, self.extent, self.checked_m2, side_m, request.effort, rng
+        )
         own, other = self._trials(places)
         envelope, heights = self._extra_trials(own, rng) if request.extras else (None, [])
-        predictor = Predictor(
-            own,
-            radius_m=self.radius_m,
-            accept=request.accept,
-            view_side_m=side_m,
-            spacing_m=math.sqrt(self._checked_m2 / max(len(own), 1)),
-            other_date=other,
-            least_error_m=self._least_error_m,
-            coverage=lambda points: lasting.seen_share(points, side_m),
-            recalibrated=self._recalibrated,
-            scenes_std=self._recalibration.std,
-        )
+        predictor = self._predictor(own, other)
         cells = self._cells(predictor, own)
         along = self._along(predictor)
         outside = 0.0
@@ -204,8 +175,18 @@ class _Check:
             float(each[known].mean()) if known.any() else 0.0
             for each in (cells.probability, cells.low, cells.changed)
         )
-        findings = Findings(
-            conditions=self.conditions,
+        stretches = () if along is None else blind_stretches(along, self.conditions, side_m)
+        lookalikes = found_lookalikes(
+            [*own, *other],
+            self.sheet.frame,
+            view_side_m=side_m,
+            radius_m=self.radius_m,
+            prior_std_m=request.prior_std_m,
+        )
+        verdict = verdict_of(
+            along,
+            stretches,
+            lookalikes,
             mean=mean if along is None else float(along.probability.mean()),
             low=low if along is None else float(along.low.mean()),
             calibrated=self.calibrated,
@@ -213,15 +194,7 @@ class _Check:
             trials=len(own) + len(other),
             outside=outside,
             changed=changed,
-            along=along,
-            stretches=() if along is None else blind_stretches(along, self.conditions, side_m),
-            lookalikes=found_lookalikes(
-                [*own, *other],
-                self.sheet.frame,
-                view_side_m=side_m,
-                radius_m=self.radius_m,
-                prior_std_m=request.prior_std_m,
-            ),
+            allowed_m=request.prior_std_m,
         )
         route = request.route
         return CheckResult(
@@ -229,30 +202,39 @@ class _Check:
             conditions=self.conditions,
             frame=self.sheet.frame,
             cells=cells,
-            verdict=verdict_of(findings),
+            verdict=verdict,
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
             mean=mean,
             second_date=bool(other),
             along=along,
             route_en_m=None if route is None else route.points_en_m(self.sheet.frame),
             band_m=None if self.area is None else self.area.band_m,
-            stretches=findings.stretches,
-            lookalikes=findings.lookalikes,
+            stretches=stretches,
+            lookalikes=lookalikes,
             envelope=envelope,
             alternatives=self._alternatives(heights, own, cells),
         )
 
-    @property
-    def _recalibration(self) -> Recalibration:
-        found = self.request.recalibration
-        return found.other_sensor() if self.request.other_sensor else found
-
-    def _recalibrated(self, share: Array) -> Array:
-        """Predicted shares (N,) from those of trials; a second date needs no recalibration."""
-        if self.request.other_date is not None:
-            return share
-        view_px = self.plan.side_m / self.sheet.grid.gsd_m
-        return self._recalibration(share, view_px, self.request.prior_std_m is not None)
+    def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
+        request, side_m = self.request, self.plan.side_m
+        lasting = self.coverage.without(request.changes, self.sheet.frame)
+        recalibration = request.recalibration
+        if request.other_sensor:
+            recalibration = recalibration.other_sensor()
+        recalibrated: Callable[[Array], Array] = np.asarray  # a second date needs no recalibration
+        if request.other_date is None:
+            view_px, has_prior = side_m / self.sheet.grid.gsd_m, request.prior_std_m is not None
+            recalibrated = partial(recalibration, view_px=view_px, has_prior=has_prior)
+        return Predictor(
+            own,
+            view_side_m=side_m,
+            spacing_m=math.sqrt(self.checked_m2 / max(len(own), 1)),
+            other_date=other,
+            least_error_m=self._least_error_m,
+            coverage=lambda points: lasting.seen_share(points, side_m),
+            recalibrated=recalibrated,
+            scenes_std=recalibration.std,
+        )
 
     @property
     def _least_error_m(self) -> float:
@@ -271,7 +253,7 @@ class _Check:
         other_date, plan = self.request.other_date, self.plan
         work = [(plan, places)]
         if other_date is not None:
-            work.append((replace(plan, other_path=other_date, seed=plan.seed + 1), places))
+            work.append((replace(plan, second_date=True), places))
         own, *others = run_many(work, self.workers, lambda share: self.progress("trials", share))
         if len(own) < MIN_VIEWS:
             raise AreaError(
@@ -288,9 +270,8 @@ class _Check:
         self, own: Sequence[Trial], rng: np.random.Generator
     ) -> tuple[Envelope | None, list[list[Trial]]]:
         """The envelope of errors, and trials from other heights."""
-        accept, radius_m = self.request.accept, self.radius_m
         # Where views are not placed, errors of heading and height make no difference.
-        placed = [t.en_m for t in own if t.confidence >= accept and t.error_m <= radius_m]
+        placed = [each.en_m for each in own if each.right]
         order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
         exact = np.array([placed[i] for i in order], np.float64).reshape(-1, 2)
         places = np.array([each.en_m for each in own])
@@ -301,7 +282,7 @@ class _Check:
             self.workers,
             lambda share: self.progress("envelope", share),
         )
-        envelope = envelope_of(found[: len(errors)], accept, radius_m) if errors else None
+        envelope = envelope_of(found[: len(errors)]) if errors else None
         return envelope, found[len(errors) :]
 
     def _predict(
@@ -319,7 +300,7 @@ class _Check:
         around_m2 = (east - west) * (north - south)
         side_m = cell_side_m(around_m2, self.plan.side_m)
         if self.area is not None:
-            side_m = cell_side_m(self._checked_m2, self.plan.side_m)
+            side_m = cell_side_m(self.checked_m2, self.plan.side_m)
             side_m = max(side_m, math.sqrt(around_m2 / MAX_CELLS_AROUND))
         grid = CellGrid.over(self.extent, side_m)
         points = grid.centres_en_m
@@ -330,11 +311,9 @@ class _Check:
             narrowest_m = min(bands_m or (0.0,))
             here = self.area.contains(points, max(0.0, (side_m - narrowest_m) / 2))
         found = self._predict(predictor, points[here], covered[here])
-        columns = {}
-        for each in fields(found):
-            whole = np.full(len(points), np.nan)
-            whole[here] = getattr(found, each.name)
-            columns[each.name] = whole.reshape(grid.rows, grid.cols)
+        columns = {name: np.full((grid.rows, grid.cols), np.nan) for name in vars(found)}
+        for name, values in vars(found).items():
+            columns[name].ravel()[here] = values
         columns["changed"] = self._changed(grid)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
@@ -355,31 +334,28 @@ class _Check:
             return self._predict(predictor, points, self.coverage.covers(points))
 
         side_m = self.plan.side_m
-        return predicted_along(self.area, self._leg_bands_m, side_m, self.conditions, predict)
+        return predicted_along(self.area, self.bands_m, side_m, self.conditions, predict)
 
     def _alternatives(
         self, heights: list[list[Trial]], own: Sequence[Trial], cells: Cells
     ) -> tuple[Alternative, ...]:
+        """Other heights, where these were tried, and narrower bands, where all legs have one."""
         found: tuple[Alternative, ...] = ()
         if heights:
-            found = heights_of(self.plan, own, heights, self.request.accept, self.radius_m)
-        return found + self._bands(cells)
-
-    def _bands(self, cells: Cells) -> tuple[Alternative, ...]:
-        """Mean probability in narrower bands, where all legs have the same."""
-        widths = set(self._leg_bands_m)
-        if self.area is None or self.area.route is None or len(widths) != 1:
-            return ()
+            found = heights_of(self.plan, own, heights)
+        route, widths = self.request.route, set(self.bands_m)
+        if route is None or len(widths) != 1:
+            return found
         rows, cols = cells.probability.shape
         grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, rows, cols)
-        line = self.area.route.points_en_m(self.area.frame)
+        line = route.points_en_m(self.sheet.frame)
         away_m = distance_to_polyline_m(grid.centres_en_m, line)
         probability = cells.probability.ravel()
-        found = []
+        bands = []
         for part in (*BANDS, 1.0):
             width_m = part * max(widths)
             inside = (away_m <= max(width_m, cells.side_m) / 2) & np.isfinite(probability)
             if inside.any() and width_m > cells.side_m:
                 mean = float(probability[inside].mean())
-                found.append(Alternative("band_m", width_m, mean, chosen=part == 1.0))
-        return tuple(found) if len(found) > 1 else ()
+                bands.append(Alternative("band_m", width_m, mean, chosen=part == 1.0))
+        return found + tuple(bands) if len(bands) > 1 else found

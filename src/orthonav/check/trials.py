@@ -11,19 +11,26 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import cached_property
 from multiprocessing import get_context, parent_process
 from multiprocessing.synchronize import Event
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.change import another_year, displaced
-from orthonav.check.ortho import OrthoPyramid
 from orthonav.check.persistence import MARGIN_PX
-from orthonav.check.views import MapCrops, TrialPlan, reported_persistence, view_of
+from orthonav.check.views import (
+    OrthoPyramid,
+    TrialPlan,
+    crop_around,
+    mirrored_donor,
+    reported_persistence,
+    view_of,
+)
 from orthonav.errors import MapFileError, WorkerError
 from orthonav.localizer import Localizer
 from orthonav.localizer.registration import RegistrationLocalizer
@@ -46,21 +53,22 @@ Work = tuple[TrialPlan, NDArray[np.float64]]
 class Trial:
     """The outcome of one trial. Positions are metres in the plane of the map's sheet.
 
-    `index`: number of the place within the plan.
     `en_m`: true position.
     `error_m`: error of the fix; NaN without one.
     `confidence`: of the fix; 0 without one.
     `expected`: mean persistence of the view; NaN for a second date.
+    `right`, `wrong`: the fix is accepted, and within the radius of the map or not.
     `found_en_m`: position of the fix.
     `rival_en_m`: best other place at least a quarter of a view away.
     `rival_share`: its score as a share of the best score; NaN without a rival.
     """
 
-    index: int
     en_m: tuple[float, float]
     error_m: float
     confidence: float
     expected: float
+    right: bool = False
+    wrong: bool = False
     found_en_m: tuple[float, float] = NOWHERE
     rival_en_m: tuple[float, float] = NOWHERE
     rival_share: float = math.nan
@@ -119,8 +127,6 @@ def _run_jobs(plans: list[TrialPlan], jobs: list[_Job], workers: int) -> Iterato
 def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[_Outcome]:
     """Outcomes in the order of the jobs. Ctrl-C is blocked while workers start, which inherit that:
     only the parent handles it."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        return pool.map(_work, jobs, chunksize=AT_ONCE)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.map(_work, jobs, chunksize=AT_ONCE)
@@ -128,19 +134,17 @@ def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[_Outcome]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_plans: list[TrialPlan] = []
-_stop: Event | None = None
-_trier: "Trier | None" = None
+_stop: Event
+_trier: "Trier"
 
 
 def _start_worker(plans: list[TrialPlan], stop: Event) -> None:
     """Set up a worker, which ends when its parent does."""
-    global _stop
-    _stop = stop
+    global _stop, _trier
+    _stop, _trier = stop, Trier(plans)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
-    _plans[:] = plans
 
 
 def _exit_with_parent() -> None:
@@ -151,12 +155,7 @@ def _exit_with_parent() -> None:
 
 
 def _work(job: _Job) -> _Outcome:
-    global _trier
-    if _stop is not None and _stop.is_set():
-        return job[0], None
-    if _trier is None:  # here rather than in `_start_worker`, so that errors reach the parent
-        _trier = Trier(_plans)
-    return _trier(job)
+    return (job[0], None) if _stop.is_set() else _trier(job)
 
 
 def registration_of(opened: MapFile) -> RegistrationLocalizer:
@@ -168,79 +167,79 @@ def registration_of(opened: MapFile) -> RegistrationLocalizer:
 
 
 class Trier:
-    """Runs trials of plans that share a map."""
+    """Runs trials of plans that share a map.
+
+    Files are opened by the first trial, so that errors of a worker reach its parent.
+    """
 
     def __init__(self, plans: Sequence[TrialPlan]) -> None:
-        """Open the map. Raises as `registration_of` does."""
-        registration = registration_of(open_map(plans[0].map_path))
-        self._registration = registration
-        self._own = MapCrops(registration.pyramid, registration.grid)
         self._plans = plans
-        self._others: dict[Path, tuple[OrthoPyramid, MapCrops]] = {}
+        self._files = ExitStack()
 
     def close(self) -> None:
-        """Close the files of second dates."""
-        for pyramid, _ in self._others.values():
-            pyramid.close()
-        self._others.clear()
+        """Close the orthophoto of the second date."""
+        self._files.close()
 
-    def __call__(self, job: _Job) -> tuple[int, Trial | None]:
-        """Run a job: number of the plan, index, metres east and north."""
+    def __call__(self, job: _Job) -> _Outcome:
+        """Run a job: number of the plan, index, metres east and north.
+
+        Raises as `registration_of` does.
+        """
         number, index, east, north = job
         plan = self._plans[number]
-        rng = np.random.default_rng([plan.seed, index])
-        crops = self._own if plan.other_path is None else self._other(plan.other_path)
-        return number, self._trial(rng, plan, crops, index, np.array([east, north]))
+        rng = np.random.default_rng([plan.request.seed + plan.second_date, index])
+        return number, self._trial(rng, plan, np.array([east, north]))
 
-    def _other(self, path: Path) -> MapCrops:
-        if path not in self._others:
-            pyramid = self._registration.pyramid
-            other = OrthoPyramid(path, self._registration.sheet, pyramid.levels)
-            self._others[path] = other, MapCrops(other, self._registration.grid)
-        return self._others[path][1]
+    @cached_property
+    def _registration(self) -> RegistrationLocalizer:
+        return registration_of(open_map(self._plans[0].request.map_path))
+
+    @cached_property
+    def _other(self) -> OrthoPyramid:
+        """The orthophoto of the second date."""
+        path, registration = self._plans[0].request.other_date, self._registration
+        assert path is not None
+        other = OrthoPyramid(path, registration.sheet, registration.pyramid.levels)
+        return self._files.enter_context(closing(other))
 
     def _trial(
-        self,
-        rng: np.random.Generator,
-        plan: TrialPlan,
-        crops: MapCrops,
-        index: int,
-        en_m: NDArray[np.float64],
+        self, rng: np.random.Generator, plan: TrialPlan, en_m: NDArray[np.float64]
     ) -> Trial | None:
-        registration = self._registration
+        registration, request = self._registration, plan.request
+        grid = registration.grid
         # One level finer than the final one, where ambiguous views are registered too.
-        side_px = plan.side_m / registration.grid.gsd_m
-        final = Levels.of(side_px, registration.pyramid.levels).final
+        final = Levels.of(plan.side_m / grid.gsd_m, registration.pyramid.levels).final
         level = max(final - 1, 0)
-        gsd_m = registration.grid.gsd_m * 2**level
+        gsd_m = grid.gsd_m * 2**level
         size = math.ceil(math.hypot(plan.width_m, plan.height_m) / gsd_m) + 4
-        crop = crops.around(en_m, size, level)
+        layer = self._other if plan.second_date else registration.pyramid
+        crop = crop_around(layer, grid, en_m, size, level)
         if crop is None:
             return None
         grey, valid, place = crop
-        donor = self._own.donor(rng, size, level)
+        donor = mirrored_donor(rng, registration.pyramid, size, level)
         inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
         lasting = valid[inner]
-        if plan.changes is not None and plan.other_path is None:
-            points = crops.points_en_m(place, size, level)
-            lasting = lasting & ~plan.changes.covers(points, registration.sheet.frame)
+        if request.changes is not None and not plan.second_date:
+            steps = (np.arange(size) + 0.5 - size / 2) * gsd_m
+            points = np.stack(np.meshgrid(steps, -steps), axis=-1) + place
+            lasting = lasting & ~request.changes.covers(points, registration.sheet.frame)
         picture = np.where(lasting, grey[inner], donor)
         expected = math.nan
-        if plan.other_path is None:
+        if not plan.second_date:
             maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
             expected = float(np.mean([each.mean() for each in maps[:2]]))
             picture = another_year(rng, picture, donor, maps)
-        if plan.relief_m > 0:
-            rim_px = plan.relief_m * size / 2 / plan.agl_m
+        if request.relief_m > 0:
+            rim_px = request.relief_m * size / 2 / plan.agl_m
             picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)
         view = view_of(rng, plan, picture, gsd_m)
-        return self._placed(rng, plan, index, place, view, expected)
+        return self._placed(rng, plan, place, view, expected)
 
     def _placed(
         self,
         rng: np.random.Generator,
         plan: TrialPlan,
-        index: int,
         place_en_m: NDArray[np.float64],
         view: View,
         expected: float,
@@ -248,13 +247,13 @@ class Trier:
         registration = self._registration
         here = (float(place_en_m[0]), float(place_en_m[1]))
         prior = None
-        if plan.prior_std_m is not None:
-            at = place_en_m + rng.normal(0, plan.prior_std_m, 2)
+        if plan.request.prior_std_m is not None:
+            at = place_en_m + rng.normal(0, plan.request.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(at)
-            prior = Prior(float(lat), float(lon), plan.prior_std_m)
-        seen = registration.register(view, prior, plan.yaw_std_deg is not None)
+            prior = Prior(float(lat), float(lon), plan.request.prior_std_m)
+        seen = registration.register(view, prior, plan.request.yaw_std_deg is not None)
         if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
-            return Trial(index, here, math.nan, 0.0, expected)
+            return Trial(here, math.nan, 0.0, expected)
         prepared, best = seen.prepared, seen.found
         found = registration.camera_en_m(prepared, best.placed.pose)
         rivals = [
@@ -267,13 +266,17 @@ class Trier:
             score, placed = max(rivals, key=lambda each: each[0])
             east, north = registration.camera_en_m(prepared, placed.pose)
             rival, share = (float(east), float(north)), score / max(best.score, 1e-6)
-        confidence = registration.confidence
+        error_m, confidence = float(np.hypot(*(found - place_en_m))), 0.0
+        if registration.confidence is not None:
+            confidence = registration.confidence(best.evidence())
+        accepted, near = confidence >= plan.request.accept, error_m <= registration.radius_m
         return Trial(
-            index=index,
             en_m=here,
-            error_m=float(np.hypot(*(found - place_en_m))),
-            confidence=0.0 if confidence is None else confidence(best.evidence()),
+            error_m=error_m,
+            confidence=confidence,
             expected=expected,
+            right=accepted and near,
+            wrong=accepted and not near,
             found_en_m=(float(found[0]), float(found[1])),
             rival_en_m=rival,
             rival_share=share,

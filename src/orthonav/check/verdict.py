@@ -1,13 +1,10 @@
 """Go, marginal or no-go, and why. The rules are documented in docs/check.md."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from orthonav.check.outcome import (
     Along,
     BlindStretch,
-    Conditions,
     Lookalike,
     Reason,
     Verdict,
@@ -30,62 +27,56 @@ TOO_FAR = 2.0
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 
 
-@dataclass(frozen=True)
-class Findings:
-    """The input of the verdict.
+def verdict_of(
+    along: Along | None,
+    stretches: tuple[BlindStretch, ...],
+    lookalikes: tuple[Lookalike, ...],
+    *,
+    mean: float,
+    low: float,
+    calibrated: bool,
+    wrong: int,
+    trials: int,
+    outside: float,
+    changed: float,
+    allowed_m: float | None,
+) -> Verdict:
+    """The worst of all reasons, worst first.
 
     `mean`, `low`: mean probability along the route, or over the map, and the lower end of its 80 %
-    interval.
-    `calibrated`: the map carries a confidence model.
-    `wrong`, `trials`: number of confident and wrong trials, and of all.
-    `outside`: share of the route outside the map, 0 to 1.
-    `changed`: share of the checked area that changed since the map was made, 0 to 1.
+    interval. `calibrated`: the map carries a confidence model. `wrong`, `trials`: number of
+    confident and wrong trials, and of all. `outside`: share of the route outside the map, 0 to 1.
+    `changed`: share of the checked area that changed since the map was made, 0 to 1. `allowed_m`:
+    standard deviation of the prior, None without one.
     """
-
-    conditions: Conditions
-    mean: float
-    low: float
-    calibrated: bool
-    wrong: int
-    trials: int
-    outside: float
-    along: Along | None
-    stretches: tuple[BlindStretch, ...]
-    lookalikes: tuple[Lookalike, ...]
-    changed: float = 0.0
-
-
-def verdict_of(found: Findings) -> Verdict:
-    """The worst of all reasons, worst first."""
-    reasons = [*_trust(found), _mean(found)]
-    if found.along is not None:
-        reasons += [*_outside(found.outside), _drift(found, found.along)]
-        reasons += _blind(found.stretches)
-    reasons += [*_changed(found), *_lookalikes(found)]
+    where = "on the map" if along is None else "along the route"
+    reasons = [*_trust(calibrated, wrong, trials), _mean(mean, low, where)]
+    if along is not None:
+        reasons += [*_outside(outside), _drift(along, allowed_m), *_blind(stretches)]
+    reasons += [*_changed(changed, where), *_lookalikes(lookalikes)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
 
 
-def _trust(found: Findings) -> list[Reason]:
-    if not found.calibrated:
+def _trust(calibrated: bool, wrong: int, trials: int) -> list[Reason]:
+    if not calibrated:
         text = "The map states no confidence, so no fix would be accepted. Build it again."
         return [Reason("no_confidence", text, Word.NO_GO)]
-    share = found.wrong / max(found.trials, 1)
-    if found.wrong < MIN_WRONG or share < GO_WRONG:
+    share = wrong / max(trials, 1)
+    if wrong < MIN_WRONG or share < GO_WRONG:
         return []
-    text = f"{found.wrong} of {found.trials} trial views had a confident fix in a wrong place."
+    text = f"{wrong} of {trials} trial views had a confident fix in a wrong place."
     return [Reason("wrong", text, Word.NO_GO if share >= NO_GO_WRONG else Word.MARGINAL)]
 
 
-def _mean(found: Findings) -> Reason:
-    where = "along the route" if found.along is not None else "on the map"
-    fine = found.low >= GO_LOW
-    text = f"One view has {'' if fine else 'only '}{_article(found.mean)} {100 * found.mean:.0f} % "
+def _mean(mean: float, low: float, where: str) -> Reason:
+    fine = low >= GO_LOW
+    text = f"One view has {'' if fine else 'only '}{_article(mean)} {100 * mean:.0f} % "
     text += f"chance of a confident, correct fix {where} (mean), "
-    text += f"at least {100 * found.low:.0f} % on nine of ten scenes."
+    text += f"at least {100 * low:.0f} % on nine of ten scenes."
     if fine:
         return Reason("fixes", text, Word.GO)
-    return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
+    return Reason("few_fixes", text, Word.NO_GO if mean < NO_GO_MEAN else Word.MARGINAL)
 
 
 def _article(share: float) -> str:
@@ -101,21 +92,16 @@ def _outside(share: float) -> list[Reason]:
     return [Reason("outside_map", f"{100 * share:.0f} % of the route is outside the map.", word)]
 
 
-def _changed(found: Findings) -> list[Reason]:
+def _changed(share: float, where: str) -> list[Reason]:
     """A warning: what changed lowers the probability, from which the verdict follows."""
-    if found.changed <= 0:
+    if share <= 0:
         return []
-    where = "along the route" if found.along is not None else "on the map"
-    share = f"{100 * found.changed:.1f} %"
-    text = f"At least {share} of the ground {where} changed since the map was made: "
+    text = f"At least {100 * share:.1f} % of the ground {where} changed since the map was made: "
     text += "fixes are rarer there; build the map from newer imagery."
-    return [
-        Reason("changed_ground", text, Word.MARGINAL if found.changed > MAX_CHANGED else Word.GO)
-    ]
+    return [Reason("changed_ground", text, Word.MARGINAL if share > MAX_CHANGED else Word.GO)]
 
 
-def _drift(found: Findings, along: Along) -> Reason:
-    allowed_m = found.conditions.prior_std_m
+def _drift(along: Along, allowed_m: float | None) -> Reason:
     worst = int(np.argmax(along.drift_m))
     drift_m = float(along.drift_m[worst])
     text = f"The largest expected position error is {drift_m:.0f} m"
@@ -149,8 +135,8 @@ def _blind(stretches: tuple[BlindStretch, ...]) -> list[Reason]:
     return [Reason("blind", f"{text}; {end}.", Word.MARGINAL)]
 
 
-def _lookalikes(found: Findings) -> list[Reason]:
-    near = [each for each in found.lookalikes if each.within_prior and each.trials > 1]
+def _lookalikes(lookalikes: tuple[Lookalike, ...]) -> list[Reason]:
+    near = [each for each in lookalikes if each.within_prior and each.trials > 1]
     if not near:
         return []
     pairs = f"{len(near)} pairs" if len(near) > 1 else "One pair"

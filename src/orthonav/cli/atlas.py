@@ -250,17 +250,20 @@ def _cut(options: argparse.Namespace) -> None:
     from orthonav.atlas.cut import cut_map
     from orthonav.cli.info import summary as map_summary
     from orthonav.cli.info import summary_text as map_text
+    from orthonav.geo.area import Area, require_one_area
     from orthonav.geo.route import read_route
 
     atlas = Atlas.open(options.atlas)
-    route = None if options.route is None else read_route(options.route)
+    if options.route is None:
+        require_one_area(None, options.band_m, options.bounds)
+        area = Area.from_bounds(options.bounds)
+    else:
+        area = Area.from_route(read_route(options.route), options.band_m)
     with progress(options) as shown:
         result = cut_map(
             atlas,
             options.out,
-            route=route,
-            band_m=options.band_m,
-            bounds_deg=options.bounds,
+            area,
             workers=options.workers,
             allow_holes=options.allow_holes,
             progress=shown,

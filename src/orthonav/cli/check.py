@@ -11,17 +11,8 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import ROUTE_HELP, add_dem, print_json, progress
 
 EVERYDAY = (
-    *(
-        "--route",
-        "--band-m",
-        "--other-date",
-        "--other-sensor",
-        "--changes",
-        "--camera",
-        "--agl-m",
-        "--dem",
-    ),
-    *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
+    *("--route", "--band-m", "--other-date", "--other-sensor", "--changes", "--camera", "--agl-m"),
+    *("--dem", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
 
 log = logging.getLogger(__name__)

@@ -16,20 +16,8 @@ if TYPE_CHECKING:
 
 PACKAGE = "ign-package:"
 EVERYDAY = (
-    "--route",
-    "--bounds",
-    "--band-m",
-    "--source",
-    "--list",
-    "--out",
-    "--dry-run",
-    "--gsd-m",
-    "--layer",
-    "--time",
-    "--date",
-    "--key-env",
-    "--cache",
-    "--json",
+    *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
+    *("--layer", "--time", "--date", "--key-env", "--cache", "--json"),
 )
 
 
@@ -88,7 +76,7 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
         help="width of the service's tiles (xyz, tms) or images (wms)",
     )
     group.add_argument("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
-    group.add_argument("--subdomains", default="abc", help="values of {s} (default abc)")
+    group.add_argument("--subdomains", help="values of {s} (default abc)")
     group.add_argument("--collection", help="collection of a STAC")
     group.add_argument("--asset", help="asset of each STAC item")
     group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
@@ -322,7 +310,7 @@ def _summary(out: Path, result: "FetchResult") -> str:
     lines = {
         "file": out,
         "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
-        "tiles": f"{estimate.tiles}, {result.fetched.from_cache} of them from the cache",
+        "tiles": f"{estimate.tiles}, {result.cells.from_cache} of them from the cache",
         "missing": result.holes() or "none",
         "layer": terms.layer,
         "date": terms.date or "unknown",

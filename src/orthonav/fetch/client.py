@@ -79,7 +79,7 @@ class BadReplyError(FetchError):
 
 
 class Client:
-    """Sends the requests of all threads of a run; close it when done.
+    """Sends the requests of all threads of a run; a context manager.
 
     `secrets` are keys by placeholder, each for one origin. `received_bytes` counts bodies as sent.
     """
@@ -101,9 +101,6 @@ class Client:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         """End every wait and every connection."""
         self.turns.stop.set()
         with self._lock:

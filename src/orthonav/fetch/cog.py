@@ -24,10 +24,11 @@ from orthonav.fetch.client import Client
 from orthonav.fetch.crs import ground_scale
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.images import CellPixels
-from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
+from orthonav.fetch.options import ImageryOptions, SourceSpec, finest_fitting
 from orthonav.fetch.remote import CACHE_BYTES, MAX_RANGE, RangeCache, RemoteFile
 from orthonav.fetch.service import CellSource
 from orthonav.fetch.urls import shown
+from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.raster import WHOLLY_VALID
 
@@ -165,19 +166,14 @@ class _CogCells:
         return (row0, col0), pixels, mask
 
 
-def cog_source(
-    client: Client,
-    urls: list[str],
-    options: ImageryOptions,
-    frame: LocalFrame,
-    provenance: Provenance,
-) -> CellSource:
-    """The files as one source, on the grid of the first at the level that fits `options`.
+def cog_source(client: Client, spec: SourceSpec, area: Area, urls: list[str]) -> CellSource:
+    """The files as one source, on the grid of the first at the level that fits the options.
 
     Raises `FetchError` where one cannot be read or they differ in pixel type or bands.
     """
+    options, provenance = spec.options, spec.provenance
     cache = RangeCache(CACHE_BYTES, len)
-    files = [_inspect(RemoteFile(client, url, cache), options, frame) for url in urls]
+    files = [_inspect(RemoteFile(client, url, cache), options, area.frame) for url in urls]
     first = files[0]
     bands = options.bands or ((1,) if first.count < 3 else (1, 2, 3))
     for file in files:

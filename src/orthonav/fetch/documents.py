@@ -4,7 +4,6 @@ import json
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 
@@ -18,19 +17,16 @@ MAX_DOCUMENT_BYTES = 64 * 2**20
 """The capabilities of a national service list a thousand layers in some ten megabytes."""
 
 
-@dataclass(frozen=True, eq=False)
-class XmlDocument:
-    """An XML document without entities, as it came and as its root element."""
-
-    body: bytes
-    root: Element
+XmlDocument = tuple[bytes, Element]
+"""An XML document without entities, as it came and as its root element."""
 
 
 def get_xml(client: Client, url: str) -> XmlDocument:
     """An XML document. Raises `FetchError`."""
 
     def check(reply: HttpReply) -> XmlDocument:
-        _require_ok(reply)
+        if reply.status != 200:
+            raise bad_status(reply)
         try:
             return parse_xml(reply.body)
         except FetchError as error:
@@ -43,7 +39,8 @@ def get_json(client: Client, url: str, body: Any = None) -> dict[str, Any]:
     """A JSON object; `body` is sent with POST. Raises `FetchError`."""
 
     def check(reply: HttpReply) -> dict[str, Any]:
-        _require_ok(reply)
+        if reply.status != 200:
+            raise bad_status(reply)
         try:
             plain = json.loads(reply.body)
         except (ValueError, RecursionError):
@@ -62,7 +59,7 @@ def parse_xml(body: bytes) -> XmlDocument:
     A DOCTYPE alone is accepted, because every WMS 1.1.1 has one; what it names is never loaded.
     """
     try:
-        return XmlDocument(body, fromstring(body, forbid_dtd=False))
+        return body, fromstring(body, forbid_dtd=False)
     except DefusedXmlException:
         raise FetchError("document declares entities, which are not read") from None
     except (ParseError, ValueError):
@@ -85,8 +82,3 @@ def capabilities(protocol: str, url: str) -> Iterator[None]:
         raise FetchError(
             f"{protocol} capabilities cannot be read ({type(error).__name__}): {url}"
         ) from None
-
-
-def _require_ok(reply: HttpReply) -> None:
-    if reply.status != 200:
-        raise bad_status(reply)

@@ -1,9 +1,10 @@
-"""Which imagery is requested, and the provenance that travels with it."""
+"""Which imagery is requested of which service, and the provenance that travels with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from orthonav.errors import FetchError
+from orthonav.fetch.urls import Secret
 
 DEFAULT_GSD_M = 0.5
 """Ground resolution where none is given: half that of a usual map (1 m), so nothing is lost."""
@@ -56,8 +57,8 @@ class ImageryOptions:
     """Bands of a file, from 1."""
     version: str | None = None
     """Version of the WMS protocol, 1.1.1 or 1.3.0."""
-    subdomains: str = "abc"
-    """Values of {s} in a tile template, one letter each."""
+    subdomains: str | None = None
+    """Values of {s} in a tile template, one letter each; None means abc."""
     preferred_style: str | None = None
     """Style taken where the layer has it and `style` is None."""
     preferred_format: str | None = None
@@ -66,8 +67,6 @@ class ImageryOptions:
     def over(self, preset: "ImageryOptions") -> "ImageryOptions":
         """These options where they are set, else those of the preset."""
         given = {name: value for name, value in vars(self).items() if value is not None}
-        if self.subdomains == ImageryOptions.subdomains:
-            given.pop("subdomains")
         return replace(preset, **given)
 
     @property
@@ -94,6 +93,24 @@ class Provenance:
     """What a user should know, such as resampling."""
     datum: str | None = None
     """What the heights of a terrain model count from; None for imagery."""
+
+
+@dataclass(frozen=True)
+class SourceSpec:
+    """A service and the imagery requested of it."""
+
+    protocol: str
+    """One of `orthonav.fetch.presets.PROTOCOLS`."""
+    url: str
+    """Its address, with `{key}` in place of a key."""
+    options: ImageryOptions
+    """Which imagery."""
+    provenance: Provenance
+    """Origin and terms, as far as they are known before the service is asked."""
+    secrets: tuple[Secret, ...] = ()
+    """The key, if the address holds one."""
+    token_url: str | None = None
+    """Address of a signing service for files."""
 
 
 def finest_fitting(gsds_m: list[float], wanted_m: float, levels: str) -> int:

@@ -197,7 +197,7 @@ def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Eleme
     pages = number = 1
     while number <= pages:
         query = {**parameters, "page": str(number), "limit": str(PAGE)}
-        feed = get_xml(client, with_query(url, query)).root
+        _, feed = get_xml(client, with_query(url, query))
         count = feed.get(f"{_GPF}pagecount", "1")
         pages = int(count) if count.isdecimal() else 1
         if pages > MAX_PAGES:

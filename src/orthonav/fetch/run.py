@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.errors import AreaError, FetchError, OutputError
-from orthonav.fetch.cache import FileCache
 from orthonav.fetch.client import Client
-from orthonav.fetch.download import FetchedCells, fetch_cells
+from orthonav.fetch.download import FetchedCells, FileCache, fetch_cells
 from orthonav.fetch.grid import Selection, select
-from orthonav.fetch.options import Provenance
+from orthonav.fetch.options import Provenance, SourceSpec
 from orthonav.fetch.politeness import RequestLimits, Stopped
 from orthonav.fetch.service import CellSource
-from orthonav.fetch.sources import SourceSpec, open_cells
-from orthonav.fetch.write import CellCounts, Packing, write_mosaic
+from orthonav.fetch.sources import open_cells
+from orthonav.fetch.write import Packing, write_mosaic
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area
 from orthonav.geo.swapped import swapped_hint
@@ -86,8 +85,7 @@ class FetchResult:
     """What was fetched: cells by outcome, and the share of valid pixels, 0 to 1."""
 
     estimate: CostEstimate
-    fetched: FetchedCells
-    counts: CellCounts
+    cells: FetchedCells
     valid_share: float
     received_mb: float
     size_bytes: int
@@ -99,12 +97,12 @@ class FetchResult:
             "gsd_m": round(self.estimate.gsd_m, 4),
             "width_px": self.estimate.width_px,
             "height_px": self.estimate.height_px,
-            "images": self.counts.images,
-            "from_cache": self.fetched.from_cache,
-            "not_covered": self.fetched.absent,
-            "blank": self.counts.blank,
-            "placeholders": self.counts.placeholders,
-            "failed": dict(self.fetched.failed),
+            "images": self.cells.images,
+            "from_cache": self.cells.from_cache,
+            "not_covered": self.cells.absent,
+            "blank": self.cells.blank,
+            "placeholders": self.cells.placeholders,
+            "failed": dict(self.cells.failed),
             "valid_share": round(self.valid_share, 4),
             "received_mb": round(self.received_mb, 3),
             "size_bytes": self.size_bytes,
@@ -114,10 +112,10 @@ class FetchResult:
     def holes(self) -> str:
         """Cells without imagery by reason, on one line; empty where there are none."""
         numbers = {
-            "failed": self.fetched.failed.total(),
-            "not covered": self.fetched.absent,
-            "blank": self.counts.blank,
-            "placeholders": self.counts.placeholders,
+            "failed": self.cells.failed.total(),
+            "not covered": self.cells.absent,
+            "blank": self.cells.blank,
+            "placeholders": self.cells.placeholders,
         }
         return ", ".join(f"{count} {reason}" for reason, count in numbers.items() if count)
 
@@ -147,17 +145,15 @@ def fetch(
         started(estimate)
         cache = FileCache(request.cache or request.out.with_name(f"{request.out.name}.tiles"))
         fetched = _fetched(source, selection, client, cache, progress)
-        _refuse_holes(request, fetched, cache)
-        counts = write_mosaic(
-            request.out, source, selection, fetched, cache, request.packing, progress
-        )
+        _refuse_holes(request, fetched)
+        write_mosaic(request.out, fetched, request.packing, progress)
         received_mb = client.received_bytes / 1e6
     if request.cache is None:
         cache.remove()
     grid = selection.grid
-    share = counts.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)
+    share = fetched.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)
     size = request.out.stat().st_size
-    result = FetchResult(estimate, fetched, counts, share, received_mb, size)
+    result = FetchResult(estimate, fetched, share, received_mb, size)
     if result.holes():
         log.warning("of %d tiles: %s; masked in the file", estimate.tiles, result.holes())
     return result
@@ -226,7 +222,7 @@ def _fetched(
         raise FetchError(f"{error}; {_resume_hint(cache)}") from None
 
 
-def _refuse_holes(request: FetchRequest, fetched: FetchedCells, cache: FileCache) -> None:
+def _refuse_holes(request: FetchRequest, fetched: FetchedCells) -> None:
     failed = fetched.failed.total()
     if not failed or request.allow_holes:
         return
@@ -234,7 +230,7 @@ def _refuse_holes(request: FetchRequest, fetched: FetchedCells, cache: FileCache
     reasons = ", ".join(f"{reason}: {count}" for reason, count in common)
     raise FetchError(
         f"{failed} of {len(fetched.digests)} tiles failed ({reasons}; for example "
-        f"{fetched.examples[common[0][0]]}); nothing was written; {_resume_hint(cache)}; "
+        f"{fetched.examples[common[0][0]]}); nothing was written; {_resume_hint(fetched.cache)}; "
         "--allow-holes writes the file without them"
     )
 

@@ -2,12 +2,12 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
-from orthonav.fetch.options import ImageryOptions, Provenance
+from orthonav.fetch.options import ImageryOptions, Provenance, SourceSpec
 from orthonav.fetch.presets import PROTOCOLS, find_preset
 from orthonav.fetch.service import CellSource
 from orthonav.fetch.stac import CatalogItem, date_of, find_items, sign
@@ -20,24 +20,6 @@ from orthonav.geo.area import Area
 _DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?")
 
 
-@dataclass(frozen=True)
-class SourceSpec:
-    """A service and the imagery requested of it."""
-
-    protocol: str
-    """One of `PROTOCOLS`."""
-    url: str
-    """Its address, with `{key}` in place of a key."""
-    options: ImageryOptions
-    """Which imagery."""
-    provenance: Provenance
-    """Origin and terms, as far as they are known before the service is asked."""
-    secrets: tuple[Secret, ...] = ()
-    """The key, if the address holds one."""
-    token_url: str | None = None
-    """Address of a signing service for files."""
-
-
 def parse_source(
     text: str,
     options: ImageryOptions,
@@ -46,20 +28,18 @@ def parse_source(
     licence: str | None = None,
     attribution: str | None = None,
     key_env: str | None = None,
-    environ: Mapping[str, str] | None = None,
 ) -> SourceSpec:
     """`NAME[:YEAR]` of a service known by name, or `wmts|wms|xyz|tms|stac|cog:ADDRESS`.
 
     Raises `FetchError` for unknown names, addresses that are not http or https, and missing keys.
     """
-    environ = os.environ if environ is None else environ
     if date is not None:
         check_date(date)
     head, _, rest = text.partition(":")
     if head in PROTOCOLS and rest:
         url, literal = without_literal_keys(checked(rest, head))
         provenance = Provenance(shown(url), options.layer or "", date, licence, attribution)
-        secrets = _secrets(url, key_env, literal, environ)
+        secrets = _secrets(url, key_env, literal)
         return SourceSpec(head, url, options, provenance, secrets)
     if head.lower() in ("http", "https", "file"):
         raise FetchError(
@@ -77,7 +57,7 @@ def parse_source(
         "; ".join(note for note in (layer.note, preset.note) if note) or None,
         preset.datum,
     )
-    secrets = _secrets(preset.url, key_env or preset.key_env, None, environ)
+    secrets = _secrets(preset.url, key_env or preset.key_env, None)
     return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)
 
 
@@ -100,16 +80,15 @@ def open_cells(client: Client, spec: SourceSpec, area: Area) -> CellSource:
 
     Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
     """
-    url, wanted = spec.url, (spec.options, area.frame, spec.provenance)
-    openers: dict[str, Callable[[], CellSource]] = {
-        "wmts": lambda: wmts_tiles(client, url, *wanted),
-        "wms": lambda: wms_cells(client, url, *wanted),
-        "xyz": lambda: xyz_tiles(url, *wanted),
-        "tms": lambda: xyz_tiles(url, *wanted, rows_from_south=True),
-        "stac": lambda: _stac(client, spec, area),
-        "cog": lambda: _cogs(client, spec, [url], area),
+    openers: dict[str, Callable[[Client, SourceSpec, Area], CellSource]] = {
+        "wmts": wmts_tiles,
+        "wms": wms_cells,
+        "xyz": xyz_tiles,
+        "tms": xyz_tiles,
+        "stac": _stac,
+        "cog": lambda client, spec, area: _cogs(client, spec, area, [spec.url]),
     }
-    return openers[spec.protocol]()
+    return openers[spec.protocol](client, spec, area)
 
 
 def _stac(client: Client, spec: SourceSpec, area: Area) -> CellSource:
@@ -123,7 +102,7 @@ def _stac(client: Client, spec: SourceSpec, area: Area) -> CellSource:
         items = sign(client, spec.token_url, items)
     provenance = replace(spec.provenance, date=date_of(items) or spec.provenance.date)
     spec = replace(spec, provenance=provenance)
-    return _cogs(client, spec, [item.url for item in items], area)
+    return _cogs(client, spec, area, [item.url for item in items])
 
 
 def _newest_by_place(items: list[CatalogItem]) -> list[CatalogItem]:
@@ -134,15 +113,13 @@ def _newest_by_place(items: list[CatalogItem]) -> list[CatalogItem]:
     return list(newest.values())
 
 
-def _cogs(client: Client, spec: SourceSpec, urls: list[str], area: Area) -> CellSource:
+def _cogs(client: Client, spec: SourceSpec, area: Area, urls: list[str]) -> CellSource:
     from orthonav.fetch.cog import cog_source  # imports GDAL
 
-    return cog_source(client, urls, spec.options, area.frame, spec.provenance)
+    return cog_source(client, spec, area, urls)
 
 
-def _secrets(
-    url: str, key_env: str | None, literal: str | None, environ: Mapping[str, str]
-) -> tuple[Secret, ...]:
+def _secrets(url: str, key_env: str | None, literal: str | None) -> tuple[Secret, ...]:
     """The key for `{key}` in an address. Raises `FetchError` where it is missing."""
     if literal is not None:
         return (Secret(KEY, origin_of(url), literal),)
@@ -154,7 +131,7 @@ def _secrets(
         return ()
     if KEY not in url:
         raise FetchError(f"--key-env needs {KEY} in the address, where the key goes: {shown(url)}")
-    value = environ.get(key_env, "").strip()
+    value = os.environ.get(key_env, "").strip()
     if not value:
         raise FetchError(
             f"this service needs a key; put yours into the environment variable {key_env}"

@@ -15,8 +15,7 @@ from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import (
     HEIGHTS_FORMAT,
     TERRAIN_GSD_M,
-    ImageryOptions,
-    Provenance,
+    SourceSpec,
     choose,
     choose_format,
     choose_layer,
@@ -24,6 +23,7 @@ from orthonav.fetch.options import (
 )
 from orthonav.fetch.service import CellSource, resolution, tile_source
 from orthonav.fetch.urls import with_query
+from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 
 CELL_PX = 1024
@@ -32,27 +32,22 @@ _MIN_CELL_PX = 64
 _VERSIONS = ("1.3.0", "1.1.1")
 
 
-def wms_cells(
-    client: Client,
-    url: str,
-    options: ImageryOptions,
-    frame: LocalFrame,
-    provenance: Provenance,
-) -> CellSource:
+def wms_cells(client: Client, spec: SourceSpec, area: Area) -> CellSource:
     """Cells of a layer of a service. Raises `FetchError` with the available choices."""
+    url, options, frame = spec.url, spec.options, area.frame
     wanted = options.version or _VERSIONS[0]
     if wanted not in _VERSIONS:
         raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, not {wanted}")
     url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": wanted})
-    document = get_xml(client, url)
-    version = document.root.get("version", "")
+    body, root = get_xml(client, url)
+    version = root.get("version", "")
     if version not in _VERSIONS:
-        found = version or document.root.tag
+        found = version or root.tag
         raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, got '{found}': {url}")
     with capabilities("WMS", url):
         from owslib.wms import WebMapService
 
-        service = WebMapService(url, version=version, xml=document.body)
+        service = WebMapService(url, version=version, xml=body)
         get_map = service.getOperationByName("GetMap")
         layers = {name: layer for name, layer in service.contents.items() if name}
         layer = layers[choose_layer(list(layers), options.layer, url, named=True)]
@@ -60,7 +55,7 @@ def wms_cells(
         times = [value.strip() for value in layer.timepositions or [] if value]
         address = next(each["url"] for each in get_map.methods if each["type"].lower() == "get")
         formats, styles = tuple(get_map.formatOptions), list(layer.styles)
-        max_px = _max_px(document.root)
+        max_px = _max_px(root)
     if options.style is not None:
         choose(styles, options.style, f"layer {layer.name} has no style")
     crs = _crs(names, options.crs, frame, layer.name)
@@ -92,7 +87,7 @@ def wms_cells(
         box = (south, west, north, east) if swap else (west, south, east, north)
         return with_query(fixed, {"BBOX": ",".join(_number(value) for value in box)})
 
-    return tile_source(provenance, grid, url_of, format_, options.empty, tiled=False)
+    return tile_source(spec.provenance, grid, url_of, format_, options.empty, tiled=False)
 
 
 def _crs_names(options: list[str]) -> dict[str, str]:

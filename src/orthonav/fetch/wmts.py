@@ -22,7 +22,7 @@ from orthonav.fetch.documents import capabilities, get_xml
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import (
     ImageryOptions,
-    Provenance,
+    SourceSpec,
     choose,
     choose_format,
     choose_layer,
@@ -31,6 +31,7 @@ from orthonav.fetch.options import (
 )
 from orthonav.fetch.service import CellSource, tile_source
 from orthonav.fetch.urls import carrying_key, joined, quoted, with_query
+from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 
 PIXEL_M = 0.28e-3
@@ -39,21 +40,16 @@ _MAX_TILE_PX = 4096
 """Largest tile that is accepted; usual ones have 256 or 512 px."""
 
 
-def wmts_tiles(
-    client: Client,
-    url: str,
-    options: ImageryOptions,
-    frame: LocalFrame,
-    provenance: Provenance,
-) -> CellSource:
+def wmts_tiles(client: Client, spec: SourceSpec, area: Area) -> CellSource:
     """The tiles of a layer of a service. Raises `FetchError` with the available choices."""
+    url, options = spec.url, spec.options
     if not _is_document(url):
         url = with_query(url, {"SERVICE": "WMTS", "REQUEST": "GetCapabilities", "VERSION": "1.0.0"})
-    document = get_xml(client, url)
+    body, _ = get_xml(client, url)
     with capabilities("WMTS", url):
         from owslib.wmts import WebMapTileService
 
-        service = WebMapTileService(url, xml=document.body)
+        service = WebMapTileService(url, xml=body)
         layer = service.contents[choose_layer(list(service.contents), options.layer, url)]
         default = [name for name, style in layer.styles.items() if style.get("isDefault")]
         styles = list(dict.fromkeys(name or "" for name in [*default, *layer.styles]))
@@ -64,7 +60,7 @@ def wmts_tiles(
                 templates.setdefault(resource["format"], template)
         formats = list(filter(None, dict.fromkeys([*layer.formats, *templates])))
         format_ = choose_format(formats, options, f"layer {layer.id}")
-        set_name, matrix, grid = _matrix(service, layer, options, frame)
+        set_name, matrix, grid = _matrix(service, layer, options, area.frame)
         values = _dimensions(layer, options)
         kvp_url = _kvp_url(client, service, url)
     preferred = options.preferred_style if options.preferred_style in styles else None
@@ -78,7 +74,7 @@ def wmts_tiles(
         **values,
     }
     url_of = _url_of(templates.get(format_), kvp_url, values)
-    return tile_source(provenance, grid, url_of, format_, options.empty)
+    return tile_source(spec.provenance, grid, url_of, format_, options.empty)
 
 
 def _url_of(

@@ -17,7 +17,6 @@ from rasterio.windows import Window
 
 from orthonav import __version__
 from orthonav.errors import FetchError, OutputError
-from orthonav.fetch.cache import FileCache
 from orthonav.fetch.download import FetchedCells
 from orthonav.fetch.grid import Selection
 from orthonav.fetch.options import Provenance
@@ -41,26 +40,8 @@ class Packing:
     quality: int = 90
 
 
-@dataclass
-class CellCounts:
-    """Cells by content, and the number of valid pixels of all of them."""
-
-    images: int = 0
-    blank: int = 0
-    placeholders: int = 0
-    valid_px: int = 0
-
-
-def write_mosaic(
-    out: Path,
-    source: CellSource,
-    selection: Selection,
-    fetched: FetchedCells,
-    cache: FileCache,
-    packing: Packing,
-    progress: Progress,
-) -> CellCounts:
-    """Write the cells as one GeoTIFF, with missing ones masked, and count them by content.
+def write_mosaic(out: Path, fetched: FetchedCells, packing: Packing, progress: Progress) -> None:
+    """Write the cells as one GeoTIFF, with missing ones masked, and count them in `fetched`.
 
     Raises `FetchError` where no pixel is valid, `OutputError` where the file cannot be written.
     """
@@ -73,29 +54,21 @@ def write_mosaic(
     ):
         raw = Path(folder) / "mosaic.tif"
         try:
-            counts = _write_raw(raw, source, selection, fetched, cache, progress)
-            if counts.valid_px == 0:
+            _write_raw(raw, fetched, progress)
+            if fetched.valid_px == 0:
                 raise FetchError("the service has no imagery of this area in this layer")
             progress("pack", 0.1)
-            _pack(raw, temporary, source, packing)
-            _verify(temporary, raw, source)
+            _pack(raw, temporary, fetched.source, packing)
+            _verify(temporary, raw, fetched.source)
             progress("pack", 1.0)
         except (RasterioError, MemoryError) as error:
             raise not_written(error.__cause__ or error, out) from error
-    return counts
 
 
-def _write_raw(
-    raw: Path,
-    source: CellSource,
-    selection: Selection,
-    fetched: FetchedCells,
-    cache: FileCache,
-    progress: Progress,
-) -> CellCounts:
+def _write_raw(raw: Path, fetched: FetchedCells, progress: Progress) -> None:
     """The mosaic as a sparse tiled file."""
-    counts = CellCounts()
-    placeholders = fetched.placeholders
+    source, selection = fetched.source, fetched.selection
+    placeholders = fetched.are_placeholders
     with rasterio.open(raw, "w", **_profile(source, selection)) as dataset:
         dataset.update_tags(**tags_of(source.provenance, selection))
         if source.bands == 3:
@@ -104,11 +77,10 @@ def _write_raw(
             if fetched.digests[number] == 0:
                 continue
             if placeholders[number]:
-                counts.placeholders += 1
+                fetched.placeholders += 1
                 continue
-            _write_cell(dataset, source, cache, (row, col), selection.first, counts)
+            _write_cell(dataset, fetched, row, col)
             progress("mosaic", (number + 1) / len(selection.cells))
-    return counts
 
 
 def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
@@ -143,27 +115,21 @@ def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
     return profile
 
 
-def _write_cell(
-    dataset: Any,
-    source: CellSource,
-    cache: FileCache,
-    cell: tuple[int, int],
-    first: tuple[int, int],
-    counts: CellCounts,
-) -> None:
-    entry = cache.read(source.address(*cell))
+def _write_cell(dataset: Any, fetched: FetchedCells, row: int, col: int) -> None:
+    entry = fetched.cache.read(fetched.source.address(row, col))
     if entry is None or entry.body is None:
-        raise OutputError(f"a fetched cell is missing from the cache: {cache.folder}")
-    pixels = source.decode(entry.body)
+        raise OutputError(f"a fetched cell is missing from the cache: {fetched.cache.folder}")
+    pixels = fetched.source.decode(entry.body)
     if pixels.blank:
-        counts.blank += 1
+        fetched.blank += 1
         return
     height, width = pixels.valid.shape
-    window = Window((cell[1] - first[1]) * width, (cell[0] - first[0]) * height, width, height)
+    first_row, first_col = fetched.selection.first
+    window = Window((col - first_col) * width, (row - first_row) * height, width, height)
     dataset.write(np.where(pixels.valid, pixels.bands, 0), window=window)
     dataset.write_mask(np.where(pixels.valid, 255, 0).astype(np.uint8), window=window)
-    counts.images += 1
-    counts.valid_px += int(pixels.valid.sum())
+    fetched.images += 1
+    fetched.valid_px += int(pixels.valid.sum())
 
 
 def _pack(raw: Path, out: Path, source: CellSource, packing: Packing) -> None:

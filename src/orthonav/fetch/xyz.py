@@ -9,11 +9,13 @@ import re
 from collections.abc import Callable
 
 from orthonav.errors import FetchError
+from orthonav.fetch.client import Client
 from orthonav.fetch.crs import MERCATOR_HALF_M, ground_scale, mercator_resolution
 from orthonav.fetch.grid import CellGrid
-from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
+from orthonav.fetch.options import ImageryOptions, SourceSpec, finest_fitting
 from orthonav.fetch.service import CellSource, tile_source
 from orthonav.fetch.urls import checked_url
+from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 
 MAX_ZOOM = 24
@@ -21,18 +23,12 @@ MAX_ZOOM = 24
 _PARTS = {"z", "x", "y", "-y", "q", "s", "r", "key"}
 
 
-def xyz_tiles(
-    template: str,
-    options: ImageryOptions,
-    frame: LocalFrame,
-    provenance: Provenance,
-    *,
-    rows_from_south: bool = False,
-) -> CellSource:
-    """The tiles of a template at the zoom that fits `options`.
+def xyz_tiles(_: Client, spec: SourceSpec, area: Area) -> CellSource:
+    """The tiles of a template at the zoom that fits the options; as TMS, `{y}` means `{-y}`.
 
-    With `rows_from_south`, `{y}` means `{-y}`. Raises `FetchError`.
+    Raises `FetchError`.
     """
+    template, options, from_south = spec.url, spec.options, spec.protocol == "tms"
     parts = set(re.findall(r"\{([^{}]*)\}", template))
     if parts - _PARTS or not (({"z", "x"} <= parts and parts & {"y", "-y"}) or "q" in parts):
         raise FetchError(
@@ -43,12 +39,13 @@ def xyz_tiles(
     tile_px = options.tile_px or (512 if "{r}" in template or "@2x" in template else 256)
     if not 64 <= tile_px <= 4096:
         raise FetchError(f"tiles must be 64 to 4096 px wide, got {tile_px}")
-    zoom = _zoom(options, frame, tile_px)
+    zoom = _zoom(options, area.frame, tile_px)
     half, last = MERCATOR_HALF_M, 2**zoom - 1
     res = mercator_resolution(zoom, tile_px)
     grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
-    url_of = _url_of(template, zoom, options.subdomains, tile_px, rows_from_south)
-    return tile_source(provenance, grid, url_of, _format(template), options.empty)
+    subdomains = "abc" if options.subdomains is None else options.subdomains
+    url_of = _url_of(template, zoom, subdomains, tile_px, from_south)
+    return tile_source(spec.provenance, grid, url_of, _format(template), options.empty)
 
 
 def quadkey(zoom: int, row: int, col: int) -> str:

@@ -2,6 +2,6 @@
 
 from orthonav.check.write.folder import require_free, write_check
 from orthonav.check.write.plain import to_json
-from orthonav.check.write.text import text as verdict_text
+from orthonav.check.write.wording import text as verdict_text
 
 __all__ = ["require_free", "to_json", "verdict_text", "write_check"]

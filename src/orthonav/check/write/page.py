@@ -5,13 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from orthonav.check.outcome import CELL_VALUES, BlindStretch, CheckResult
-from orthonav.check.write.figures import MAX_LOOKALIKES
-from orthonav.check.write.imagery import jpeg, visible_box
-from orthonav.check.write.plain import Plain, plain, to_plain
+from orthonav.check.outcome import CELL_VALUES, CheckResult
+from orthonav.check.write.figures import MAX_LOOKALIKES, jpeg, visible_box
+from orthonav.check.write.plain import Plain, plain, summarize, to_plain
 from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
-from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
     SIMULATED,
     SYMBOLS,
@@ -62,7 +60,11 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
         "note": "" if result.second_date else SIMULATED,
         "figures": {figure.name: figure for figure in figures},
         "layers": LAYERS,
-        "stretches": [_stretch_row(*each) for each in enumerate(result.stretches, start=1)],
+        "stretches": [
+            (*row, ("✓ " if stretch.recoverable else "✕ ") + outcome)
+            for number, stretch in enumerate(result.stretches, start=1)
+            for *row, outcome in [stretch_row(number, stretch)]
+        ],
         "lookalikes": _lookalike_rows(result),
         "max_rows": MAX_ROWS,
         "max_lookalikes": MAX_LOOKALIKES,
@@ -84,9 +86,12 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
     area = f"{km2:.3g} km²" if km2 < 100 else f"{km2:.0f} km²"
     shown = [(share_text(result.mean), f"mean probability of a fix over {area}")]
     if result.along is not None:
-        route = f"of {metres_text(summary.route_m)} at a probability of {CONFIDENT:g} or more"
-        shown += [(share_text(summary.confident_share), route), _longest(summary.longest)]
-    shown.append((metres_text(summary.error_m), "expected error of a correct fix"))
+        route = f"of {metres_text(summary['route_m'])} at a probability of {CONFIDENT:g} or more"
+        shown += [
+            (share_text(summary["route_share_from_0_9"]), route),
+            _longest(result, summary["longest_stretch"]),
+        ]
+    shown.append((metres_text(summary["error_m"]), "expected error of a correct fix"))
     prior = conditions.prior_std_m
     if prior is None:
         shown.append(("no prior", "the whole map is searched"))
@@ -99,18 +104,14 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
     return shown
 
 
-def _longest(longest: BlindStretch | None) -> tuple[str, str]:
-    if longest is None:
+def _longest(result: CheckResult, number: int | None) -> tuple[str, str]:
+    if number is None:
         return "none", "blind stretches along the route"
+    longest = result.stretches[number - 1]
     duration = seconds_text(longest.end_s - longest.start_s)
     error = metres_text(longest.drift_m)
     text = f"longest blind stretch: {duration}, error {error} after it"
     return metres_text(longest.length_m), text
-
-
-def _stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    *values, outcome = stretch_row(number, stretch)
-    return (*values, ("✓ " if stretch.recoverable else "✕ ") + outcome)
 
 
 def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
@@ -185,8 +186,8 @@ def _page_data(result: CheckResult, image: Background) -> str:
         "risks": [vars(risk) for risk in RISKS],
         "edge_px": EDGE_PX,
         "most": {
-            "error_m": _two_digits(max(most_m, 1.0)),
-            "wrong": _two_digits(max(0.05, most_wrong)),
+            "error_m": float(f"{max(most_m, 1.0):.2g}"),
+            "wrong": float(f"{max(0.05, most_wrong):.2g}"),
         },
         "route": None if along is None else along.points_en_m,
         "segments": [] if along is None else segments(along.probability),
@@ -234,10 +235,6 @@ def _colours() -> list[str]:
     from matplotlib.colors import to_hex
 
     return [to_hex(colour) for colour in colormaps["cividis"](np.linspace(0, 1, 10))]
-
-
-def _two_digits(value: float) -> float:
-    return float(f"{value:.2g}")
 
 
 def _band(result: CheckResult) -> list[Any]:

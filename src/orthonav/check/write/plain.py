@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import CELL_VALUES, Cells, CheckResult
-from orthonav.check.write.summary import summarize
 from orthonav.geo.frames import LocalFrame
+from orthonav.records import CONFIDENT
 
 FORMAT, VERSION = "orthonav-check", 1
-_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4}
+_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}
 """Decimals by the last word of a name: a centimetre; shares and others have `_SHARE`."""
 _SHARE, _EXACT = 3, 6
 
+Array = NDArray[np.float64]
 Plain = dict[str, Any]
 
 
@@ -49,7 +50,7 @@ def to_plain(result: CheckResult) -> Plain:
             ],
         },
         "conditions": plain(asdict(result.conditions), _EXACT),
-        "summary": _summary(result),
+        "summary": plain(summarize(result)),
         "plane": {
             "origin_lat_deg": float(result.frame.lat_deg),
             "origin_lon_deg": float(result.frame.lon_deg),
@@ -85,25 +86,54 @@ def lookalikes_to_plain(result: CheckResult) -> list[Plain]:
     ]
 
 
-def _summary(result: CheckResult) -> Plain:
-    summary = summarize(result)
-    longest = result.stretches.index(summary.longest) + 1 if summary.longest else None
+def summarize(result: CheckResult) -> Plain:
+    """The key figures of a check, which the page, the terminal and `check.json` share.
+
+    `route_share_from_0_9`: share of the length with a probability of `CONFIDENT` or more, 0 to 1.
+    `error_m`: expected error of a correct fix (root mean square), along the route or over the map.
+    `longest_stretch`: number of the longest blind stretch, from 1. Without a route its figures are
+    NaN, 0 or None.
+    """
+    along, cells, stretches = result.along, result.cells, result.stretches
+    route_m = share = math.nan
+    if along is None or not len(along.distance_m):
+        error_m = _rms(cells.error_m.ravel(), cells.probability.ravel())
+    else:
+        route_m = float(along.distance_m[-1] - along.distance_m[0])
+        weights = _length_per_point_m(along.distance_m)
+        known = np.isfinite(along.probability)
+        confident = np.where(known, along.probability, 0.0) >= CONFIDENT
+        share = float(weights[confident].sum() / weights.sum()) if known.any() else math.nan
+        error_m = _rms(along.error_m, weights * np.nan_to_num(along.probability))
+    longest = max(stretches, key=lambda each: each.length_m, default=None)
     return {
-        "area_km2": plain(result.area_km2, 4),
-        "second_date": bool(result.second_date),
-        **plain(
-            {
-                "mean_probability": result.mean,
-                "error_m": summary.error_m,
-                "route_m": summary.route_m,
-                "route_s": summary.route_s,
-                "route_share_from_0_9": summary.confident_share,
-            }
-        ),
-        "blind_stretches": len(result.stretches),
-        "unrecoverable_stretches": summary.unrecoverable,
-        "longest_stretch": longest,
+        "area_km2": result.area_km2,
+        "second_date": result.second_date,
+        "mean_probability": result.mean,
+        "error_m": error_m,
+        "route_m": route_m,
+        "route_s": route_m / result.conditions.speed_mps,
+        "route_share_from_0_9": share,
+        "blind_stretches": len(stretches),
+        "unrecoverable_stretches": sum(not each.recoverable for each in stretches),
+        "longest_stretch": None if longest is None else stretches.index(longest) + 1,
     }
+
+
+def _length_per_point_m(distance_m: Array) -> Array:
+    """Length of the route (N,) that each of its points represents."""
+    if len(distance_m) < 2:
+        return np.ones(len(distance_m))
+    steps = np.diff(distance_m)
+    return np.asarray(np.concatenate([steps[:1], steps[1:] + steps[:-1], steps[-1:]]) / 2)
+
+
+def _rms(values: Array, weights: Array) -> float:
+    """Weighted root mean square of the known values; NaN for none."""
+    known = np.isfinite(values) & np.isfinite(weights) & (weights > 0)
+    if not known.any():
+        return math.nan
+    return float(np.sqrt(np.average(values[known] ** 2, weights=weights[known])))
 
 
 def _cells(frame: LocalFrame, cells: Cells) -> Plain:
@@ -147,7 +177,7 @@ def _route(result: CheckResult) -> Plain | None:
     return found
 
 
-def latlon_deg(frame: LocalFrame, points_en_m: NDArray[np.float64]) -> list[list[float]]:
+def latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
     """Latitude and longitude of points (N, 2), rounded to a centimetre."""
     lat, lon = frame.latlon_from_en(points_en_m)
     rounded: list[list[float]] = np.round(np.stack([lat, lon], axis=1), _DIGITS["deg"]).tolist()
