@@ -100,8 +100,12 @@ def test_more_candidates_are_compared_until_a_place_is_proven(monkeypatch, confi
     assert found == Found(confidences[-1])
 
 
-def test_views_judged_at_the_finest_level_are_not_compared_finer(monkeypatch):
-    assert searched(monkeypatch, [0.5], final=0)[1] == [(3, False)]
+def test_without_a_finer_level_more_candidates_are_finished_at_the_finest(monkeypatch):
+    assert searched(monkeypatch, [0.5, 0.5], final=0)[1] == [(3, False), (48, False)]
+
+
+def test_views_judged_at_the_level_they_are_finished_at_have_no_further_pass(monkeypatch):
+    assert searched(monkeypatch, [0.5], final=LOOK)[1] == [(3, False)]
 
 
 def test_a_budget_leaves_it_out(monkeypatch):
@@ -134,10 +138,17 @@ def test_before_a_cheap_search_there_is_no_trial(monkeypatch):
     assert (ran, finished) == ([50.0, 10.0], [(3, False)])
 
 
-@pytest.mark.parametrize("changes", [{"final": 0}, {"learnt": False}])
-def test_without_a_finer_level_or_a_confidence_there_is_no_trial(monkeypatch, changes):
+@pytest.mark.parametrize("changes", [{"final": LOOK}, {"learnt": False}])
+def test_where_nothing_is_finished_or_no_confidence_is_known_there_is_no_trial(
+    monkeypatch, changes
+):
     ran, finished, _ = searched(monkeypatch, [0.999] * 3, costs_ms=(50.0, 300.0), **changes)
     assert ran == [50.0, 300.0] and finished[0] == (3, False)
+
+
+def test_a_trial_without_a_finer_level_finishes_the_best_candidates(monkeypatch):
+    ran, finished, found = searched(monkeypatch, [0.999], costs_ms=(50.0, 300.0), final=0)
+    assert (ran, finished, found) == ([50.0], [(3, False)], Found(0.999))
 
 
 def test_other_places_are_less_confident_than_the_one_that_won_in_detail():

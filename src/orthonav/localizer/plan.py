@@ -198,6 +198,13 @@ class SearchPlan:
         least, most = self.tile_candidates
         return max(least, min(most, round(tiles / self.tiles_per_candidate)))
 
+    def doubt_passes(self, levels: Levels) -> tuple[tuple[int, float], ...]:
+        """The passes of `finer` for a view: without a finer level only that of most candidates,
+        which are finished; none where candidates are finished at the level they are judged at."""
+        if levels.final == levels.look:
+            return ()
+        return self.finer if levels.final > 0 else self.finer[-1:]
+
     def enough(self, run: Search, levels: Levels) -> ClearMargin:
         """The margin that ends the search after `run`."""
         fine = run.from_tiles or run.level == levels.look

@@ -77,17 +77,18 @@ class ViewSearch:
         """The best place so far, if a trial proves it that costs less than the next search.
 
         `cost_ms`: that of the next search. The best few candidates are placed on the terrain, where
-        there is one, and compared one level finer. Where only a part of all places was compared, or
-        only a few on the terrain, the best must stand out as well.
+        there is one, and finished; they are compared one level finer, where there is such a level.
+        Where only a part of all places was compared, or only a few on the terrain, the best must
+        stand out as well.
         """
         plan, ground, last = self._plan, self._ground, self._last
         trial_ms = plan.trial_ms if ground.is_level else plan.terrain_trial_ms
-        if last is None or self._confidence is None or self._levels.final == 0:
+        if last is None or self._confidence is None or self._levels.final == self._levels.look:
             return None
         if not self._judged or cost_ms <= trial_ms or not self._budget.allows(trial_ms):
             return None
         placed = ground.placed_on_terrain(self._judged, plan.trials)
-        found = self._finished(placed, plan.trials, finer=True)
+        found = self._finished(placed, plan.trials, finer=self._levels.final > 0)
         compared_all = ground.is_level and last.level == self._levels.look and not last.from_tiles
         if not compared_all and not self._is_clear(found, plan.trial_clear):
             return None
@@ -96,16 +97,17 @@ class ViewSearch:
     def _concluded(self) -> Registered:
         """The best place after all searches, none of which ended with one that stands out.
 
-        While it is not proven, more candidates are finished and compared one level finer.
+        While it is not proven, more candidates are finished, and compared one level finer where
+        there is such a level.
         """
         plan, judged = self._plan, self._judged
         if not self._ground.is_level and self._budget.allows(0.0):
             judged = self._ground.placed_on_terrain(judged, plan.terrain_candidates)
         found = self._finished(judged)
-        for kept, cost_ms in plan.finer if self._levels.final > 0 else ():
+        for kept, cost_ms in plan.doubt_passes(self._levels):
             if self._is_proven(found, plan.doubt) or not self._budget.allows(cost_ms):
                 break
-            found = self._finished(judged, kept, finer=True)
+            found = self._finished(judged, kept, finer=self._levels.final > 0)
         return replace(found, cut_short=self._budget.cut_short)
 
     def _finished(
