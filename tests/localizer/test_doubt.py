@@ -42,11 +42,12 @@ class Registrar:
     def __init__(self, confidences, ratio):
         self.kept, self._left, self._ratio = [], iter(confidences), ratio
 
-    def judged(self, *_):
+    def judged(self, templates, levels, candidates, level, *_):
+        assert level <= levels.coarse  # candidates from above are compared at the coarse level
         return ["a place"]
 
     def standing(self, *_):
-        return 30.0, 29.0
+        return 30.0, 30.0 / self._ratio
 
     def finished(self, *_, finer, kept, **__):
         self.kept.append((kept, finer is not None))
@@ -131,6 +132,17 @@ def test_where_few_places_were_compared_it_must_stand_out_too(monkeypatch, chang
     assert ran == list(costs_ms)
     ran, *_ = searched(monkeypatch, [0.999], costs_ms=costs_ms, ratio=1.3, **changes)
     assert ran == [50.0]
+
+
+def test_a_place_that_stands_out_ends_the_search_unless_few_places_were_compared(monkeypatch):
+    costs_ms = 50.0, 10.0
+    ran, *_ = searched(monkeypatch, [0.5] * 6, costs_ms=costs_ms, ratio=3.0, level=LOOK + 1)
+    assert ran == [50.0]
+    for confidence, number in ((0.5, 2), (0.995, 1)):
+        ran, *_ = searched(
+            monkeypatch, [confidence] * 6, costs_ms=costs_ms, ratio=3.0, level=LOOK + 2
+        )
+        assert ran == list(costs_ms[:number])
 
 
 def test_before_a_cheap_search_there_is_no_trial(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.register import refine, search, template
-from orthonav.register.kernel import KERNEL
+from orthonav.register.kernel import KERNEL, SEARCH
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Refiner
 from orthonav.register.scale_map import ScaleMap
@@ -15,6 +15,7 @@ from orthonav.register.search import SearchWindow, bank, best_near
 
 SHAPE = (256, 320)
 GROUND = Ground()
+needs_search = pytest.mark.skipif(SEARCH is None, reason="the kernel does not search here")
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason="the kernel was not compiled")
 
 
@@ -29,8 +30,8 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (refine, search, template):
-        monkeypatch.setattr(module, "KERNEL", None)
+    for module, name in ((refine, "KERNEL"), (search, "SEARCH"), (template, "KERNEL")):
+        monkeypatch.setattr(module, name, None)
     return compiled, work()
 
 
@@ -146,18 +147,19 @@ SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
 """Heights and widths of windows, searched in transforms of all factors and odd lengths."""
 
 
-@needs_kernel
+@needs_search
 @pytest.mark.parametrize("with_scales", [False, True])
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_a_search_finds_the_same_scores_and_poses(reference, monkeypatch, size, with_scales):
     made, _ = next(views(1, 7, 1))
     poses = bank(None, 0.1, turn_step_rad=0.6, scale_step=0.13, sigmas=2).poses
+    np.random.default_rng(3).shuffle(poses)  # smaller ones after larger ones
     values = np.random.default_rng(2).uniform(-0.3, 0.3, (9, 11)).astype(np.float32)
     scales = ScaleMap(values, 40.0, 0.05) if with_scales else None
 
     def work():
         window = SearchWindow(reference.window(1, 10, -20, *size), 1, 10, -20, 60)
-        window.prepare()
+        window.prepare(made)
         return search._best_of(made, window, poses, range(2, len(poses)), scales)
 
     (scores, numbers), (plain_scores, plain_numbers) = both(monkeypatch, work)
@@ -170,7 +172,7 @@ def test_a_search_finds_the_same_scores_and_poses(reference, monkeypatch, size, 
     assert differs[seen].sum() <= 1e-3 * seen.sum()
 
 
-@needs_kernel
+@needs_search
 @pytest.mark.parametrize("reach_px", [0.0, 3.0, 14.0])
 def test_the_best_place_near_by_is_the_same(reference, monkeypatch, reach_px):
     made, _ = next(views(1, 7, 1))
@@ -182,21 +184,24 @@ def test_the_best_place_near_by_is_the_same(reference, monkeypatch, reach_px):
         assert one.score < 1e-3 or apart_px(one.pose, other.pose) < 1e-2
 
 
-@needs_kernel
+@needs_search
 def test_near_poses_beyond_all_bounds_touch_no_memory():
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
     channels = np.ones((20, 30, 3), np.float32)
-    places = np.array([(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (3, 4, math.nan, 0)], np.float64)
-    out = np.full((3, 3), math.nan)
-    KERNEL.near(channels, made.values, made.weights, places, 2, out)
-    assert (out[:2, 0] == 0).all()
+    beyond = [(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (5, 5, 0, 80.0), (5, 5, 0, math.nan)]
+    places = np.array([*beyond, (3, 4, math.nan, 0)], np.float64)
+    out = np.full((5, 3), math.nan)
+    SEARCH.near(channels, made.values, made.weights, places, 2, out)
+    assert (out[:4, 0] == 0).all()
 
 
-@needs_kernel
-@pytest.mark.parametrize("damage", ["size", "bands", "numbers", "groups", "strided", "expected"])
+@needs_search
+@pytest.mark.parametrize(
+    "damage", ["size", "empty", "bands", "numbers", "groups", "strided", "expected"]
+)
 def test_windows_that_do_not_match_are_refused(damage):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    rows, cols = (44, 40) if damage == "size" else (45, 40)
+    rows, cols = {"size": (44, 40), "empty": (0, 40)}.get(damage, (45, 40))
     spectra = np.zeros((cols // 2 // 8 + 1 + (damage == "groups"), 3, rows, 16), np.float32)
     best = np.zeros((4 if damage == "bands" else 3, cols, 16), np.float32)
     numbers = np.zeros(best.shape, np.int32 if damage != "numbers" else np.int64)
@@ -205,4 +210,19 @@ def test_windows_that_do_not_match_are_refused(damage):
         best = np.zeros((6, cols, 16), np.float32)[::2]
     poses = np.zeros((1, 4))
     with pytest.raises(ValueError, match=r"window|expected|contiguous"):
-        KERNEL.search(spectra, made.values, made.weights, poses, 0, best, numbers, expected)
+        SEARCH.search(spectra, made.values, made.weights, poses, 0, best, numbers, expected)
+
+
+@needs_search
+@pytest.mark.parametrize("missing", range(5))
+def test_an_array_that_is_missing_is_refused(missing):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    spectra, poses = np.zeros((3, 3, 45, 16), np.float32), np.zeros((1, 4))
+    best, numbers = np.zeros((3, 40, 16), np.float32), np.zeros((3, 40, 16), np.int32)
+    given = [spectra, made.values, poses, best, numbers]
+    given[missing] = None
+    spectra, values, poses, best, numbers = given
+    with pytest.raises(TypeError):
+        SEARCH.search(spectra, values, made.weights, poses, 0, best, numbers, None)
+    with pytest.raises(TypeError):
+        SEARCH.near(None, made.values, made.weights, np.zeros((1, 4)), 2, np.zeros((1, 3)))

@@ -122,15 +122,7 @@ class ViewCandidates:
             self._rows,
             run.candidates,
         )
-        found = self._nearby(tiles, plan.tile_reach_strides * grid.stride_m / grid.gsd_m)
-        if self.prior is None:
-            return found
-        x, y = self.middle_px
-        return [
-            each
-            for each in found
-            if max(abs(each.pose.x_px - x), abs(each.pose.y_px - y)) <= self.reach_px
-        ]
+        return self._nearby(tiles, plan.tile_reach_strides * grid.stride_m / grid.gsd_m)
 
     def _by_fft(self, run: Search) -> list[Candidate]:
         """The best places of the sheet, or of what the prior allows, at the level of a search."""
@@ -152,11 +144,20 @@ class ViewCandidates:
         return self._promising(found)
 
     def _nearby(self, found: list[Candidate], reach_px: float) -> list[Candidate]:
-        """Candidates at the best place within `reach_px` (level 0), at the coarse level."""
+        """Candidates at the best place within `reach_px` (level 0) of each, at the coarse level;
+        those that the prior allows."""
         view, scales = self.view, self.plan.nearby_log_scales
-        return self._promising(
+        moved = self._promising(
             self.registrar.nearby(view.templates, view.levels, found, reach_px, scales)
         )
+        if self.prior is None:
+            return moved
+        x, y = self.middle_px
+        return [
+            each
+            for each in moved
+            if max(abs(each.pose.x_px - x), abs(each.pose.y_px - y)) <= self.reach_px
+        ]
 
     def _promising(self, found: list[Candidate]) -> list[Candidate]:
         """The first of candidates, best first: those that are not far weaker than the best."""

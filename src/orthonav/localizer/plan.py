@@ -258,8 +258,10 @@ class SearchPlan:
         if cost_ms <= self.last_ms:
             return Search(levels.coarse, poses, False, self.candidates, cost_ms)
         far, count = levels.coarse + 1, self.far_candidates
-        cost_ms = fft_ms(far, len(poses)) + self.nearby_ms * count
-        return Search(far, poses, False, count, cost_ms)
+        far_ms = fft_ms(far, len(poses)) + self.nearby_ms * count
+        if math.isinf(far_ms):  # there is no such level
+            return Search(levels.coarse, poses, False, self.candidates, cost_ms)
+        return Search(far, poses, False, count, far_ms)
 
     def _poses(
         self, prior: PosePrior, turn_step_rad: float, scale_step: float

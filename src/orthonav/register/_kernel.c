@@ -14,7 +14,7 @@
 #include <math.h>
 #include <string.h>
 
-#define LAYOUT 2        /* of all arguments and results; kernel.py has the same number */
+#define LAYOUT 3        /* of all arguments and results; kernel.py has the same number */
 #define BLOCKS 6        /* blocks along a side of a view: orthonav.register.template.BLOCKS */
 #define FULLY_VALID 0.99f
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
@@ -44,7 +44,7 @@ INLINE float from_middle(int at, int side) { return (float)at + 0.5f - (float)si
 /* Block that a row or column belongs to: the first ones are floor(side * block / BLOCKS). */
 INLINE int block_of(int at, int side) { return ((at + 1) * BLOCKS - 1) / side; }
 
-/* The same where all four taps are inside. */
+/* As `sampled` of _kernel.h, where all four taps are inside. */
 INLINE lanes inside(const float *at, Py_ssize_t stride, float right, float down) {
     const lanes upper = load(at), lower = load(at + stride);
     const lanes next = load(at + LANES), last = load(at + stride + LANES);
@@ -491,7 +491,7 @@ static PyMethodDef functions[] = {
      "search(spectra, view, weights, poses, first, best, which, expected): see "
      "orthonav.register.search."},
     {"near", py_near, METH_VARARGS,
-     "near(channels, view, weights, corner, poses, reach, out): see orthonav.register.search."},
+     "near(channels, view, weights, places, reach, out): see orthonav.register.search."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -502,7 +502,8 @@ static struct PyModuleDef module = {
 
 PyMODINIT_FUNC PyInit__kernel(void) {
     PyObject *made = PyModule_Create(&module);
-    if (made && PyModule_AddIntConstant(made, "LAYOUT", LAYOUT) < 0) {
+    if (made && (PyModule_AddIntConstant(made, "LAYOUT", LAYOUT) < 0 ||
+                 PyModule_AddIntConstant(made, "SEARCHES", HAS_AVX2) < 0)) {
         Py_DECREF(made);
         return NULL;
     }

@@ -27,6 +27,7 @@ typedef float lanes_in_memory __attribute__((vector_size(16), aligned(4)));
         else NAME##_plain ARGUMENTS;                                                                \
     }
 #else
+#define HAS_AVX2 0
 #define FOR_EVERY_PROCESSOR(NAME, PARAMETERS, ARGUMENTS)                                            \
     static void NAME PARAMETERS { NAME##_inline ARGUMENTS; }
 #endif

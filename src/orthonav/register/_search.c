@@ -139,19 +139,19 @@ INLINE void transform_inline(const plan_t *plan, pair_t *data, pair_t *scratch, 
 FOR_EVERY_PROCESSOR(transform, (const plan_t *plan, pair_t *data, pair_t *scratch, pair_t **ended),
                     (plan, data, scratch, ended))
 
-/* 0; or -1 without memory, or where the length has other prime factors than 2, 3 and 5. */
+/* 0; -1 where the length has other prime factors than 2, 3 and 5; -2 without memory. */
 static int make_plan(int length, plan_t *plan) {
     static const int factors[] = {4, 2, 3, 5};
     int rest = length;
     size_t size = 0;
     plan->length = length, plan->count = 0, plan->twiddles = NULL;
-    for (int at = 0; at < 4; at++)
+    for (int at = 0; at < 4 && length > 0; at++)
         for (; rest % factors[at] == 0; rest /= factors[at]) plan->factors[plan->count++] = factors[at];
-    if (rest != 1) return -1;
+    if (rest != 1 || length < 1) return -1;
     for (int at = 0, done = 1; at < plan->count; done *= plan->factors[at++])
         size += (size_t)(plan->factors[at] - 1) * (length / (done * plan->factors[at]));
     float *into = plan->twiddles = malloc((2 * size + 1) * sizeof(float));
-    if (!into) return -1;
+    if (!into) return -2;
     for (int at = 0, done = 1; at < plan->count; done *= plan->factors[at++])
         for (int i = 1; i < length / (done * plan->factors[at]); i++)
             for (int j = 1; j < plan->factors[at]; j++) {
@@ -424,16 +424,15 @@ static int search_all(search_t *search, const view_t *view, const pose_t *poses,
         const int half = half_of(view, poses[at].log_scale);
         if (half <= most && half > largest) largest = half;
     }
-    const size_t side = 2 * (size_t)largest, strips = search->groups * CHANNELS * side * PAIR;
+    const size_t side = 2 * (size_t)largest;
     search->planes = memory_for(CHANNELS * side * side);
-    search->strips = memory_for(strips);
+    search->strips = memory_for(search->groups * CHANNELS * side * PAIR);
     search->surface = memory_for((size_t)search->groups * rows * PAIR);
     search->data = memory_for((size_t)longest * PAIR);
     search->scratch = memory_for((size_t)longest * PAIR);
     search->total = memory_for((size_t)rows * PAIR);
     const int has_memory = search->planes && search->strips && search->surface && search->data &&
                            search->scratch && search->total;
-    if (has_memory) memset(search->strips, 0, strips * sizeof(float));
     for (Py_ssize_t at = 0; has_memory && at < count; at++) {
         const pose_t *pose = poses + at;
         const int half = half_of(view, pose->log_scale);
@@ -542,7 +541,7 @@ static void best_near(const near_t *near, const view_t *view, const place_t *pla
     memset(near->sums, 0, (size_t)places * near->across * sizeof(wide));
     for (int at = 0; at < 2 * half; at++) {
         interleave(near, half, gains, at, &from, &to);
-        add_row(near, at, from, to);
+        if (from < to) add_row(near, at, from, to);
     }
     for (int down = 0; down < places; down++)
         for (int right = 0; right < places; right++) {
@@ -558,13 +557,13 @@ static void best_near(const near_t *near, const view_t *view, const place_t *pla
                           score_at(near, best_down + 1, best_right));
 }
 
-/* 0, or -1 without memory. */
+/* 0, or -1 without memory. A view larger than any map scores 0. */
 static int search_near(near_t *near, const view_t *view, const place_t *places, Py_ssize_t count,
                        double *out) {
     int largest = 0;
     for (Py_ssize_t at = 0; at < count; at++) {
         const int half = half_of(view, places[at].log_scale);
-        if (half > largest) largest = half;
+        if (half > largest && half < LARGEST / 8) largest = half;
     }
     const size_t side = 2 * (size_t)largest, size = side + 2 * near->reach;
     near->across = (2 * near->reach + AT_ONCE) / AT_ONCE * AT_ONCE;
@@ -575,20 +574,22 @@ static int search_near(near_t *near, const view_t *view, const place_t *places, 
     near->around = memory_for(size * near->around_floats);
     near->sums = memory_for((size_t)(2 * near->reach + 1) * near->across * WIDE);
     const int has_memory = near->planes && near->posed && near->around && near->sums;
-    for (Py_ssize_t at = 0; has_memory && at < count; at++) best_near(near, view, places + at, out + 3 * at);
+    for (Py_ssize_t at = 0; has_memory && at < count; at++, out += 3) {
+        out[0] = 0.0, out[1] = places[at].x, out[2] = places[at].y;
+        if (half_of(view, places[at].log_scale) <= largest) best_near(near, view, places + at, out);
+    }
     free(near->planes), free(near->posed), free(near->around), free(near->sums);
     return has_memory ? 0 : -1;
 }
 
 /* ---- What Python calls ---- */
 
-/* Borrow contiguous buffers; 0, or -1 with an error and none borrowed. */
 typedef struct {
     PyObject *from;
     int dimensions;
     Py_ssize_t last;
     char kind;
-    int flags;
+    int flags, may_be_none;
 } wanted_t;
 
 static void give_back(Py_buffer *buffers, int count) {
@@ -596,11 +597,12 @@ static void give_back(Py_buffer *buffers, int count) {
         if (buffers[count].obj) PyBuffer_Release(buffers + count);
 }
 
+/* Borrow contiguous buffers; 0, or -1 with an error and none borrowed. */
 static int borrow_all(const wanted_t *wanted, Py_buffer *buffers, int count) {
     memset(buffers, 0, count * sizeof *buffers);
     for (int at = 0; at < count; at++) {
         const wanted_t *want = wanted + at;
-        if (want->from == Py_None) continue;
+        if (want->from == Py_None && want->may_be_none) continue;
         if (borrow(want->from, buffers + at, want->dimensions, want->last, want->kind, want->flags) < 0) {
             buffers[at].obj = NULL;
             give_back(buffers, at);
@@ -635,25 +637,26 @@ PyObject *py_search(PyObject *self, PyObject *arguments) {
     if (!PyArg_ParseTuple(arguments, "OO(dd)OiOOO", &from[0], &from[1], &weights[0], &weights[1], &from[2],
                           &first, &from[3], &from[4], &from[5]))
         return NULL;
-    const wanted_t wanted[6] = {{from[0], 4, PAIR, 'f', 0},
-                                {from[1], 3, LANES, 'f', 0},
-                                {from[2], 2, 4, 'd', 0},
-                                {from[3], 3, PAIR, 'f', PyBUF_WRITABLE},
-                                {from[4], 3, PAIR, 'i', PyBUF_WRITABLE},
-                                {from[5], 3, PAIR, 'f', 0}};
+    const wanted_t wanted[6] = {{from[0], 4, PAIR, 'f', 0, 0},
+                                {from[1], 3, LANES, 'f', 0, 0},
+                                {from[2], 2, 4, 'd', 0, 0},
+                                {from[3], 3, PAIR, 'f', PyBUF_WRITABLE, 0},
+                                {from[4], 3, PAIR, 'i', PyBUF_WRITABLE, 0},
+                                {from[5], 3, PAIR, 'f', 0, 1}};
     if (borrow_all(wanted, got, 6) < 0) return NULL;
     const Py_ssize_t *of_map = got[0].shape, *of_best = got[3].shape;
     search_t search = {.spectra = got[0].buf, .groups = (int)of_map[0], .bands = (int)of_best[0]};
     const bests_t bests = {got[3].buf, got[4].buf, got[5].buf};
     const view_t view = view_of(&got[1], weights);
     const int rows = (int)of_map[2], cols = (int)of_best[1];
-    if (of_map[1] != CHANNELS || of_map[0] != cols / 2 / WIDE + 1 || rows > LARGEST || cols > LARGEST ||
+    if (rows < 1 || cols < 1 || of_best[0] < 1 || of_map[1] != CHANNELS || of_map[0] != cols / 2 / WIDE + 1 || rows > LARGEST || cols > LARGEST ||
         (of_best[0] - 1) * PAIR >= rows || !is_alike(&got[3], &got[4]) ||
         (got[5].obj && !is_alike(&got[3], &got[5])))
         PyErr_SetString(PyExc_ValueError, "spectra, scores and numbers must be of one window");
-    else if (make_plan(rows, &search.down) < 0 || make_plan(cols, &search.along) < 0)
-        PyErr_SetString(PyExc_ValueError, "sides of the window must be products of 2, 3 and 5");
-    else {
+    else if ((failed = make_plan(rows, &search.down)) || (failed = make_plan(cols, &search.along))) {
+        if (failed == -2) PyErr_NoMemory();
+        else PyErr_SetString(PyExc_ValueError, "sides of the window must be products of 2, 3 and 5");
+    } else {
         Py_BEGIN_ALLOW_THREADS
         failed = search_all(&search, &view, got[2].buf, got[2].shape[0], first, &bests);
         Py_END_ALLOW_THREADS
@@ -673,10 +676,10 @@ PyObject *py_near(PyObject *self, PyObject *arguments) {
     if (!PyArg_ParseTuple(arguments, "OO(dd)OiO", &from[0], &from[1], &weights[0], &weights[1], &from[2],
                           &reach, &from[3]))
         return NULL;
-    const wanted_t wanted[4] = {{from[0], 3, CHANNELS, 'f', 0},
-                                {from[1], 3, LANES, 'f', 0},
-                                {from[2], 2, 4, 'd', 0},
-                                {from[3], 2, 3, 'd', PyBUF_WRITABLE}};
+    const wanted_t wanted[4] = {{from[0], 3, CHANNELS, 'f', 0, 0},
+                                {from[1], 3, LANES, 'f', 0, 0},
+                                {from[2], 2, 4, 'd', 0, 0},
+                                {from[3], 2, 3, 'd', PyBUF_WRITABLE, 0}};
     if (borrow_all(wanted, got, 4) < 0) return NULL;
     near_t near = {.map = got[0].buf, .rows = (int)got[0].shape[0], .cols = (int)got[0].shape[1],
                    .reach = reach};

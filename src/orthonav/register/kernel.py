@@ -5,7 +5,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-LAYOUT = 2
+LAYOUT = 3
 """Number of the layout of arguments and results; a kernel with another one is not used."""
 _NAME = "orthonav.register._kernel"
 log = logging.getLogger(__name__)
@@ -28,3 +28,7 @@ def _compiled() -> Any:
 KERNEL: Any = _compiled()
 """Module of the functions in `_kernel.c`; None where no compiler was at hand at installation. NumPy
 then does the same, several times slower."""
+
+SEARCH: Any = KERNEL if KERNEL is not None and KERNEL.SEARCHES else None
+"""The kernel where it searches faster than SciPy: on processors with AVX2. Elsewhere its vectors of
+eight numbers are slow, and SciPy and OpenCV search (docs/decisions/registration.md, 15)."""

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from orthonav.register.evidence import CHANNELS, FINE, EvidenceRecipe, evidence
 
 Array = NDArray[np.float32]
+LONGEST_PX = 32768
+"""Longest side of an array that the kernel and OpenCV sample."""
 WHOLE_LEVEL_PX = 2_000_000
 """Levels of up to so many pixels are made ready whole, once (16 bytes each)."""
 
@@ -50,7 +52,9 @@ class Reference:
 
     def caches(self, level: int) -> bool:
         """Whether the evidence of a level is made once and cached: where it is small enough."""
-        return math.prod(self.shape(level)) <= WHOLE_LEVEL_PX
+        return (
+            math.prod(self.shape(level)) <= WHOLE_LEVEL_PX and max(self.shape(level)) <= LONGEST_PX
+        )
 
     def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> Array:
         """Evidence (H, W, 4) of a whole level, computed once."""

@@ -15,6 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from orthonav.register.evidence import COARSE, FINE, EvidenceRecipe
+from orthonav.register.kernel import SEARCH
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
@@ -28,7 +29,7 @@ LOOK_PX = 72.0
 (docs/decisions/registration.md, 2)."""
 KEPT_TO_LOOK = 200
 """Candidates that pass from the coarse level to the judged one, at most
-(docs/decisions/registration.md, 12)."""
+(docs/decisions/registration.md, 15)."""
 KEPT_TO_FINISH = 3
 """Places that are finished: the best and its rivals."""
 KEPT_TO_FINEST = 12
@@ -53,7 +54,7 @@ MAX_KEPT_WINDOWS = 4
 """Search windows of whole sheets in the cache."""
 SAME_PLACE_SHARE = 1 / 8
 """Candidates from tiles closer together than this share of the view's side are one place."""
-WHOLE_WINDOW_PX = 4_000_000
+WHOLE_WINDOW_PX = 8_000_000
 """Up to so many pixels of the coarse level their surroundings are cut out of one window of the
 whole sheet (12 bytes each); of larger sheets a window is made for each."""
 MAX_RATIO = 10.0
@@ -280,7 +281,8 @@ class Registrar:
         if math.prod(self.reference.shape(levels.coarse)) <= WHOLE_WINDOW_PX:
             whole = self.whole_window(levels.coarse, recipe, side_px)
             _ = whole.channels
-        _ = template.interleaved  # made, like the channels, before threads ask for them
+        if SEARCH is None:
+            _ = template.interleaved  # made, like the channels, before threads ask for them
 
         def moved(some: Sequence[Candidate]) -> list[Candidate]:
             place = some[0].pose.x_px, some[0].pose.y_px

@@ -21,7 +21,7 @@ from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
-from orthonav.register.kernel import KERNEL
+from orthonav.register.kernel import SEARCH
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale, rotation
 from orthonav.register.reference import cut
@@ -39,6 +39,8 @@ PLACES_AT_ONCE = 50
 """Poses whose surroundings a thread searches at a time."""
 WIDE = 8
 """Columns or rows that the kernel transforms together."""
+LONGEST_PX = 32768
+"""Longest side of a window that the kernel takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +128,14 @@ class SearchWindow:
             into[..., 0, : some.shape[2]], into[..., 1, : some.shape[2]] = some.real, some.imag
         return out.reshape(len(out), channels, rows, 2 * WIDE)
 
-    def prepare(self) -> None:
-        """Make what threads share, so that none makes it again."""
-        _ = self.spectra if KERNEL is None else self.spectra_by_columns
+    @property
+    def by_kernel(self) -> bool:
+        """Whether the kernel searches it: where there is one, and no side is too long for it."""
+        return SEARCH is not None and max(self.size) <= LONGEST_PX
+
+    def prepare(self, template: Template) -> None:
+        """Make what threads share when they search for a view, so that none makes it again."""
+        _ = self.spectra_by_columns if self.by_kernel else (self.spectra, template.interleaved)
 
     def _transformed(self) -> NDArray[np.complex64]:
         planes = np.moveaxis(self._normalized(), 2, 0)
@@ -164,8 +171,7 @@ def search(
     """
     share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
     parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
-    _ = template.interleaved
-    window.prepare()
+    window.prepare(template)
     surfaces = (pool.map if pool else map)(
         lambda part: _best_of(template, window, poses, part, scales), parts
     )
@@ -204,11 +210,11 @@ def best_near(
         ]
     ).reshape(-1, 4)
     found = np.empty((len(places), 3))
-    if KERNEL is None:
+    if SEARCH is None:
         for place, into in zip(places, found, strict=True):
             into[:] = _best_near(template, window, place, reach)
     else:
-        KERNEL.near(window.channels, template.values, template.weights, places, reach, found)
+        SEARCH.near(window.channels, template.values, template.weights, places, reach, found)
     found[:, 1] = (window.col + found[:, 1]) * unit
     found[:, 2] = (window.row + found[:, 2]) * unit
     return [
@@ -247,7 +253,7 @@ def _best_of(
     """The best score (H, W) of some of the poses at every place, and the number of its pose."""
     shape = window.height, window.width
     expected = None if scales is None else scales.over(window.level, window.row, window.col, shape)
-    if KERNEL is not None:
+    if window.by_kernel:
         return _best_by_kernel(template, window, poses, part, scales, expected)
     best = np.full(shape, -np.inf, np.float32)
     which = np.zeros(shape, np.int32)
@@ -287,7 +293,7 @@ def _best_by_kernel(
             for turn, log_scale in (poses[number] for number in part)
         ]
     )
-    KERNEL.search(
+    SEARCH.search(
         *(window.spectra_by_columns, template.values, template.weights, tried, part.start),
         *(best, which, None if expected is None else _in_bands(expected, best.shape)),
     )

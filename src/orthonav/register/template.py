@@ -247,7 +247,8 @@ def halved(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Grey and valid at half the resolution; the last row or column of an odd number is left out.
 
-    The middle stays where it is unless one is.
+    Leaving one out moves the middle by half a pixel of the finer picture: above the coarse level,
+    where places are only known to more than that.
     """
     size = grey.shape[1] // 2, grey.shape[0] // 2
     grey, valid = grey[: 2 * size[1], : 2 * size[0]], valid[: 2 * size[1], : 2 * size[0]]
