@@ -47,7 +47,7 @@ class Registrar:
         return ["a place"]
 
     def standing(self, *_):
-        return 30.0, 30.0 / self._ratio
+        return 60.0, 60.0 / self._ratio
 
     def finished(self, *_, finer, kept, **__):
         self.kept.append((kept, finer is not None))
