@@ -56,7 +56,7 @@ rm -f "$work/src/$kernel".*so
 if command -v aarch64-linux-gnu-gcc >/dev/null; then
     aarch64-linux-gnu-gcc -O3 -shared -fPIC "-I$work/root/usr/include/$python" \
         -idirafter "$work/root/usr/include" -o "$work/src/$kernel.abi3.so" \
-        "$checkout/src/$kernel.c" -lm
+        -Wno-psabi "$checkout/src/$kernel.c" "$checkout/src/orthonav/register/_search.c" -lm
 else
     echo "aarch64-linux-gnu-gcc is missing: NumPy takes the place of the kernel" >&2
 fi
