@@ -392,6 +392,14 @@ def test_no_more_windows_are_kept_than_a_few():
     assert len(registrar._windows) == MAX_KEPT_WINDOWS
 
 
+def test_the_window_that_was_used_last_is_kept():
+    registrar = Registrar(reference_of(GROUND, (128, 128)))
+    used = registrar.whole_window(1, FINE, 20.0)
+    for view_px in np.geomspace(40, 400, 25):
+        registrar.whole_window(1, FINE, float(view_px))
+        assert registrar.whole_window(1, FINE, 20.0) is used
+
+
 @pytest.mark.parametrize("level", [1, 2])
 def test_a_part_reaches_as_far_as_given(registrar, level):
     """Middles of views within the reach are sought, those well beyond it are not."""

@@ -65,8 +65,8 @@ def build_atlas(
 
     A sheet that fails is listed in the result, and the others are built. `progress` is called
     with a stage and its share done, `report` with lines for people. Raises `AreaError`,
-    `ImageryError`, `MissingFileError`; `AtlasError` where present sheets were made otherwise;
-    `WorkerError` where workers have other versions; `StorageError`.
+    `ImageryError`, `MissingFileError`; `AtlasError` where present sheets are of other imagery or
+    versions; `WorkerError` where workers have other versions; `StorageError`.
     """
     started_s = time.monotonic()
     orthos = [Path(path).absolute() for path in request.orthos]

@@ -45,7 +45,7 @@ class AtlasRequest:
     `bounds_deg`: area: west, south, east, north.
     `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
     imagery is the area.
-    `replace`: rebuild sheets that were made otherwise, instead of refusing them.
+    `replace`: rebuild sheets of other imagery or program versions instead of refusing them.
     `index`: also make the index of the coarse tiles.
     `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
     what its heights count from.
@@ -273,7 +273,7 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
-    """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
+    """Raise `AtlasError` naming the sheets of the atlas (`known`) of other imagery or versions."""
     sheets = [task.sheet for task in tasks if task.sheet.id in known]
     other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
     if not other:
@@ -288,6 +288,6 @@ def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None
     )
     named = ", ".join(sheet.id for sheet in other[:5]) + (", .." if len(other) > 5 else "")
     raise AtlasError(
-        f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
+        f"{len(other)} of {len(tasks)} sheets of the atlas are of other imagery or versions "
         f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
     )

@@ -9,6 +9,7 @@ positive roll makes it look left.
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,11 +104,14 @@ class Camera:
         )
 
 
+@lru_cache(maxsize=64)
 def enu_from_camera(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
-    """Rotation (3, 3) from camera axes to east, north, up."""
+    """Rotation (3, 3) from camera axes to east, north, up; not to be written to."""
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     ned_from_body = _rotation(2, yaw) @ _rotation(1, pitch) @ _rotation(0, roll)
-    return np.asarray(_ENU_FROM_NED @ ned_from_body @ _BODY_FROM_CAMERA)
+    rotation = np.asarray(_ENU_FROM_NED @ ned_from_body @ _BODY_FROM_CAMERA)
+    rotation.flags.writeable = False
+    return rotation
 
 
 def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
@@ -231,8 +235,25 @@ def ground_en_m(
 
     NaN where a point looks at or above the horizon, or where the lens cannot be undone.
     """
+    return met_by_rays_en_m(camera_rays(camera, px), yaw_deg, pitch_deg, roll_deg, agl_m)
+
+
+def camera_rays(camera: Camera, px: Array) -> Array:
+    """Rays (N, 3) in camera axes, 1 along the optical axis, through image points (N, 2).
+
+    NaN where the lens cannot be undone.
+    """
     plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    rays = np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
+    return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
+
+
+def met_by_rays_en_m(
+    rays: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
+) -> Array:
+    """Where rays (N, 3) in camera axes meet flat ground (N, 2), metres from the point below.
+
+    NaN where a ray points at or above the horizon.
+    """
     enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
     down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
     return np.asarray(enu[:, :2] * (agl_m / down))

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from orthonav.localizer.checks import check_footprint
 from orthonav.localizer.rectify import downsampled, rectify_footprint
 from orthonav.records import Telemetry, View
+from orthonav.register.evidence import FINE, EvidenceRecipe
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Levels, PosePrior, Registrar
 from orthonav.register.search import bank, search
-from orthonav.register.template import ViewTemplates, halved
+from orthonav.register.template import ViewTemplates
 from orthonav.track import CameraDisplacement
 
 VIEW_PX = 160
@@ -69,47 +70,43 @@ def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
     )
 
 
-class _ViewPyramid:
-    """One rectified view in the role of the map: grey and valid (H, W) at several levels."""
+class _ViewAsMap(Reference):
+    """One rectified view in the role of the map. Its evidence is that of its templates, so that it
+    is made once for both roles: a constant factor changes no correlation."""
 
-    levels = LEVELS
+    def __init__(self, templates: ViewTemplates) -> None:
+        self._templates = templates
 
-    def __init__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> None:
-        self._pictures = [(grey, valid)]
-        for _ in range(LEVELS - 1):
-            self._pictures.append(halved(*self._pictures[-1]))
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return LEVELS
 
     def shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""
-        rows, cols = self._pictures[level][0].shape
-        return rows, cols
+        return self._templates.shape(level)
 
-    def read(
-        self, level: int, row: int, col: int, height: int, width: int
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of a window, which may reach beyond the view."""
-        out = np.zeros((height, width), np.uint8), np.zeros((height, width), np.bool_)
-        rows, cols = self.shape(level)
-        y0, x0, y1, x1 = max(row, 0), max(col, 0), min(row + height, rows), min(col + width, cols)
-        if y0 < y1 and x0 < x1:
-            for whole, part in zip(self._pictures[level], out, strict=True):
-                part[y0 - row : y1 - row, x0 - col : x1 - col] = whole[y0:y1, x0:x1]
-        return out
+    def caches(self, level: int) -> bool:
+        """All levels are small."""
+        return True
+
+    def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> NDArray[np.float32]:
+        """Evidence (H, W, 4) of a level."""
+        return self._templates.at(level, recipe).values
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryView:
     """A view rectified for odometry, heading up.
 
-    `registrar`: registers the next view on this one. `grey`, `valid` (H, W): the rectified view, of
-    `pixel_m` metres a pixel. `camera_px` (2,): the camera seen from its middle, x to the right and
-    y down. `telemetry`: that of the view, corrected by `bias` (4,) of heading (rad), log scale,
-    pitch and roll (rad). `view`: what it was made of.
+    `registrar`: registers the next view on this one. `templates`: the rectified view, of `pixel_m`
+    metres a pixel. `camera_px` (2,): the camera seen from its middle, x to the right and y down.
+    `telemetry`: that of the view, corrected by `bias` (4,) of heading (rad), log scale, pitch and
+    roll (rad). `view`: what it was made of, averaged towards `pixel_m`.
     """
 
     registrar: Registrar
-    grey: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
+    templates: ViewTemplates
     pixel_m: float
     camera_px: Array
     telemetry: Telemetry
@@ -117,9 +114,14 @@ class OdometryView:
     view: View
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.templates.shape(0)
+
+    @property
     def middle_px(self) -> tuple[float, float]:
         """Middle of the view, x and y."""
-        rows, cols = self.grey.shape
+        rows, cols = self.shape
         return cols / 2, rows / 2
 
     @property
@@ -146,16 +148,21 @@ class OdometryView:
         camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
         pixel_m = pixel_m or side_m / VIEW_PX
-        made = rectify_footprint(
-            downsampled(replace(view, telemetry=telemetry), pixel_m),
-            gsd_m=pixel_m,
-            multiple_px=2 ** (LEVELS - 1),
-        )
+        thinned = downsampled(replace(view, telemetry=telemetry), pixel_m)
+        made = rectify_footprint(thinned, gsd_m=pixel_m, multiple_px=2 ** (LEVELS - 1))
         if check_footprint(made, 1.0, VIEW_PX / 4) is not None:
             return None
         camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
-        registrar = Registrar(Reference(_ViewPyramid(made.grey, made.valid)))
-        return cls(registrar, made.grey, made.valid, pixel_m, camera_px, telemetry, bias, view)
+        templates = ViewTemplates(made.grey, made.valid, 0)
+        return cls(
+            registrar=Registrar(_ViewAsMap(templates)),
+            templates=templates,
+            pixel_m=pixel_m,
+            camera_px=camera_px,
+            telemetry=telemetry,
+            bias=bias,
+            view=replace(thinned, telemetry=view.telemetry),
+        )
 
     def corrected(self, bias: Array) -> "OdometryView | None":
         """The same view with the present estimate of the biases.
@@ -283,8 +290,8 @@ def _registered(
     before: OdometryView, now: OdometryView, prior: PosePrior, expected_en_m: Array | None
 ) -> Placed | None:
     """The later view registered on the earlier one; None where no place stands out."""
-    templates = ViewTemplates(now.grey, now.valid, 0)
-    side_px = math.sqrt(float(now.valid.sum()))
+    templates = now.templates
+    side_px = math.sqrt(float(templates.valid.sum()))
     levels = Levels.of(side_px, LEVELS)
     if expected_en_m is not None:
         placed = _as_expected(before, now, templates, levels, prior, expected_en_m)
@@ -334,6 +341,6 @@ def _as_expected(
 def _reach_px(before: OdometryView, now: OdometryView) -> float:
     """How far from the earlier view the later one is sought, in pixels of both."""
     seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
-    far = math.hypot(*before.grey.shape)
+    far = math.hypot(*before.shape)
     # A clock that stands still does not bound the distance.
     return min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far

@@ -44,7 +44,7 @@ NEAR_TURNS_RAD, NEAR_SCALES = (-0.1, 0.0, 0.1), (-0.09, 0.0, 0.09)
 
 
 @dataclass(frozen=True)
-class GroundSeen:
+class ViewedGround:
     """What a fix says of the ground: `middle_en_m`, that of the picture's middle, metres east and
     north; `gain`, score on the terrain over that on level ground, None without a terrain."""
 
@@ -81,7 +81,7 @@ class ViewOnLevelGround:
         """Judged candidates, at most `at_most` of them placed again, where none stands out."""
         return judged
 
-    def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
+    def by_camera(self, found: Registered) -> tuple[Registered, ViewedGround | None]:
         """The places found, as poses of the view on level ground below the camera."""
         return found, None
 
@@ -249,7 +249,7 @@ class ViewOverRelief(ViewOnLevelGround):
             made = self.seen.templates_at(finalist.pose, self.view.levels.final - 1)
         return super()._finer_templates(finalist) if made is None else made
 
-    def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
+    def by_camera(self, found: Registered) -> tuple[Registered, ViewedGround | None]:
         """The same, of a view on the terrain: heights are counted from the ground below the camera,
         and the camera of the pose is where it is."""
         finalists = tuple((score, self._by_camera(each)) for score, each in found.finalists)
@@ -260,7 +260,7 @@ class ViewOverRelief(ViewOnLevelGround):
         gain = None
         if not isinstance(self.seen.relief.terrain, LevelTerrain):
             gain = self._gain(pose) or 1.0
-        seen = GroundSeen(self.seen.middle_en_m(orientation, pose), gain)
+        seen = ViewedGround(self.seen.middle_en_m(orientation, pose), gain)
         return replace(found, placed=self._by_camera(found.placed), finalists=finalists), seen
 
     def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:

@@ -12,7 +12,7 @@ from orthonav.localizer.checks import check_footprint
 from orthonav.localizer.rectify import (
     RectifiedView,
     downsampled,
-    looks_aside,
+    is_oblique,
     near_part,
     rectify_footprint,
 )
@@ -75,7 +75,7 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     nominal_m = (telemetry.agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
         camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
     )
-    if looks_aside(view):
+    if is_oblique(view):
         near = near_part(view, gsd_m)
         if near is None:
             return NoFix("too_small", "the view shows no ground that is near enough")

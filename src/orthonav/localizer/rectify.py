@@ -48,7 +48,7 @@ class RectifiedView:
     offset_en_m: Array
 
 
-def looks_aside(view: View) -> bool:
+def is_oblique(view: View) -> bool:
     """Whether a view is far off nadir, or its picture does not hold its principal point: its part
     near enough is then rectified (`near_part`)."""
     camera = view.camera
@@ -102,7 +102,7 @@ def downsampled(view: View, gsd_m: float) -> View:
     """The view averaged down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
     camera, agl_m = view.camera, view.telemetry.agl_m
     pixel_m = camera.gsd_m(agl_m)
-    if looks_aside(view) and (near := near_part(view, gsd_m)) is not None:
+    if is_oblique(view) and (near := near_part(view, gsd_m)) is not None:
         pixel_m = near.finest_m
     factor = int(gsd_m / max(pixel_m, 1e-9))  # heights may be absurd, not yet refused
     width, height = camera.width_px // max(1, factor), camera.height_px // max(1, factor)
@@ -138,7 +138,7 @@ def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> Rectifie
     """
     camera, telemetry = view.camera, view.telemetry
     pitch_deg, roll_deg, agl_m = telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
-    if looks_aside(view):
+    if is_oblique(view):
         return _rectify_near(view, gsd_m, multiple_px)
     axis = np.array(axis_on_ground_en_m(0.0, pitch_deg, roll_deg, agl_m))
     half_m = np.array(camera.extent) * agl_m / 2

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import MapFileError, VariantError
 from orthonav.localizer.candidates import ViewCandidates
-from orthonav.localizer.over_relief import GroundSeen, ViewOnLevelGround, ViewOverRelief
+from orthonav.localizer.over_relief import ViewedGround, ViewOnLevelGround, ViewOverRelief
 from orthonav.localizer.plan import DEFAULT_PLAN, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.rectify import looks_aside, off_nadir_deg
+from orthonav.localizer.rectify import is_oblique, off_nadir_deg
 from orthonav.localizer.relief import LevelTerrain, Relief
 from orthonav.localizer.relief_camera import CameraFound
 from orthonav.localizer.view_search import ViewSearch
@@ -48,7 +48,7 @@ class RegisteredView:
 
     prepared: PreparedView
     found: Registered | NoFix
-    ground: GroundSeen | None = None
+    ground: ViewedGround | None = None
     camera: Callable[[], CameraFound | None] = lambda: None
 
 
@@ -155,7 +155,7 @@ class RegistrationLocalizer:
         if self.relief is not None:
             prepared = replace(prepared, prior=self.relief.expected(prepared))
         if not self._candidates(prepared, prior).touches_map:
-            outside = NoFix("outside_map", "the map does not reach to where the prior says")
+            outside = NoFix("outside_map", "the area of the prior is outside the map")
             return RegisteredView(prepared, outside)
         ground = self.on_ground(prepared)
         found = self.best(prepared, prior, ground)
@@ -190,7 +190,7 @@ class RegistrationLocalizer:
         """A view on the terrain of the map, where it has one."""
         if self.relief is not None:
             return ViewOverRelief(self.relief, self.registrar, view)
-        if looks_aside(view.picture_at(view.levels.final)):
+        if is_oblique(view.picture_at(view.levels.final)):
             level = Relief(LevelTerrain(), self.grid)
             return ViewOverRelief(level, self.registrar, view)
         return ViewOnLevelGround(self.registrar, view)

@@ -13,11 +13,12 @@ between what the camera sees of flat ground under two tilts.
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import ground_en_m
+from orthonav.geo.camera import Camera, camera_rays, met_by_rays_en_m
 from orthonav.localizer.prepared import PreparedView
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.records import View
@@ -80,7 +81,7 @@ def with_tilt(
     slopes = _derivatives(view, mean)
     if slopes is None:
         return None
-    profile = _TiltProfile(registration, view, prepared.levels.final)
+    profile = _TiltProfile(registration, view, prepared)
     for axis in np.flatnonzero(weights).tolist():
         after, before = (profile.score(mean, slopes, tilt, axis, sign) for sign in (1, -1))
         middle: float | None = placed.score
@@ -107,9 +108,7 @@ def _derivatives(view: View, mean: Array) -> Array | None:
 
     The ground seen stays at its place on the map. None where too little of the view is ground.
     """
-    camera, telemetry = view.camera, view.telemetry
-    share = (np.arange(SEEN_POINTS) + 0.5) / SEEN_POINTS
-    px = np.stack(np.meshgrid(share * camera.width_px, share * camera.height_px), -1).reshape(-1, 2)
+    telemetry, rays = view.telemetry, _seen_rays(view.camera)
     tilt = np.array([telemetry.pitch_deg, telemetry.roll_deg])
     cos, sin = np.exp(mean[3]) * np.array([math.cos(mean[2]), math.sin(mean[2])])
     out = np.zeros((4, 2))
@@ -119,7 +118,7 @@ def _derivatives(view: View, mean: Array) -> Array | None:
             tilts = tilt.copy()
             tilts[axis] += sign * math.degrees(DERIVATIVE_STEP_RAD)
             pitch, roll = tilts.tolist()
-            seen.append(ground_en_m(camera, px, 0.0, pitch, roll, telemetry.agl_m))
+            seen.append(met_by_rays_en_m(rays, 0.0, pitch, roll, telemetry.agl_m))
         both = np.isfinite(seen).all(axis=(0, 2))
         if both.sum() < SEEN_POINTS:
             return None
@@ -127,6 +126,16 @@ def _derivatives(view: View, mean: Array) -> Array | None:
         right, forward, turn, scale = _similarity(after, before)
         out[:, axis] = right * cos + forward * sin, forward * cos - right * sin, turn, scale
     return out / (2 * DERIVATIVE_STEP_RAD)
+
+
+@lru_cache(maxsize=4)
+def _seen_rays(camera: Camera) -> Array:
+    """Rays (N, 3) through points all over the image. Cached: undoing a lens takes time."""
+    share = (np.arange(SEEN_POINTS) + 0.5) / SEEN_POINTS
+    px = np.stack(np.meshgrid(share * camera.width_px, share * camera.height_px), -1).reshape(-1, 2)
+    rays = camera_rays(camera, px)
+    rays.flags.writeable = False
+    return rays
 
 
 def _similarity(of: Array, to: Array) -> tuple[float, float, float, float]:
@@ -144,8 +153,11 @@ def _similarity(of: Array, to: Array) -> tuple[float, float, float, float]:
 class _TiltProfile:
     """The score of one view under several tilts."""
 
-    def __init__(self, registration: RegistrationLocalizer, view: View, level: int) -> None:
-        self._registration, self._view = registration, view
+    def __init__(
+        self, registration: RegistrationLocalizer, view: View, prepared: PreparedView
+    ) -> None:
+        level = prepared.levels.final
+        self._registration, self._view = registration, prepared.picture_at(level)
         camera, telemetry = view.camera, view.telemetry
         corner = math.hypot(*camera.extent) / 2
         rim_m = RIM_PX * registration.grid.gsd_m * 2**level

@@ -168,7 +168,7 @@ class Tracker:
     def smoothed_track(self) -> list[Fix | NoFix]:
         """Positions at all views so far, each estimated from the views after it too."""
         if self._history is None:
-            raise ValueError("this tracker keeps no history")
+            raise ValueError("this tracker was made without `smooth`")
         left = len(self._outcomes) - len(self._lagged)
         smoothed = self._history.smoothed(left) if left else []
         return self._lagged + [
@@ -296,7 +296,7 @@ class Tracker:
         """The view for odometry, in pixels of the one before unless they differ too much."""
         if before is not None:
             made = OdometryView.of(view, before.pixel_m, bias)
-            if made is None or made.grey.size < 4 * before.grey.size:
+            if made is None or math.prod(made.shape) < 4 * math.prod(before.shape):
                 return made
         return OdometryView.of(view, None, bias)
 

@@ -231,12 +231,12 @@ class Registrar:
         side = _rounded_side(view_px / 2**level)
         key = (level, recipe, side)
         with self._lock:
-            found = self._windows.get(key)
+            found = self._windows.pop(key, None)
             if found is None:
                 found = SearchWindow(self.reference.whole(level, recipe), level, 0, 0, side)
                 while len(self._windows) >= MAX_KEPT_WINDOWS:
                     self._windows.pop(next(iter(self._windows)))
-                self._windows[key] = found
+            self._windows[key] = found  # the least recently used one is the first
         return found
 
     def part_window(

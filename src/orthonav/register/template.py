@@ -236,10 +236,19 @@ class ViewTemplates:
         """The template at a level, `finest` or coarser."""
         key = (level, recipe)
         if key not in self._made:
-            while len(self._pictures) <= level - self.finest:
-                self._pictures.append(halved(*self._pictures[-1]))
-            self._made[key] = Template.of(*self._pictures[level - self.finest], level, recipe)
+            self._made[key] = Template.of(*self._picture(level), level, recipe)
         return self._made[key]
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns at a level, `finest` or coarser."""
+        rows, cols = self._picture(level)[0].shape
+        return rows, cols
+
+    def _picture(self, level: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Grey and valid at a level."""
+        while len(self._pictures) <= level - self.finest:
+            self._pictures.append(halved(*self._pictures[-1]))
+        return self._pictures[level - self.finest]
 
 
 def halved(
