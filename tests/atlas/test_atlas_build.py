@@ -310,7 +310,11 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
     assert planned(route=route, band_m=10.0) == names[:1]
     assert planned(route=route, band_m=1500.0) == names
     for area in ({"bounds_deg": (10.0, 10.0, 11.0, 11.0)}, {"band_m": 5.0}):
-        with pytest.raises(AreaError):
+        with pytest.raises(AreaError, match=r"outside the orthophotos$|band"):
+            planned(**area)
+    turned = Route(((west + 1e-4, middle), (east - 1e-4, middle)))
+    for area in ({"bounds_deg": (south, west, north, east)}, {"route": turned, "band_m": 10.0}):
+        with pytest.raises(AreaError, match="seem to be swapped"):
             planned(**area)
 
 

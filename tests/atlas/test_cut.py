@@ -295,6 +295,10 @@ def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
         cut_map(atlas, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
+    west, south, east, north = atlas.bounds_deg
+    swapped = Area.from_bounds((south, west, north, east))
+    with pytest.raises(AreaError, match="seem to be swapped"):
+        cut_map(atlas, tmp_path / "o.onav", swapped)
     empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
     with pytest.raises(AreaError, match="no sheets yet"):
         cut_map(empty, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))

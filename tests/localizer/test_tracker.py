@@ -152,7 +152,7 @@ def test_smoothing_corrects_the_beginning_of_a_flight(localizer):
     ]
     assert max(after) < 15 and len(rows) == len(after)
     assert np.mean(after[:4]) < 6  # 5 deg of pitch are 13 m from 150 m
-    with pytest.raises(ValueError, match="no history"):
+    with pytest.raises(ValueError, match="smooth=True"):
         Tracker(localizer).smoothed_track()
 
 

@@ -13,6 +13,7 @@ from orthonav.embed.whitened import CellSheet
 from orthonav.errors import AreaError, AtlasError
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
+from orthonav.geo.swapped import swapped_hint
 from orthonav.geo.world import WorldSheets
 from orthonav.prepare.layout import MIN_TILE_VALID_SHARE
 
@@ -48,16 +49,22 @@ def turned(lon_deg: float) -> float:
     return (lon_deg + 180) % 360 - 180
 
 
-def require_sheets(atlas: Atlas, found: Sequence[object]) -> None:
-    """Raise `AreaError` with the extent of the atlas where no sheet was found."""
+def require_sheets(atlas: Atlas, area: Area, found: Sequence[object]) -> None:
+    """Raise `AreaError` with the extent of the atlas where no sheet was found in an area; names
+    swapped latitude and longitude."""
     if found:
         return
     if atlas.bounds_deg is None:
         raise AreaError(f"the atlas has no sheets yet: {atlas.url}")
     west, south, east, north = atlas.bounds_deg
+    hint = swapped_hint(
+        *(area.frame.lat_deg, area.frame.lon_deg),
+        lambda lat, lon: south <= lat <= north and 0 <= (lon - west) % 360 <= (east - west) % 360,
+    )
     raise AreaError(
         f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
-        f"{west:.4f},{south:.4f},{east:.4f},{north:.4f} (west, south, east, north): {atlas.url}"
+        f"{west:.4f},{south:.4f},{east:.4f},{north:.4f} (west, south, east, north){hint}: "
+        f"{atlas.url}"
     )
 
 

@@ -98,7 +98,7 @@ class _MapCutter:
         self.area = area
         self.grid = grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
         sheets = atlas.over(box_deg(area, grid.tile_m))
-        require_sheets(atlas, sheets)
+        require_sheets(atlas, area, sheets)
         self.members = members = opened_sheets(atlas, sheets, grid)
         self.recipe, representation = recipes(members[0].manifest)
         turns = isinstance(representation, OrientedGradients)

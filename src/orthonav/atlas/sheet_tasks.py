@@ -22,6 +22,7 @@ from orthonav.errors import AreaError, AtlasError
 from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.route import Route
 from orthonav.geo.sheets import sheets_of_route
+from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.prepare.block_cache import digest
 from orthonav.prepare.layout import grid_of
@@ -111,7 +112,8 @@ def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> l
     imagery = Imagery(mosaic)
     names = sorted(_names(recipe, imagery, request))
     if not names:
-        raise AreaError("the area lies outside the orthophotos")
+        hint = _swapped(recipe, imagery, request)
+        raise AreaError(f"the area lies outside the orthophotos{hint}")
     made_by, terrain = versions(), (request.dem, request.dem_datum)
     tasks = []
     for name in names:
@@ -202,6 +204,20 @@ class Imagery:
             lon = lon - 360 * np.round((lon - lon[0]) / 360)
             boxes.append([lon.min(), lat.min(), lon.max(), lat.max()])
         return np.array(boxes, np.float64)
+
+
+def _swapped(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> str:
+    """A hint if the middle of the bounds, or the start of the route, lies on imagery with latitude
+    and longitude swapped."""
+    there = imagery.sheets(recipe)
+    if request.bounds_deg is not None:
+        west, south, east, north = request.bounds_deg
+        place = (south + north) / 2, (west + east) / 2
+    elif request.route is not None:
+        place = request.route.waypoints[0]
+    else:
+        return ""
+    return swapped_hint(*place, lambda lat, lon: recipe.sheets.name_at(lat, lon) in there)
 
 
 def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iterable[str]:

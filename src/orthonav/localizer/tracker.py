@@ -168,7 +168,7 @@ class Tracker:
     def smoothed_track(self) -> list[Fix | NoFix]:
         """Positions at all views so far, each estimated from the views after it too."""
         if self._history is None:
-            raise ValueError("this tracker was made without `smooth`")
+            raise ValueError("smoothing needs a tracker made with smooth=True")
         left = len(self._outcomes) - len(self._lagged)
         smoothed = self._history.smoothed(left) if left else []
         return self._lagged + [
