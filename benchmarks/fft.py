@@ -19,7 +19,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.register.kernel import SEARCH
+from orthonav.register.kernel import KERNEL
 from orthonav.register.search import SearchWindow
 
 SIZES = ((240, 100), (432, 160), (1000, 220), (2000, 220))
@@ -78,7 +78,7 @@ def poses(side: int, view: int) -> dict[str, Callable[[], Array]]:
     rng = np.random.default_rng(0)
     strip = rng.standard_normal((CHANNELS, view, side)).astype(np.float32)
     window = rng.standard_normal((CHANNELS, side, side)).astype(np.float32)
-    compiled = {} if SEARCH is None else {"kernel": _by_kernel(side, view)}
+    compiled = {} if KERNEL is None else {"kernel": _by_kernel(side, view)}
     return compiled | {
         "scipy": _by_planes(scipy.fft, strip, window),
         "numpy": _by_planes(np.fft, strip, window),
@@ -99,7 +99,7 @@ def _by_kernel(side: int, view: int) -> Callable[[], Array]:
     tried = np.array([(0.3, 0.0, -np.inf, np.inf)])
 
     def pose() -> Array:
-        SEARCH.search(spectra, values, (1.0, 0.6), tried, 0, best, numbers, None)
+        KERNEL.search(spectra, values, (1.0, 0.6), tried, 0, best, numbers, None)
         return best
 
     return pose

@@ -12,6 +12,7 @@
 
 #include <limits.h>
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #define LAYOUT 3        /* of all arguments and results; kernel.py has the same number */
@@ -500,10 +501,17 @@ static struct PyModuleDef module = {
     NULL, NULL, NULL, NULL,
 };
 
+int has_avx2 = 0;
+
 PyMODINIT_FUNC PyInit__kernel(void) {
+#if defined(__x86_64__) && defined(__GNUC__)
+    const char *without = getenv("ORTHONAV_NO_AVX2");
+    has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+               !(without && *without);
+#endif
     PyObject *made = PyModule_Create(&module);
     if (made && (PyModule_AddIntConstant(made, "LAYOUT", LAYOUT) < 0 ||
-                 PyModule_AddIntConstant(made, "SEARCHES", HAS_AVX2) < 0)) {
+                 PyModule_AddIntConstant(made, "AVX2", has_avx2) < 0)) {
         Py_DECREF(made);
         return NULL;
     }

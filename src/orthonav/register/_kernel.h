@@ -15,22 +15,27 @@
 typedef float lanes __attribute__((vector_size(16)));
 typedef float lanes_in_memory __attribute__((vector_size(16), aligned(4)));
 
-/* A function compiled twice from `NAME_inline`: for processors with AVX2, and for all. GCC's
- * target_clones("arch=..") is no substitute: it asks for that very model of processor. */
+/* Whether functions for AVX2 are used: where the processor has it, and ORTHONAV_NO_AVX2 is not set. */
+extern int has_avx2;
+
+/* A function compiled for processors with AVX2 from the inline function FAST, and for all from PLAIN.
+ * GCC's target_clones("arch=..") is no substitute: it asks for that very model of processor. */
 #if defined(__x86_64__) && defined(__GNUC__)
-#define HAS_AVX2 (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-#define FOR_EVERY_PROCESSOR(NAME, PARAMETERS, ARGUMENTS)                                            \
-    __attribute__((target("avx2,fma"))) static void NAME##_avx2 PARAMETERS { NAME##_inline ARGUMENTS; } \
-    static void NAME##_plain PARAMETERS { NAME##_inline ARGUMENTS; }                                \
+#define FOR_AVX2_AND_ALL(NAME, FAST, PLAIN, PARAMETERS, ARGUMENTS)                                  \
+    __attribute__((target("avx2,fma"))) static void NAME##_avx2 PARAMETERS { FAST ARGUMENTS; }      \
+    static void NAME##_plain PARAMETERS { PLAIN ARGUMENTS; }                                        \
     static void NAME PARAMETERS {                                                                   \
-        if (HAS_AVX2) NAME##_avx2 ARGUMENTS;                                                        \
+        if (has_avx2) NAME##_avx2 ARGUMENTS;                                                        \
         else NAME##_plain ARGUMENTS;                                                                \
     }
 #else
-#define HAS_AVX2 0
-#define FOR_EVERY_PROCESSOR(NAME, PARAMETERS, ARGUMENTS)                                            \
-    static void NAME PARAMETERS { NAME##_inline ARGUMENTS; }
+#define FOR_AVX2_AND_ALL(NAME, FAST, PLAIN, PARAMETERS, ARGUMENTS)                                  \
+    static void NAME PARAMETERS { PLAIN ARGUMENTS; }
 #endif
+
+/* The same from `NAME_inline`. */
+#define FOR_EVERY_PROCESSOR(NAME, PARAMETERS, ARGUMENTS)                                            \
+    FOR_AVX2_AND_ALL(NAME, NAME##_inline, NAME##_inline, PARAMETERS, ARGUMENTS)
 
 INLINE lanes all(float value) { return (lanes){value, value, value, value}; }
 

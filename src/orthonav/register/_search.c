@@ -21,7 +21,7 @@
 
 typedef float wide __attribute__((vector_size(32)));
 typedef float wide_in_memory __attribute__((vector_size(32), aligned(4)));
-typedef int wide_int __attribute__((vector_size(32)));
+typedef int lanes_int __attribute__((vector_size(16)));
 
 typedef struct {
     wide re, im;
@@ -34,25 +34,26 @@ typedef struct {
 #if defined(__clang__)
 #define MIX(A, B, ...) __builtin_shufflevector(A, B, __VA_ARGS__)
 #else
-#define MIX(A, B, ...) __builtin_shuffle(A, B, (wide_int){__VA_ARGS__})
+#define MIX(A, B, ...) __builtin_shuffle(A, B, (lanes_int){__VA_ARGS__})
 #endif
 
-/* Eight rows of eight numbers become columns. */
+/* Four rows of four numbers become columns. */
+INLINE void transpose_four(const lanes *m, int apart, lanes *out) {
+    const lanes a = MIX(m[0], m[2 * apart], 0, 4, 1, 5), b = MIX(m[0], m[2 * apart], 2, 6, 3, 7);
+    const lanes c = MIX(m[apart], m[3 * apart], 0, 4, 1, 5), d = MIX(m[apart], m[3 * apart], 2, 6, 3, 7);
+    out[0] = MIX(a, c, 0, 4, 1, 5), out[1] = MIX(a, c, 2, 6, 3, 7);
+    out[2] = MIX(b, d, 0, 4, 1, 5), out[3] = MIX(b, d, 2, 6, 3, 7);
+}
+
+/* Eight rows of eight numbers become columns: four by four, as all processors can. */
 INLINE void transpose(wide *m) {
-    wide two[WIDE], four[WIDE];
-    for (int at = 0; at < WIDE; at += 2) {
-        two[at] = MIX(m[at], m[at + 1], 0, 8, 1, 9, 4, 12, 5, 13);
-        two[at + 1] = MIX(m[at], m[at + 1], 2, 10, 3, 11, 6, 14, 7, 15);
-    }
-    for (int at = 0; at < WIDE; at += 4)
-        for (int half = 0; half < 2; half++) {
-            const wide a = two[at + half], b = two[at + 2 + half];
-            four[at + 2 * half] = MIX(a, b, 0, 1, 8, 9, 4, 5, 12, 13);
-            four[at + 2 * half + 1] = MIX(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
-        }
+    lanes *const halves = (lanes *)m, made[4 * 4];
+    for (int block = 0; block < 4; block++)
+        transpose_four(halves + 8 * (block & 1) + (block >> 1), 2, made + 4 * block);
+    /* Block (0, 0), (1, 0), (0, 1), (1, 1) of the rows, each as columns. */
     for (int at = 0; at < 4; at++) {
-        m[at] = MIX(four[at], four[at + 4], 0, 1, 2, 3, 8, 9, 10, 11);
-        m[at + 4] = MIX(four[at], four[at + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+        halves[2 * at] = made[at], halves[2 * at + 1] = made[4 + at];
+        halves[8 + 2 * at] = made[8 + at], halves[8 + 2 * at + 1] = made[12 + at];
     }
 }
 
@@ -63,81 +64,20 @@ typedef struct {
     float *twiddles;    /* pairs of cosine and minus sine, pass after pass */
 } plan_t;
 
-INLINE pair_t plus(pair_t a, pair_t b) { return (pair_t){a.re + b.re, a.im + b.im}; }
-INLINE pair_t minus(pair_t a, pair_t b) { return (pair_t){a.re - b.re, a.im - b.im}; }
-INLINE pair_t times(pair_t a, float by) { return (pair_t){a.re * by, a.im * by}; }
-INLINE pair_t times_i(pair_t a, float by) { return (pair_t){-a.im * by, a.re * by}; }
-INLINE pair_t turned(pair_t a, const float *by) {
-    return (pair_t){a.re * by[0] - a.im * by[1], a.re * by[1] + a.im * by[0]};
-}
+#define VECTOR lanes
+#define OF_VECTOR(NAME) NAME##_lanes
+#include "_transform.h"
+#undef VECTOR
+#undef OF_VECTOR
+#if defined(__x86_64__) && defined(__GNUC__)
+#define VECTOR wide
+#define OF_VECTOR(NAME) NAME##_wide
+#include "_transform.h"
+#endif
 
-/* Transform of 2, 3, 4 or 5 numbers, `apart` from each other. */
-INLINE void butterfly(int factor, const pair_t *from, int apart, pair_t *out) {
-    const pair_t a = from[0], b = from[apart];
-    if (factor == 2) {
-        out[0] = plus(a, b), out[1] = minus(a, b);
-    } else if (factor == 3) {
-        const pair_t c = from[2 * apart], sum = plus(b, c), middle = plus(a, times(sum, -0.5f));
-        const pair_t side = times_i(minus(b, c), -0.866025403784438647f);
-        out[0] = plus(a, sum), out[1] = plus(middle, side), out[2] = minus(middle, side);
-    } else if (factor == 4) {
-        const pair_t c = from[2 * apart], d = from[3 * apart];
-        const pair_t even = plus(a, c), odd = minus(a, c), sum = plus(b, d);
-        const pair_t side = times_i(minus(b, d), -1.0f);
-        out[0] = plus(even, sum), out[1] = plus(odd, side);
-        out[2] = minus(even, sum), out[3] = minus(odd, side);
-    } else {
-        const float cos1 = 0.309016994374947424f, sin1 = -0.951056516295153572f;
-        const float cos2 = -0.809016994374947424f, sin2 = -0.587785252292473129f;
-        const pair_t c = from[2 * apart], d = from[3 * apart], e = from[4 * apart];
-        const pair_t near = plus(b, e), far = plus(c, d), x = minus(b, e), y = minus(c, d);
-        const pair_t middle1 = plus(a, plus(times(near, cos1), times(far, cos2)));
-        const pair_t middle2 = plus(a, plus(times(near, cos2), times(far, cos1)));
-        const pair_t side1 = plus(times_i(x, sin1), times_i(y, sin2));
-        const pair_t side2 = minus(times_i(x, sin2), times_i(y, sin1));
-        out[0] = plus(a, plus(near, far));
-        out[1] = plus(middle1, side1), out[4] = minus(middle1, side1);
-        out[2] = plus(middle2, side2), out[3] = minus(middle2, side2);
-    }
-}
-
-/* One pass: what `done` passes' factors multiply to, and `left` numbers between parts. */
-INLINE void pass(int factor, int done, int left, const pair_t *from, pair_t *to,
-                 const float *twiddles) {
-    const size_t apart = (size_t)left * done;
-    pair_t out[5];
-    for (int k = 0; k < done; k++, from += (size_t)left * factor, to += left) {
-        butterfly(factor, from, left, out);
-        for (int j = 0; j < factor; j++) to[apart * j] = out[j];
-        const float *by = twiddles;
-        for (int i = 1; i < left; i++) {
-            butterfly(factor, from + i, left, out);
-            to[i] = out[0];
-            for (int j = 1; j < factor; j++, by += 2) to[i + apart * j] = turned(out[j], by);
-        }
-    }
-}
-
-/* Transform `data`; it ends there or in `scratch`, which `ended` says. */
-INLINE void transform_inline(const plan_t *plan, pair_t *data, pair_t *scratch, pair_t **ended) {
-    const float *twiddles = plan->twiddles;
-    for (int at = 0, done = 1; at < plan->count; done *= plan->factors[at++]) {
-        const int factor = plan->factors[at], left = plan->length / (done * factor);
-        switch (factor) {
-        case 2: pass(2, done, left, data, scratch, twiddles); break;
-        case 3: pass(3, done, left, data, scratch, twiddles); break;
-        case 4: pass(4, done, left, data, scratch, twiddles); break;
-        default: pass(5, done, left, data, scratch, twiddles); break;
-        }
-        twiddles += 2 * (size_t)(factor - 1) * (left - 1);
-        pair_t *const other = data;
-        data = scratch, scratch = other;
-    }
-    *ended = data;
-}
-
-FOR_EVERY_PROCESSOR(transform, (const plan_t *plan, pair_t *data, pair_t *scratch, pair_t **ended),
-                    (plan, data, scratch, ended))
+FOR_AVX2_AND_ALL(transform, transform_wide, transform_lanes,
+                 (const plan_t *plan, pair_t *data, pair_t *scratch, pair_t **ended),
+                 (plan, data, scratch, ended))
 
 /* 0; -1 where the length has other prime factors than 2, 3 and 5; -2 without memory. */
 static int make_plan(int length, plan_t *plan) {
@@ -235,12 +175,12 @@ typedef struct {
     pair_t *data, *scratch, *total;     /* of one transform, and of the sum of channels */
 } search_t;
 
-/* Best scores (B, C) and the numbers of their poses (B, C, 16); `expected` (B, C) or NULL: the log
- * scale at each place. Each pair has eight rows of a band and the eight below. */
+/* Best scores (B, C, 16) and the numbers of their poses; `expected` or NULL: the log scale at each
+ * place. Each sixteen are eight rows of a band and the eight below. */
 typedef struct {
-    pair_in_memory_t *best;
+    float *best;
     int *which;
-    const pair_in_memory_t *expected;
+    const float *expected;
 } bests_t;
 
 /* The middle of the view goes to the first number, what lies before it wraps to the end; all turned by
@@ -340,10 +280,6 @@ INLINE void multiply_columns_inline(const search_t *search, int half) {
 
 FOR_EVERY_PROCESSOR(multiply_columns, (const search_t *search, int half), (search, half))
 
-INLINE wide_int chosen(wide_int where, wide_int one, wide_int other) {
-    return (where & one) | (~where & other);
-}
-
 /* Eight columns of a group, of the eight rows from `row` on: imaginary and real parts. */
 INLINE void columns_of(const search_t *search, int group, int row, wide *im, wide *re) {
     const int rows = search->down.length;
@@ -373,38 +309,47 @@ INLINE void join_rows(const search_t *search, int band) {
     }
 }
 
-INLINE int is_any(wide_int where) {
-    long long parts[4];
-    memcpy(parts, &where, sizeof parts);
-    return (parts[0] | parts[1] | parts[2] | parts[3]) != 0;
+/* Take the scores (16) above the best so far, where the scale that is expected there is in reach: of
+ * four at a time, which all processors compare at once. Imaginary parts are the upper rows. */
+INLINE void compare_column(const float *scores, lanes_int number, float lowest, float highest,
+                           float *best, int *which, const float *expected) {
+    lanes_int taken[PAIR / LANES], any = {0};
+    for (int part = 0; part < PAIR / LANES; part++) {
+        const int at = part * LANES;
+        taken[part] = load(scores + (at + WIDE) % PAIR) > load(best + at);
+        if (expected) {
+            const lanes scale = load(expected + at);
+            taken[part] &= (scale >= lowest) & (scale <= highest);
+        }
+        any |= taken[part];
+    }
+    long long halves[2];
+    memcpy(halves, &any, sizeof halves);
+    if (!(halves[0] | halves[1])) return;
+    for (int part = 0; part < PAIR / LANES; part++) {
+        const int at = part * LANES;
+        const lanes_int here = taken[part], score = (lanes_int)load(scores + (at + WIDE) % PAIR);
+        lanes_int numbers, bests = (lanes_int)load(best + at);
+        memcpy(&numbers, which + at, sizeof numbers);
+        numbers = (here & number) | (~here & numbers), bests = (here & score) | (~here & bests);
+        memcpy(which + at, &numbers, sizeof numbers);
+        memcpy(best + at, &bests, sizeof bests);
+    }
 }
 
 /* Transforms back along the rows, and the best score at every place. */
 INLINE void compare_rows_inline(const search_t *search, int number, float lowest, float highest,
                                 const bests_t *bests) {
     const int cols = search->along.length;
-    const wide_int here = (wide_int){0} + number;
+    const lanes_int here = (lanes_int){0} + number;
     pair_t *scores;
     for (int band = 0; band < search->bands; band++) {
         join_rows(search, band);
         transform(&search->along, search->data, search->scratch, &scores);
-        pair_in_memory_t *best = bests->best + (size_t)band * cols;
-        int *which = bests->which + (size_t)band * cols * PAIR;
-        for (int at = 0; at < cols; at++, which += PAIR) {
-            const wide upper = scores[at].im, lower = scores[at].re;
-            wide_int in_upper = upper > best[at].re, in_lower = lower > best[at].im, numbers[2];
-            if (bests->expected) {
-                const pair_in_memory_t *expected = bests->expected + (size_t)band * cols + at;
-                in_upper &= (expected->re >= lowest) & (expected->re <= highest);
-                in_lower &= (expected->im >= lowest) & (expected->im <= highest);
-            }
-            if (!is_any(in_upper | in_lower)) continue;
-            best[at].re = (wide)chosen(in_upper, (wide_int)upper, (wide_int)best[at].re);
-            best[at].im = (wide)chosen(in_lower, (wide_int)lower, (wide_int)best[at].im);
-            memcpy(numbers, which, sizeof numbers);
-            numbers[0] = chosen(in_upper, here, numbers[0]);
-            numbers[1] = chosen(in_lower, here, numbers[1]);
-            memcpy(which, numbers, sizeof numbers);
+        for (int col = 0; col < cols; col++) {
+            const size_t at = ((size_t)band * cols + col) * PAIR;
+            compare_column((const float *)(scores + col), here, lowest, highest, bests->best + at,
+                           bests->which + at, bests->expected ? bests->expected + at : NULL);
         }
     }
 }

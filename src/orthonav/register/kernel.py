@@ -28,7 +28,3 @@ def _compiled() -> Any:
 KERNEL: Any = _compiled()
 """Module of the functions in `_kernel.c`; None where no compiler was at hand at installation. NumPy
 then does the same, several times slower."""
-
-SEARCH: Any = KERNEL if KERNEL is not None and KERNEL.SEARCHES else None
-"""The kernel where it searches faster than SciPy: on processors with AVX2. Elsewhere its vectors of
-eight numbers are slow, and SciPy and OpenCV search (docs/decisions/registration.md, 15)."""

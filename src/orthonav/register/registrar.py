@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from orthonav.register.evidence import COARSE, FINE, EvidenceRecipe
-from orthonav.register.kernel import SEARCH
+from orthonav.register.kernel import KERNEL
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
@@ -281,7 +281,7 @@ class Registrar:
         if math.prod(self.reference.shape(levels.coarse)) <= WHOLE_WINDOW_PX:
             whole = self.whole_window(levels.coarse, recipe, side_px)
             _ = whole.channels
-        if SEARCH is None:
+        if KERNEL is None:
             _ = template.interleaved  # made, like the channels, before threads ask for them
 
         def moved(some: Sequence[Candidate]) -> list[Candidate]:

@@ -21,7 +21,7 @@ from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
-from orthonav.register.kernel import SEARCH
+from orthonav.register.kernel import KERNEL
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale, rotation
 from orthonav.register.reference import cut
@@ -131,7 +131,7 @@ class SearchWindow:
     @property
     def by_kernel(self) -> bool:
         """Whether the kernel searches it: where there is one, and no side is too long for it."""
-        return SEARCH is not None and max(self.size) <= LONGEST_PX
+        return KERNEL is not None and max(self.size) <= LONGEST_PX
 
     def prepare(self, template: Template) -> None:
         """Make what threads share when they search for a view, so that none makes it again."""
@@ -210,11 +210,11 @@ def best_near(
         ]
     ).reshape(-1, 4)
     found = np.empty((len(places), 3))
-    if SEARCH is None:
+    if KERNEL is None:
         for place, into in zip(places, found, strict=True):
             into[:] = _best_near(template, window, place, reach)
     else:
-        SEARCH.near(window.channels, template.values, template.weights, places, reach, found)
+        KERNEL.near(window.channels, template.values, template.weights, places, reach, found)
     found[:, 1] = (window.col + found[:, 1]) * unit
     found[:, 2] = (window.row + found[:, 2]) * unit
     return [
@@ -293,7 +293,7 @@ def _best_by_kernel(
             for turn, log_scale in (poses[number] for number in part)
         ]
     )
-    SEARCH.search(
+    KERNEL.search(
         *(window.spectra_by_columns, template.values, template.weights, tried, part.start),
         *(best, which, None if expected is None else _in_bands(expected, best.shape)),
     )
