@@ -14,11 +14,12 @@ import pytest
 pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
 
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.find import _against, rectified
+from orthonav.atlas.find import rectified
 from orthonav.atlas.index import make_index
 from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets
 from orthonav.atlas.item import canonical
 from orthonav.atlas.locate import AtlasLocator
+from orthonav.atlas.matches import against
 from orthonav.atlas.sheet_registration import SheetRegistrar
 from orthonav.atlas.store import Store
 from orthonav.atlas.tile_search import TileSearch
@@ -233,7 +234,7 @@ def evidence(**values):
 
 
 def test_the_best_other_match_of_the_atlas_is_the_rival():
-    found = _against(evidence(), [evidence(strength=30.0, look=4.0, fine=40.0)])
+    found = against(evidence(), [evidence(strength=30.0, look=4.0, fine=40.0)])
     assert found["rival"] == 30.0
     assert found["look_rival"] == 5.0
     assert np.isnan(found["fine_rival"])
@@ -241,9 +242,9 @@ def test_the_best_other_match_of_the_atlas_is_the_rival():
 
 def test_the_finest_level_does_not_count_against_a_rival_not_compared_there():
     doubtful = evidence(strength=60.0, fine=90.0, fine_rival=20.0)
-    found = _against(doubtful, [evidence(strength=60.0), evidence(strength=20.0, fine=30.0)])
+    found = against(doubtful, [evidence(strength=60.0), evidence(strength=20.0, fine=30.0)])
     assert np.isnan(found["fine"]) and np.isnan(found["fine_rival"])
-    both = _against(doubtful, [evidence(strength=60.0, fine=80.0)])
+    both = against(doubtful, [evidence(strength=60.0, fine=80.0)])
     assert (both["fine"], both["fine_rival"]) == (90.0, 80.0)
 
 

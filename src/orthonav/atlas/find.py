@@ -7,7 +7,7 @@ agree are found (`orthonav.atlas.agreement`).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +17,10 @@ from orthonav.atlas.agreement import (
     Agreement,
     PlaceEvidence,
     Placement,
-    nearest_m,
 )
-from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
+from orthonav.atlas.matches import ViewMatches
+from orthonav.atlas.sheet_registration import SearchRegion, SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
-from orthonav.confidence.logistic import logit
-from orthonav.confidence.registered import USUAL_CONFIDENCE
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer.checks import check_footprint, check_view
 from orthonav.localizer.prepared import MIN_VIEW_PX, pose_prior
@@ -47,15 +45,11 @@ VIEW_TILES = (0.6, 2.5)
 FOLLOWED, FOLLOWED_NATS = 4, 4.0
 """Chains whose expected places are searched: at most so many, and not less likely than the best by
 more nats."""
-RIVAL_SHARE = 0.25
-"""Matches farther apart than this share of the view's side are different places."""
 START_PX = 5.0
 """Standard deviation of a found place, in pixels of the sheets: half of the radius within which
 their confidence counts a place as right."""
 REPLAYED = 4
 """Latest views of a place that a track begins with."""
-LEAST = 1e-5
-"""Least and greatest (1 - LEAST) probability of a match, for finite odds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +111,16 @@ class PlaceFinder:
     def _placed(self, view: View, coarse: RectifiedView, side_m: float) -> FoundPlace | NoFix:
         time_ns = view.telemetry.time_ns
         expected = self._expected(view, coarse, time_ns)
-        regions = [*expected, *self._candidates(view, coarse)]
-        made = (self._registrar.register(view, region, side_m) for region in regions)
-        found = _distinct([each for each in made if each is not None], side_m)
+        candidates = self._candidates(view, coarse)
+        regions = [*expected, *candidates]
+        registrar, matches = self._registrar.of_view(view, side_m), ViewMatches(side_m)
+        matches.add_candidates(registrar, candidates)
+        matches.add_expected(registrar, expected)
         places = [
             PlaceEvidence(
-                *one.latlon_deg, one.turn_rad, one.log_scale, _log_odds(key, found), self._number
+                *one.latlon_deg, one.turn_rad, one.log_scale, matches.log_odds(at), self._number
             )
-            for key, one in enumerate(found)
+            for at, one in enumerate(matches.found)
         ]
         all_m2 = _searched_m2(regions)
         chance = _searched_m2(expected) / all_m2 if all_m2 else 1.0
@@ -195,14 +191,6 @@ def _searched_m2(regions: Sequence[SearchRegion]) -> float:
     return sum(math.pi * region.reach_m**2 for region in regions)
 
 
-def _log_odds(key: int, found: Sequence[SheetMatch]) -> float:
-    """Log odds of one of the matches of a view (strongest first) against all the others."""
-    one = found[key]
-    rivals = [each.evidence for place, each in enumerate(found) if place != key]
-    confidence = one.confidence or USUAL_CONFIDENCE
-    return logit(confidence(_against(one.evidence, rivals)), LEAST)
-
-
 def _moved(
     place: tuple[float, float], view: RectifiedView, turn_rad: float, log_scale: float, sign: float
 ) -> tuple[float, float]:
@@ -212,33 +200,3 @@ def _moved(
     moved = np.array([cos * ahead[0] + sin * ahead[1], cos * ahead[1] - sin * ahead[0]])
     lat, lon = LocalFrame(*place).latlon_from_en(moved)
     return float(lat), float(lon)
-
-
-def _distinct(matches: Sequence[SheetMatch], side_m: float) -> list[SheetMatch]:
-    """The strongest match of each place, strongest first."""
-    distinct: list[SheetMatch] = []
-    for each in sorted(matches, key=lambda one: -one.evidence["strength"]):
-        others = [one.latlon_deg for one in distinct]
-        if nearest_m(each.latlon_deg, others) > RIVAL_SHARE * side_m:
-            distinct.append(each)
-    return distinct
-
-
-def _against(
-    evidence: Mapping[str, float], rivals: Sequence[Mapping[str, float]]
-) -> dict[str, float]:
-    """The evidence of a match with the best other match of the whole atlas as its rival.
-
-    The finest level counts only where the strongest rival was compared there too.
-    """
-    made = dict(evidence)
-    for rival, value in (("rival", "strength"), ("look_rival", "look")):
-        made[rival] = max([made[rival], *(each[value] for each in rivals)])
-    strongest = max(rivals, key=lambda each: each["strength"], default=None)
-    if strongest is None or not math.isfinite(made["fine"]):
-        return made
-    if math.isfinite(strongest["fine"]):
-        made["fine_rival"] = max(made["fine_rival"], strongest["fine"])
-    else:
-        made["fine"] = made["fine_rival"] = math.nan
-    return made
