@@ -1,18 +1,27 @@
-"""A view is registered on the part of a sheet around a place, as on all of the sheet."""
+"""A view is registered on the part of a sheet around a place as on the whole sheet, on one sheet
+where two overlap; and only the strongest candidates are searched."""
 
 import itertools
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
 
-from orthonav.atlas import find
-from orthonav.atlas.matches import ViewMatches, against
-from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar, part_of
-from orthonav.flight.folder import open_flight
+from orthonav.atlas import matches
+from orthonav.atlas.find import PlaceFinder, rectified
+from orthonav.atlas.matches import SEARCHED, ViewMatches
+from orthonav.atlas.sheet_registration import (
+    PyramidPart,
+    SearchRegion,
+    SheetMatch,
+    SheetRegistrar,
+)
+from orthonav.atlas.tile_search import TileSearch
+from orthonav.flight.folder import open_flight, read_truth
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.records import PRIOR_SIGMAS, Prior, View
 
@@ -25,149 +34,168 @@ def registrar(atlas):
 
 
 @pytest.fixture(scope="module")
-def views(flown):
+def view(flown):
+    """The first view of the flight, and where it was taken."""
     flight = open_flight(flown)
-    lines = (flown / "truth.csv").read_text().splitlines()
-    rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
-    first, last = ((float(row["lat_deg"]), float(row["lon_deg"])) for row in (rows[0], rows[-1]))
-    east_m, north_m = LocalFrame(*first).en_from_latlon(*last)
-    rows = [row | {"yaw_deg": math.degrees(math.atan2(east_m, north_m))} for row in rows]
-    return [
-        (View(view.grey(), flight.camera, view.telemetry), row)
-        for view, row in zip(itertools.islice(flight.views, 2), rows, strict=False)
-    ]
+    seen = next(iter(flight.views))
+    return View(seen.grey(), flight.camera, seen.telemetry), next(
+        iter(read_truth(flown / "truth.csv").values())
+    )
 
 
-def region(truth, *, east_m=0.0, reach_m=80.0, turn_rad=0.05):
-    """A region whose middle is off by `east_m`, of a view straight down."""
-    lat, lon = float(truth["lat_deg"]), float(truth["lon_deg"])
-    at = LocalFrame(lat, lon).latlon_from_en(np.array([east_m, 0.0]))
-    place = float(at[0]), float(at[1])
-    turn = math.radians(float(truth["yaw_deg"])) + turn_rad
-    return SearchRegion(*place, turn, 0.0, place, reach_m, find.TURN_STD_RAD)
+@pytest.fixture(scope="module")
+def candidate(atlas, view):
+    """The best candidate of that view, which is the right place."""
+    finder = PlaceFinder(SheetRegistrar(atlas), TileSearch(atlas))
+    found = finder._candidates(view[0], rectified(view[0], finder._search.recipe.gsd_m))
+    return min(found, key=lambda each: _off_m(each, view[1]))
 
 
-def off_m(match, truth):
-    return distances_m([match.latlon_deg], [(float(truth["lat_deg"]), float(truth["lon_deg"]))])[0]
+def _off_m(place, truth):
+    return distances_m([place.latlon_deg], [truth])[0]
 
 
-def whole(atlas, view, where):
-    """The view registered on all of the first sheet that may show it, as far as `where` reaches."""
-    found = []
-    for sheet in SheetRegistrar(atlas).near(where, SIDE_M):
-        telemetry = replace(view.telemetry, yaw_deg=math.degrees(where.turn_rad))
-        prior = Prior(*where.latlon_deg, where.reach_m / PRIOR_SIGMAS)
-        turned = replace(view, telemetry=telemetry)
-        seen = sheet.register(turned, prior, heading_std_rad=where.turn_std_rad)
-        pose = seen.found.placed.pose
-        place = sheet.sheet.frame.latlon_from_en(sheet.camera_en_m(seen.prepared, pose))
-        found.append((seen.found.score, tuple(map(float, place))))
-    return max(found)
+def test_a_part_of_a_pyramid_reads_as_the_whole(registrar, candidate):
+    whole = registrar.at(candidate, SIDE_M)[0].pyramid
+    unit = 2 ** (whole.levels - 1)
+    part = PyramidPart(whole, whole.levels, unit, 2 * unit, 5 * unit, 4 * unit)
+    for level in range(whole.levels):
+        rows, cols = part.shape(level)
+        assert (rows, cols) == (5 * unit >> level, 4 * unit >> level)
+        found = part.read(level, 1, 0, rows - 1, cols)
+        first = (unit >> level) + 1, 2 * unit >> level
+        expected = whole.read(level, *first, rows - 1, cols)
+        assert all(np.array_equal(*pair) for pair in zip(found, expected, strict=True))
 
 
-@pytest.mark.parametrize("east_m", [0.0, 40.0])
-def test_a_part_of_a_sheet_gives_the_place_of_the_whole_sheet(atlas, registrar, views, east_m):
-    for view, truth in views:
-        where = region(truth, east_m=east_m)
-        found = registrar.of_view(view, SIDE_M).searched(where)
-        score, place = whole(atlas, view, where)
-        assert off_m(found, truth) < 10
-        assert distances_m([found.latlon_deg], [place])[0] < 0.5
-        assert found.evidence["strength"] == pytest.approx(score, rel=0.02)
+def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, candidate):
+    """The evidence is what confidences were fitted to."""
+    seen, truth = view
+    found = registrar.of_view(seen, SIDE_M).searched(candidate)
+    assert _off_m(found, truth) < 10
+    sheet = registrar.at(candidate, SIDE_M)[0]
+    yaw_deg = math.degrees(candidate.turn_rad)
+    turned = replace(seen, telemetry=replace(seen.telemetry, yaw_deg=yaw_deg))
+    prior = Prior(*candidate.latlon_deg, candidate.reach_m / PRIOR_SIGMAS)
+    whole = sheet.register(turned, prior, heading_std_rad=candidate.turn_std_rad)
+    for name in ("strength", "look", "detail_ratio", "local_phase", "local_gradients"):
+        assert found.evidence[name] == pytest.approx(whole.found.evidence()[name], rel=0.05)
+    assert found.turn_rad == pytest.approx(whole.found.placed.pose.turn_rad, abs=2e-3)
+    assert found.confidence == sheet.confidence
 
 
-def test_a_candidate_is_judged_and_finished_at_the_place_of_the_search(registrar, views):
-    view, truth = views[0]
-    of_view = registrar.of_view(view, SIDE_M)
-    judged = of_view.judged(region(truth, east_m=30.0))
-    searched = of_view.searched(region(truth, east_m=30.0))
-    assert distances_m([judged.latlon_deg], [searched.latlon_deg])[0] < 25
-    finished = judged.finished()
-    assert distances_m([finished.latlon_deg], [searched.latlon_deg])[0] < 1
-    assert finished.evidence["strength"] == pytest.approx(searched.evidence["strength"], rel=0.02)
+def test_a_judged_candidate_is_finished_where_its_region_is_searched(registrar, view, candidate):
+    judged = registrar.of_view(view[0], SIDE_M).judged(candidate)
+    assert distances_m([judged.latlon_deg], [view[1]])[0] < 20
+    finished, searched = judged.finished(), judged.searched()
+    assert distances_m([finished.latlon_deg], [searched.latlon_deg])[0] < 2
+    assert finished.evidence["strength"] == pytest.approx(searched.evidence["strength"], rel=0.05)
 
 
-def test_places_without_a_sheet_have_no_match(registrar, views):
-    view, truth = views[0]
-    of_view = registrar.of_view(view, SIDE_M)
-    nowhere = replace(region(truth), lat_deg=10.0, middle_latlon_deg=(10.0, 10.0))
-    assert of_view.judged(nowhere) is None and of_view.searched(nowhere) is None
+def test_a_place_between_sheets_is_judged_on_one(registrar, atlas):
+    """On its own sheet; on a neighbour that reaches there where that cannot be used."""
+    _, south, east, north = next(iter(atlas.sheets().values())).bounds_deg
+    name = next(
+        name
+        for name, other in atlas.sheets().items()
+        if other.bounds_deg[1] == south and other.bounds_deg[0] == pytest.approx(east)
+    )
+    border = LocalFrame((south + north) / 2, east).latlon_from_en(np.array([5.0, 0.0]))
+    place = float(border[0]), float(border[1])
+    region = SearchRegion(*place, 0.0, 0.0, place, 50.0, 0.1)
+    assert len(registrar.near(region, SIDE_M)) == 2
+    (own,) = registrar.at(region, SIDE_M)
+    registrar._usable.discard(name)
+    (other,) = registrar.at(region, SIDE_M)
+    assert own is not other
 
 
-def test_the_part_of_a_pyramid_shows_what_the_whole_shows(registrar, views):
-    _, truth = views[0]
-    sheet = registrar.near(region(truth), SIDE_M)[0]
-    middle = (sheet.grid.width_px / 2, sheet.grid.height_px / 3)
-    part = part_of(sheet, middle, 90.0)
-    east_px = (part.grid.west_m - sheet.grid.west_m) / sheet.grid.gsd_m
-    south_px = (sheet.grid.north_m - part.grid.north_m) / sheet.grid.gsd_m
-    for level in range(sheet.pyramid.levels):
-        rows, cols = part.pyramid.shape(level)
-        row, col = (round(at) >> level for at in (south_px, east_px))
-        for mine, theirs in zip(
-            part.pyramid.read(level, 0, 0, rows, cols),
-            sheet.pyramid.read(level, row, col, rows, cols),
-            strict=True,
-        ):
-            assert np.array_equal(mine, theirs)
-    assert part_of(sheet, (-500.0, -500.0), 90.0) is None
-    corner = part_of(sheet, (0.0, 0.0), 90.0)
-    assert corner.pyramid.shape(0)[0] < part.pyramid.shape(0)[0]
+class Region(SimpleNamespace):
+    """A judged region whose place has a score; `finds`: that of its search."""
 
-
-class Judged:
-    """A candidate whose searches are counted."""
-
-    def __init__(self, place, look, strength, searches):
-        self.latlon_deg, self.look, self._strength = (48.0 + place / 100, 11.0), look, strength
-        self._searches = searches
+    searched_before = 0
 
     def finished(self):
+        return self._match(self.look)
+
+    def searched(self):
+        Region.searched_before += 1
+        return self._match(self.finds)
+
+    def _match(self, strength):
         evidence = {
-            **{"strength": self._strength, "rival": 0.0, "look": self.look, "look_rival": 0.0},
-            **{"fine": math.nan, "fine_rival": math.nan, "detail_ratio": 1.4},
-            **{"local_phase": 9.0, "local_gradients": 9.0},
+            **dict.fromkeys(("rival", "look_rival"), 0.0),
+            **dict.fromkeys(("fine", "fine_rival", "detail_ratio"), math.nan),
+            **dict.fromkeys(("local_phase", "local_gradients"), 20.0),
+            **{"strength": strength, "look": strength},
         }
         return SheetMatch(*self.latlon_deg, 0.0, 0.0, evidence, None)
 
-    def searched(self):
-        self._searches.append(self.look)
-        return self.finished()
+
+def _regions(*scores, finds=None):
+    """Regions a tenth of a degree apart."""
+    Region.searched_before = 0
+    found = finds or scores
+    return [
+        Region(latlon_deg=(50 + at / 10, 8.0), look=score, finds=more)
+        for at, (score, more) in enumerate(zip(scores, found, strict=True))
+    ]
 
 
-class Registrar:
-    """Judges regions that are candidates already."""
-
-    def judged(self, region):
-        return region
-
-
-def found_among(*candidates):
-    """What is found among candidates (place, look, strength), and which were searched."""
-    searches = []
-    found = ViewMatches(300.0)
-    found.add_candidates(Registrar(), [Judged(*each, searches) for each in candidates])
-    return found, searches
+def _added(regions):
+    found = ViewMatches(SIDE_M)
+    found.add_candidates(SimpleNamespace(judged=lambda each: each), regions)
+    return found
 
 
-def test_a_proven_match_ends_the_search_of_candidates():
-    weak = [(place, 14.0, 30.0) for place in range(2, 9)]
-    found, searches = found_among(*weak, (1, 60.0, 120.0))
-    assert searches == [60.0] and found.found[0].evidence["strength"] == 120.0
-    assert found.proves((48.01, 11.0), 1.0) and not found.proves((48.05, 11.0), 1000.0)
+def test_candidates_are_searched_until_one_is_proven():
+    clear = _added(_regions(10.0, 90.0, 11.0, 12.0, 10.0, 9.0))
+    assert Region.searched_before == 1
+    assert clear.found[0].lat_deg == 50.1
+    _added(_regions(*[15.0] * 8))
+    assert Region.searched_before == SEARCHED
 
 
-def test_without_a_proven_match_the_strongest_candidates_are_searched():
-    alike = [(place, 15.0 - place / 10, 30.0 - place) for place in range(8)]
-    found, searches = found_among(*alike)
-    assert searches == [15.0, 14.9, 14.8, 14.7] and len(found.found) == 8
-    assert not found.proves(found.found[0].latlon_deg, 1e6)
+def test_a_place_that_only_its_search_shows_is_found():
+    found = _added(_regions(20.0, 18.0, 17.0, finds=(20.0, 90.0, 17.0)))
+    assert found.found[0].lat_deg == 50.1 and found.log_odds(0) > matches.PROVEN
 
 
-def test_candidates_that_were_not_finished_are_rivals_too():
-    weak = [(place, 14.0, 30.0) for place in range(2, 9)]
-    alone, _ = found_among((1, 60.0, 120.0))
-    beside, _ = found_among((1, 60.0, 120.0), *weak)
-    assert len(beside.found) < 1 + len(weak)
-    assert beside.log_odds(0) <= alone.log_odds(0)
-    assert against(beside.found[0].evidence, [], [14.0])["look_rival"] == 14.0
+def test_candidates_that_are_not_finished_are_rivals():
+    alone = _added(_regions(30.0, 8.0, 7.0, 6.0))
+    rivals = _added(_regions(30.0, 14.9, 14.8, 14.7, 14.6))
+    assert len(rivals.found) == 4
+    assert rivals.log_odds(0) < alone.log_odds(0)
+    # No rival of the place that it belongs to.
+    rivals._judged = [SimpleNamespace(latlon_deg=(50.0, 8.001), look=29.0)]
+    before = rivals.log_odds(0)
+    rivals._judged = []
+    assert rivals.log_odds(0) == before
+
+
+def test_expected_places_are_searched_unless_the_view_is_proven_there():
+    searched = []
+
+    def search(region):
+        searched.append(region.latlon_deg[0])
+
+    here, there = (SearchRegion(lat, 8.0, 0.0, 0.0, (lat, 8.0), 500.0, 0.1) for lat in (50.1, 51.0))
+    registrar = SimpleNamespace(searched=search)
+    proven, doubtful = _added(_regions(10.0, 90.0)), _added(_regions(15.0, 15.0))
+    for found, regions, expected in (
+        (proven, (here, there), []),
+        (proven, (there, here), [51.0]),
+        (doubtful, (here, there), [50.1, 51.0]),
+    ):
+        searched.clear()
+        found.add_expected(registrar, regions)
+        assert searched == expected
+
+
+def test_all_views_of_a_flight_are_found_among_their_candidates(atlas, registrar, flown):
+    finder = PlaceFinder(registrar, TileSearch(atlas))
+    flight = open_flight(flown)
+    truth = list(read_truth(flown / "truth.csv").values())
+    for seen, at in zip(itertools.islice(flight.views, 3), truth, strict=False):
+        finder.find(View(seen.grey(), flight.camera, seen.telemetry))
+        assert _off_m(finder._agreement.best.last, at) < 25

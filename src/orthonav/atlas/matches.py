@@ -57,20 +57,26 @@ class ViewMatches:
         for number, (_, region) in enumerate(finished[:SEARCHED]):
             found[number] = region.searched() or found[number]
             self.found = self._distinct(found)
-            if self.proves(self.found[0].latlon_deg, 0.0):
+            if self._proven:
                 break
 
     def add_expected(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
-        """Search the regions where a view is expected; none where a candidate is proven there."""
-        left = [each for each in regions if not self.proves(each.latlon_deg, each.reach_m)]
-        found = [each for each in map(registrar.searched, left) if each is not None]
-        self.found = self._distinct([*self.found, *found])
+        """Search the regions where a view is expected, the likeliest first, up to one in which the
+        strongest match is proven; not that one where a candidate has been."""
+        for region in regions:
+            if not self._proven_in(region) and (found := registrar.searched(region)):
+                self.found = self._distinct([*self.found, found])
+            if self._proven_in(region):
+                break
 
-    def proves(self, latlon_deg: tuple[float, float], reach_m: float) -> bool:
-        """Whether the strongest match is proven, and within reach of a place."""
-        if not self.found or self.log_odds(0) < PROVEN:
-            return False
-        return nearest_m(latlon_deg, [self.found[0].latlon_deg]) <= reach_m
+    @property
+    def _proven(self) -> bool:
+        """Whether the strongest match is proven."""
+        return bool(self.found) and self.log_odds(0) >= PROVEN
+
+    def _proven_in(self, region: SearchRegion) -> bool:
+        """Whether it is, and lies in a region."""
+        return self._proven and region.contains(self.found[0])
 
     def log_odds(self, number: int) -> float:
         """Log odds of one of the matches against all others."""

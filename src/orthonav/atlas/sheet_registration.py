@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.atlas.agreement import Placement
+from orthonav.atlas.agreement import Placement, nearest_m
 from orthonav.atlas.catalog import Atlas
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AtlasError, MapFileError
@@ -56,6 +56,10 @@ class SearchRegion(Placement):
     middle_latlon_deg: tuple[float, float]
     reach_m: float
     turn_std_rad: float
+
+    def contains(self, place: Placement) -> bool:
+        """Whether a place is within reach."""
+        return nearest_m(self.latlon_deg, [place.latlon_deg]) <= self.reach_m
 
 
 @dataclass(frozen=True, eq=False)
