@@ -137,7 +137,7 @@ def _regions(*scores, finds=None):
     Region.searched_before = 0
     found = finds or scores
     return [
-        Region(latlon_deg=(50 + at / 10, 8.0), look=score, finds=more)
+        Region(latlon_deg=(50 + at / 10, 8.0), look=score, finds=more, region=at)
         for at, (score, more) in enumerate(zip(scores, found, strict=True))
     ]
 
@@ -156,6 +156,15 @@ def test_candidates_are_searched_until_one_is_proven():
     assert Region.searched_before == SEARCHED
 
 
+def test_a_place_remains_a_rival_where_its_search_finds_another_one():
+    moved = SheetMatch(52.0, 8.0, 0.0, 0.0, _regions(30.0)[0].finished().evidence, None)
+    regions = _regions(40.0, 20.0, 18.0)
+    regions[0].searched = lambda: moved
+    found = _added(regions)
+    assert [each.lat_deg for each in found.found][:2] == [50.0, 52.0]
+    assert found.compared == [0, 1, 2]
+
+
 def test_a_place_that_only_its_search_shows_is_found():
     found = _added(_regions(20.0, 18.0, 17.0, finds=(20.0, 90.0, 17.0)))
     assert found.found[0].lat_deg == 50.1 and found.log_odds(0) > matches.PROVEN
@@ -171,6 +180,8 @@ def test_candidates_that_are_not_finished_are_rivals():
     before = rivals.log_odds(0)
     rivals._judged = []
     assert rivals.log_odds(0) == before
+    rivals._judged = [SimpleNamespace(latlon_deg=(51.0, 8.0), look=29.0)]
+    assert rivals.log_odds(0) < before
 
 
 def test_expected_places_are_searched_unless_the_view_is_proven_there():
@@ -192,7 +203,7 @@ def test_expected_places_are_searched_unless_the_view_is_proven_there():
         assert searched == expected
 
 
-def test_all_views_of_a_flight_are_found_among_their_candidates(atlas, registrar, flown):
+def test_all_views_of_a_flight_are_found(atlas, registrar, flown):
     finder = PlaceFinder(registrar, TileSearch(atlas))
     flight = open_flight(flown)
     truth = list(read_truth(flown / "truth.csv").values())

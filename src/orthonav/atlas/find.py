@@ -112,7 +112,6 @@ class PlaceFinder:
         time_ns = view.telemetry.time_ns
         expected = self._expected(view, coarse, time_ns)
         candidates = self._candidates(view, coarse)
-        regions = [*expected, *candidates]
         registrar, matches = self._registrar.of_view(view, side_m), ViewMatches(side_m)
         matches.add_candidates(registrar, candidates)
         matches.add_expected(registrar, expected)
@@ -122,7 +121,8 @@ class PlaceFinder:
             )
             for at, one in enumerate(matches.found)
         ]
-        all_m2 = _searched_m2(regions)
+        # Candidates that were only judged might hide a match: their area does not count.
+        all_m2 = _searched_m2([*expected, *matches.compared])
         chance = _searched_m2(expected) / all_m2 if all_m2 else 1.0
         self._agreement.add_view(places, time_ns, side_m, chance)
         self._views[self._number] = view

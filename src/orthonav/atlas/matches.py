@@ -35,12 +35,14 @@ LEAST = 1e-5
 class ViewMatches:
     """The matches of a view `side_m` wide.
 
-    `found`: the strongest of each place, strongest first.
+    `found`: the strongest of each place, strongest first. `compared`: the regions of candidates
+    that were finished, or searched.
     """
 
     def __init__(self, side_m: float) -> None:
         self._apart_m = RIVAL_SHARE * side_m
         self._judged: list[JudgedRegion] = []
+        self.compared: list[SearchRegion] = []
         self.found: list[SheetMatch] = []
 
     def add_candidates(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
@@ -50,19 +52,28 @@ class ViewMatches:
         hopeful = sum(each.look >= HOPE * judged[0].look for each in judged)
         hopeful = max(hopeful, MIN_HOPEFUL)
         self._judged = judged[hopeful:]
+        self.compared = [each.region for each in judged[:hopeful]]
         finished = [(each.finished(), each) for each in judged[:hopeful]]
         finished.sort(key=lambda each: -each[0].evidence["strength"])
         found = [match for match, _ in finished]
         self.found = self._distinct(found)
+        searched: list[SheetMatch] = []
         for number, (_, region) in enumerate(finished[:SEARCHED]):
-            found[number] = region.searched() or found[number]
+            match = region.searched()
+            if match is None:
+                continue
+            searched.append(match)
+            if nearest_m(match.latlon_deg, [found[number].latlon_deg]) > self._apart_m:
+                found.append(match)  # the place that was judged remains a rival
+            else:
+                found[number] = match
             self.found = self._distinct(found)
-            if self._proven:
+            if self._proven and self.found[0] in searched:
                 break
 
     def add_expected(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
         """Search the regions where a view is expected, the likeliest first, up to one in which the
-        strongest match is proven; not that one where a candidate has been."""
+        strongest match is proven. One in which a candidate is proven already is not searched."""
         for region in regions:
             if not self._proven_in(region) and (found := registrar.searched(region)):
                 self.found = self._distinct([*self.found, found])

@@ -26,7 +26,7 @@ from orthonav.localizer.relief import Relief
 from orthonav.mapfile import open_map
 from orthonav.mapfile.layer import level_shape
 from orthonav.records import PRIOR_SIGMAS, NoFix, Prior, View
-from orthonav.register.evidence import FINE
+from orthonav.register.evidence import COARSE, FINE
 from orthonav.register.pose import Pose
 from orthonav.register.reference import GreyPyramid
 from orthonav.register.refine import Placed
@@ -41,7 +41,8 @@ BORDER_SHARE = 0.25
 """Sheets reach half a tile beyond their box: a sheet is
 searched where the middle of a view may lie up to this share of its side outside the box."""
 WIDEST = 1.25
-"""Scale of a view up to which all of it lies on the part of a sheet where it is registered."""
+"""On level ground all of a view of up to this scale lies on the part of a sheet where it is
+registered."""
 
 
 @dataclass(frozen=True)
@@ -172,9 +173,10 @@ class ViewRegistrar:
         if not whole.touches_map:
             return None
         half_diagonal_px = math.hypot(*view.templates.valid.shape) / 2 * 2**view.levels.final
-        around_px = (
-            whole.reach_px + WIDEST * half_diagonal_px + FINE.margin_px * 2**view.levels.final
+        margin_px = max(
+            FINE.margin_px * 2**view.levels.look, COARSE.margin_px * 2**view.levels.coarse
         )
+        around_px = whole.reach_px + WIDEST * half_diagonal_px + margin_px
         part = part_of(sheet, whole.middle_px, around_px)
         if part is None:
             return None

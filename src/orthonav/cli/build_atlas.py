@@ -33,7 +33,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_recipe(sheets)
     add_dem(sheets, "which gives sheets a terrain layer, and maps that are cut out of them")
     sheets.add_argument(
-        "--replace", action="store_true", help="rebuild sheets of other imagery or program versions"
+        "--replace", action="store_true", help="rebuild sheets that have other imagery or versions"
     )
     coarse = parser.add_argument_group("coarse tiles, for views without a prior")
     coarse.add_argument(

@@ -71,8 +71,11 @@ def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
 
 
 class _ViewAsMap(Reference):
-    """One rectified view in the role of the map. Its evidence is that of its templates, so that it
-    is made once for both roles: a constant factor changes no correlation."""
+    """One rectified view in the role of the map. Not to be shared between threads.
+
+    Its evidence is that of its templates, so that it is made once for both roles. They differ by a
+    factor for each kind of evidence, which changes no correlation.
+    """
 
     def __init__(self, templates: ViewTemplates) -> None:
         self._templates = templates

@@ -42,7 +42,7 @@ from orthonav.register.registrar import Registered, Registrar
 class RegisteredView:
     """A prepared view and its best place; `found` is a `NoFix` where it could not be compared.
 
-    `ground`: what it saw, where the map has a terrain or the view looks aside. `camera`: makes the
+    `ground`: what it saw, where the map has a terrain or the view is oblique. `camera`: makes the
     camera with its pitch and roll, None where these are not examined.
     """
 

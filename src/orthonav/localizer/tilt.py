@@ -157,8 +157,10 @@ class _TiltProfile:
         self, registration: RegistrationLocalizer, view: View, prepared: PreparedView
     ) -> None:
         level = prepared.levels.final
-        self._registration, self._view = registration, prepared.picture_at(level)
         camera, telemetry = view.camera, view.telemetry
+        self._registration, self._view = registration, prepared.picture_at(level)
+        if not np.allclose(self._view.camera.extent, camera.extent, rtol=1e-9):
+            self._view = view  # cropped, it might be judged at other levels
         corner = math.hypot(*camera.extent) / 2
         rim_m = RIM_PX * registration.grid.gsd_m * 2**level
         self.step_rad = min(rim_m / max(telemetry.agl_m * corner**2, 1e-9), MAX_STEP_RAD)

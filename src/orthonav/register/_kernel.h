@@ -15,8 +15,9 @@
 typedef float lanes __attribute__((vector_size(16)));
 typedef float lanes_in_memory __attribute__((vector_size(16), aligned(4)));
 
-/* Whether functions for AVX2 are used: where the processor has it, and ORTHONAV_NO_AVX2 is not set. */
-extern int has_avx2;
+/* Whether functions for AVX2 are used: where the processor has it, and ORTHONAV_NO_AVX2 is not set to
+ * anything but an empty string. */
+extern __attribute__((visibility("hidden"))) int has_avx2;
 
 /* A function compiled for processors with AVX2 from the inline function FAST, and for all from PLAIN.
  * GCC's target_clones("arch=..") is no substitute: it asks for that very model of processor. */
