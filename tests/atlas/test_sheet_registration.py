@@ -74,10 +74,11 @@ def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, can
     found = registrar.of_view(seen, SIDE_M).searched(candidate)
     assert _off_m(found, truth) < 10
     sheet = registrar.at(candidate, SIDE_M)[0]
-    yaw_deg = math.degrees(candidate.turn_rad)
-    turned = replace(seen, telemetry=replace(seen.telemetry, yaw_deg=yaw_deg))
+    yaw_deg, std_deg = np.degrees([candidate.turn_rad, candidate.turn_std_rad]).tolist()
+    telemetry = replace(seen.telemetry, yaw_deg=yaw_deg, yaw_std_deg=std_deg)
+    turned = replace(seen, telemetry=telemetry)
     prior = Prior(*candidate.latlon_deg, candidate.reach_m / PRIOR_SIGMAS)
-    whole = sheet.register(turned, prior, heading_std_rad=candidate.turn_std_rad)
+    whole = sheet.register(turned, prior)
     for name in ("strength", "look", "detail_ratio", "local_phase", "local_gradients"):
         assert found.evidence[name] == pytest.approx(whole.found.evidence()[name], rel=0.05)
     assert found.turn_rad == pytest.approx(whole.found.placed.pose.turn_rad, abs=2e-3)

@@ -29,7 +29,7 @@ from orthonav.records import CONFIDENT, NoFix, View
 
 # Values without another source: `python -m benchmarks.atlas_lost`.
 CANDIDATES = 24
-"""Places of the whole atlas that are judged, 5 ms each."""
+"""Places of the whole atlas that are judged, 4 ms each."""
 TURN_STEP_DEG = 8.0
 LOG_SCALES = (-0.06, 0.06)
 """Headings and log scales under which coarse tiles are searched: each

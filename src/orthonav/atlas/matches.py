@@ -18,14 +18,15 @@ from orthonav.atlas.sheet_registration import (
 )
 from orthonav.confidence.logistic import logit
 from orthonav.confidence.registered import USUAL_CONFIDENCE
+from orthonav.localizer.plan import DEFAULT_PLAN
 from orthonav.register.registrar import HOPE, MIN_HOPEFUL
 
 SEARCHED = 4
 """At most so many candidates are searched: the right one and the best rivals are among them
 (docs/decisions/atlas.md, 5)."""
-PROVEN = logit(0.998, 0.0)
+PROVEN = logit(1 - DEFAULT_PLAN.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
-searched (`SearchPlan.trial_doubt`)."""
+searched."""
 RIVAL_SHARE = 0.25
 """Matches farther apart than this share of the view's side are different places."""
 LEAST = 1e-5

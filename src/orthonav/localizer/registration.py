@@ -134,24 +134,12 @@ class RegistrationLocalizer:
         return self._fix(seen.prepared, seen.found, view.telemetry, seen)
 
     def register(
-        self,
-        view: View,
-        prior: Prior | None = None,
-        heading_known: bool = True,
-        *,
-        heading_std_rad: float | None = None,
+        self, view: View, prior: Prior | None = None, heading_known: bool = True
     ) -> RegisteredView | NoFix:
-        """The view and its best place within `prior`; `NoFix` where it shows too little.
-
-        `heading_std_rad`: standard deviation of the heading in place of the reported one, which
-        has limits.
-        """
+        """The view and its best place within `prior`; `NoFix` where it shows too little."""
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
-        if heading_std_rad is not None:
-            pose_prior = replace(prepared.prior, turn_std_rad=heading_std_rad)
-            prepared = replace(prepared, prior=pose_prior)
         if self.relief is not None:
             prepared = replace(prepared, prior=self.relief.expected(prepared))
         if not self._candidates(prepared, prior).touches_map:
