@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.register import refine, search, template
+from orthonav.register import refine, search, sharpness, template
 from orthonav.register.kernel import KERNEL
+from orthonav.register.map_window import MapWindow
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Refiner
 from orthonav.register.scale_map import ScaleMap
@@ -32,7 +33,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (refine, search, template):
+    for module in (refine, search, sharpness, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -71,7 +72,7 @@ def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_kernel), False])
 def test_views_that_touch_the_map_with_a_few_pixels_are_placed(reference, monkeypatch, compiled):
     if not compiled:
-        for module in (refine, template):
+        for module in (refine, sharpness, template):
             monkeypatch.setattr(module, "KERNEL", None)
     rng = np.random.default_rng(8)
     made = templates_of(GROUND, Pose(160, 128, 0, 0)).at(0)
@@ -143,6 +144,87 @@ def test_other_arrays_are_refused(damage):
         view = view[:, ::2]
     with pytest.raises(ValueError, match=r"expected|contiguous"):
         KERNEL.refine(window, view, slopes, numbers, (0, 0, 0, 0), (0,) * 9)
+
+
+@needs_kernel
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_a_covariance_is_made_of_is_the_same(reference, monkeypatch, level, whole):
+    view_valid = np.ones((96, 128), bool)
+    view_valid[:40, 90:] = whole
+    made, window = [], []
+    for template_, pose in views(12, 6, level, view_valid):
+        made.append((Refiner(template_, reference), pose))
+        window.append(MapWindow.of(template_, reference, pose, refine.SLACK_PX))
+
+    def work():
+        return [one._spread(seen, pose) for (one, pose), seen in zip(made, window, strict=True)]
+
+    for one, other in zip(*both(monkeypatch, work), strict=True):
+        for mine, plain in zip(one, other, strict=True):
+            limit = 2e-3 * np.abs(plain).max(axis=0)  # OpenCV rounds positions
+            assert (np.abs(mine - plain) <= limit + 1e-9).all()
+        assert one.agreement() == pytest.approx(other.agreement(), abs=0.03)
+        assert one.blocks_t() == pytest.approx(other.blocks_t(), abs=0.02)
+
+
+@needs_kernel
+@pytest.mark.parametrize("pose", [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)])
+def test_sums_at_a_pose_beyond_all_bounds_touch_no_memory(pose):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
+    images = np.ones((20, 30, 4), np.float32), made.values, made.slopes, made.numbers
+    limits = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
+    out = np.full(2 * 16 + 36 * refine.BLOCK_SUMS, math.nan)
+    KERNEL.spread(*images, pose, limits, out)
+    assert not out[:16].any() and not out[32:].any()
+    with pytest.raises(ValueError, match="expected"):
+        KERNEL.spread(*images, pose, limits, out[:-1])
+
+
+@needs_kernel
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("whole", [True, False])
+def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole):
+    view_valid = np.ones((96, 128), bool)
+    view_valid[:40, 90:] = whole
+    seen = list(views(12, 8, level, view_valid))
+
+    def work():
+        return [sharpness._moved_scores(made, reference, pose) for made, pose in seen]
+
+    for one, other in zip(*both(monkeypatch, work), strict=True):
+        assert one.shape == other.shape
+        for mine, plain in zip(one, other, strict=True):
+            assert np.abs(mine - plain).max() <= 1e-2 * np.abs(plain).max() + 1e-9
+            assert np.unravel_index(mine.argmax(), mine.shape) == np.unravel_index(
+                plain.argmax(), plain.shape
+            )
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
+)
+def test_moves_beyond_all_bounds_touch_no_memory(matrix):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    window, out = np.ones((20, 30, 4), np.float32), np.full((3, 7, 9), math.nan, np.float32)
+    KERNEL.moved(window, made.values, made.weights, matrix, 0.0, (3, 4), (60, 80), 1e-3, out)
+    assert not out.any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["size", "small", "moves", "scores", "strided", "window"])
+def test_moves_that_do_not_match_are_refused(damage):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    size = {"size": (77, 100), "small": (made.mask.shape[0] + 5, 100)}.get(damage, (80, 100))
+    window = np.ones((20, 30, 3 if damage == "window" else 4), np.float32)
+    out = np.zeros((3, 8 if damage == "scores" else 7, 9), np.float32)
+    if damage == "strided":
+        out = np.zeros((3, 7, 18), np.float32)[..., ::2]
+    moves = (-3, 4) if damage == "moves" else (3, 4)
+    matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    with pytest.raises(ValueError, match=r"match|expected|contiguous|products"):
+        KERNEL.moved(window, made.values, made.weights, matrix, 0.0, moves, size, 1e-3, out)
 
 
 SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]

@@ -3,7 +3,7 @@
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
- * `derive` makes the view's derivatives and adds up their products. The Python modules do the same
+ * `spread` adds up what the covariance is made of. `derive` makes the view's derivatives and adds up their products. The Python modules do the same
  * with NumPy; they are the oracle of this file and take its place where it was not compiled.
  *
  * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
@@ -15,13 +15,15 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define LAYOUT 3        /* of all arguments and results; kernel.py has the same number */
+#define LAYOUT 4        /* of all arguments and results; kernel.py has the same number */
 #define BLOCKS 6        /* blocks along a side of a view: orthonav.register.template.BLOCKS */
 #define FULLY_VALID 0.99f
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
 #define PER_BLOCK (2 * 4 * 4)
 #define CURVATURES (BLOCKS * BLOCKS * PER_BLOCK)
 #define DERIVED (CURVATURES + 8)
+#define BLOCK_SUMS 7    /* four steps' terms, both products, pixels that count */
+#define SPREAD (16 + 16 + BLOCKS * BLOCKS * BLOCK_SUMS)
 #define CHUNK 128       /* pixels of a row whose taps are found together */
 
 typedef struct {
@@ -358,6 +360,106 @@ static void refine(const window_t *window, const template_t *view, const numbers
     memcpy(best->step, step, sizeof step);
 }
 
+/* The map (H, W, 4) as the view's window shows it, edge directions turned, zero where either does not
+ * count; the last of each four is 1 where both do. */
+INLINE void sample_inline(const window_t *window, const template_t *view, const double *matrix,
+                          float cosine, float sine, float *into) {
+    const lanes straight = {cosine, cosine, 1.0f, 0.0f}, crossed = {-sine, sine, 0.0f, 0.0f};
+    const float dx = (float)matrix[0], dy = (float)matrix[3], *values = view->view;
+    for (int row = 0; row < view->rows; row++) {
+        const float x = (float)(matrix[1] * row + matrix[2]), y = (float)(matrix[4] * row + matrix[5]);
+        for (int col = 0; col < view->cols; col++, values += LANES, into += LANES) {
+            const lanes map = sampled(window, x + dx * (float)col, y + dy * (float)col);
+            const float counts = map[3] * values[3] > FULLY_VALID ? 1.0f : 0.0f;
+            const lanes other = {map[1], map[0], 0.0f, 0.0f}, last = {0.0f, 0.0f, 0.0f, counts};
+            const lanes turned = (map * straight + other * crossed) * counts + last;
+            memcpy(into, &turned, sizeof turned);
+        }
+    }
+}
+
+FOR_EVERY_PROCESSOR(sample,
+                    (const window_t *window, const template_t *view, const double *matrix,
+                     float cosine, float sine, float *into),
+                    (window, view, matrix, cosine, sine, into))
+
+/* Derivatives along x and y as those of steps along x, y, turn and log scale. */
+INLINE void by_steps(lanes dx, lanes dy, lanes x, float y, lanes out[4]) {
+    out[0] = dx, out[1] = dy, out[2] = x * dy - y * dx, out[3] = x * dx + y * dy;
+}
+
+/* Products of the view's derivatives and those of the map (4, 4), then by block the sums of
+ * `BlockSums` of refine.py. */
+INLINE void correlate_inline(const template_t *view, const float *map, const seen_t *seen,
+                             double *observed, double *out) {
+    const float gain = (float)seen->gains[0], square = (float)seen->squares[0];
+    const lanes gains = {gain, gain, (float)seen->gains[1], 0.0f};
+    const lanes squares = {square, square, (float)seen->squares[1], 0.0f};
+    const size_t width = (size_t)LANES * view->cols;
+    for (int row = 0; row < view->rows; row++) {
+        const int before = row > 0 ? row - 1 : (view->rows > 1);
+        const int after = row + 1 < view->rows ? row + 1 : (view->rows > 1 ? view->rows - 2 : 0);
+        const float *const around[3] = {map + before * width, map + row * width, map + after * width};
+        const float y = from_middle(row, view->rows);
+        double *into = out + (size_t)BLOCKS * BLOCK_SUMS * block_of(row, view->rows);
+        lanes products[4][4] = {{{0}}};
+        for (int block = 0; block < BLOCKS; block++, into += BLOCK_SUMS) {
+            const int last = view->cols * (block + 1) / BLOCKS;
+            lanes terms[4] = {{0}}, product = {0};
+            float pixels = 0.0f;
+            for (int col = view->cols * block / BLOCKS; col < last; col++) {
+                const size_t at = (size_t)view->cols * row + col;
+                const lanes mine = load(view->view + LANES * at), theirs = load(around[1] + LANES * col);
+                const lanes x = all(from_middle(col, view->cols)), counts = all(theirs[3]);
+                const float *const slopes = view->slopes + 2 * LANES * at;
+                lanes slope[2], step[4], other[4];
+                by_steps(load(slopes), load(slopes + LANES), x, y, step);
+                sobel(around, col, view->cols, slope);
+                by_steps(slope[0] * gains * counts, slope[1] * gains * counts, x, y, other);
+                const lanes residual = gains * theirs - squares * mine * counts;
+                for (int i = 0; i < 4; i++) {
+                    terms[i] += step[i] * residual;
+                    for (int j = 0; j < 4; j++) products[i][j] += step[i] * other[j];
+                }
+                product += mine * theirs;
+                pixels += theirs[3];
+            }
+            for (int i = 0; i < 4; i++) into[i] += (double)terms[i][0] + terms[i][1] + terms[i][2];
+            into[4] += (double)product[0] + product[1];
+            into[5] += product[2];
+            into[6] += pixels;
+        }
+        for (int i = 0; i < 4; i++)
+            for (int j = 0; j < 4; j++)
+                observed[4 * i + j] +=
+                    (double)products[i][j][0] + products[i][j][1] + products[i][j][2];
+    }
+}
+
+FOR_EVERY_PROCESSOR(correlate,
+                    (const template_t *view, const float *map, const seen_t *seen, double *observed,
+                     double *out),
+                    (view, map, seen, observed, out))
+
+/* What a covariance is made of; 0, or -1 without memory. */
+static int spread(const window_t *window, const template_t *view, const numbers_t *numbers,
+                  const limits_t *limits, const pose_t *pose, double *out) {
+    const size_t pixels = (size_t)view->rows * view->cols;
+    float *const map = malloc((pixels + 1) * LANES * sizeof(float));
+    double matrix[6], hessian[4][4];
+    seen_t seen;
+    if (!map) return -1;
+    memset(out, 0, SPREAD * sizeof(double));
+    look(window, view, numbers, limits, pose, &seen);
+    hessian_of(&seen, numbers, limits, hessian);
+    memcpy(out + 16, hessian, sizeof hessian);
+    matrix_of(pose, view, limits, matrix);
+    sample(window, view, matrix, (float)cos(2 * pose->turn), (float)sin(-2 * pose->turn), map);
+    correlate(view, map, &seen, out, out + 32);
+    free(map);
+    return 0;
+}
+
 int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags) {
     if (PyObject_GetBuffer(from, into, PyBUF_STRIDES | PyBUF_FORMAT | flags) < 0) return -1;
     const Py_ssize_t size = kind == 'd' ? 8 : 4;
@@ -432,29 +534,45 @@ static int borrow_images(PyObject *const from[3], images_t *images) {
     return -1;
 }
 
-static PyObject *py_refine(PyObject *self, PyObject *arguments) {
-    PyObject *from[3], *number_list;
+/* A view beside the map, and a pose. */
+typedef struct {
     images_t images;
     Py_buffer numbers;
+    pose_t pose;
     limits_t limits;
+} problem_t;
+
+static void give_back_problem(problem_t *problem) {
+    PyBuffer_Release(&problem->numbers);
+    give_back(&problem->images);
+}
+
+/* 0, or -1 with an error; `out`: takes the last argument, NULL where there is none. */
+static int borrow_problem(PyObject *arguments, problem_t *problem, PyObject **out) {
+    PyObject *from[3], *numbers;
+    pose_t *const pose = &problem->pose;
+    double *const l = (double *)&problem->limits;
+    if (!PyArg_ParseTuple(arguments, out ? "OOOO(dddd)(ddddddddd)O" : "OOOO(dddd)(ddddddddd)", &from[0],
+                          &from[1], &from[2], &numbers, &pose->x, &pose->y, &pose->turn,
+                          &pose->log_scale, &l[0], &l[1], &l[2], &l[3], &l[4], &l[5], &l[6], &l[7],
+                          &l[8], out))
+        return -1;
+    if (borrow_images(from, &problem->images) < 0) return -1;
+    if (borrow(numbers, &problem->numbers, 1, NUMBERS, 'd', 0) == 0) return 0;
+    give_back(&problem->images);
+    return -1;
+}
+
+static PyObject *py_refine(PyObject *self, PyObject *arguments) {
+    problem_t problem;
     placed_t best;
-    double *l = (double *)&limits;
     (void)self;
-    if (!PyArg_ParseTuple(arguments, "OOOO(dddd)(ddddddddd)", &from[0], &from[1], &from[2],
-                          &number_list, &best.pose.x, &best.pose.y, &best.pose.turn,
-                          &best.pose.log_scale, &l[0], &l[1], &l[2], &l[3], &l[4], &l[5], &l[6],
-                          &l[7], &l[8]))
-        return NULL;
-    if (borrow_images(from, &images) < 0) return NULL;
-    if (borrow(number_list, &numbers, 1, NUMBERS, 'd', 0) < 0) {
-        give_back(&images);
-        return NULL;
-    }
+    if (borrow_problem(arguments, &problem, NULL) < 0) return NULL;
+    best.pose = problem.pose;
     Py_BEGIN_ALLOW_THREADS
-    refine(&images.window, &images.template, numbers.buf, &limits, &best);
+    refine(&problem.images.window, &problem.images.template, problem.numbers.buf, &problem.limits, &best);
     Py_END_ALLOW_THREADS
-    PyBuffer_Release(&numbers);
-    give_back(&images);
+    give_back_problem(&problem);
     return Py_BuildValue("(dddd)d(dd)dddN", best.pose.x, best.pose.y, best.pose.turn,
                          best.pose.log_scale, best.score, best.correlations[0],
                          best.correlations[1], best.weighted, best.overlap, best.converged,
@@ -483,9 +601,30 @@ free_view:
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }
 
+static PyObject *py_spread(PyObject *self, PyObject *arguments) {
+    problem_t problem;
+    Py_buffer out;
+    PyObject *to;
+    int failed;
+    (void)self;
+    if (borrow_problem(arguments, &problem, &to) < 0) return NULL;
+    if (borrow(to, &out, 1, SPREAD, 'd', PyBUF_WRITABLE) == 0) {
+        Py_BEGIN_ALLOW_THREADS
+        failed = spread(&problem.images.window, &problem.images.template, problem.numbers.buf,
+                        &problem.limits, &problem.pose, out.buf);
+        Py_END_ALLOW_THREADS
+        if (failed) PyErr_NoMemory();
+        PyBuffer_Release(&out);
+    }
+    give_back_problem(&problem);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
 static PyMethodDef functions[] = {
     {"refine", py_refine, METH_VARARGS,
      "refine(window, view, slopes, numbers, pose, limits): see orthonav.register.refine."},
+    {"spread", py_spread, METH_VARARGS,
+     "spread(window, view, slopes, numbers, pose, limits, out): see orthonav.register.refine."},
     {"derive", py_derive, METH_VARARGS,
      "derive(view, slopes, out): see orthonav.register.template."},
     {"search", py_search, METH_VARARGS,
@@ -493,6 +632,9 @@ static PyMethodDef functions[] = {
      "orthonav.register.search."},
     {"near", py_near, METH_VARARGS,
      "near(channels, view, weights, places, reach, out): see orthonav.register.search."},
+    {"moved", py_moved, METH_VARARGS,
+     "moved(window, view, weights, matrix, turn, moves, size, floor, out): see "
+     "orthonav.register.sharpness."},
     {NULL, NULL, 0, NULL},
 };
 

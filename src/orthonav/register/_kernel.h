@@ -76,5 +76,6 @@ int is_whole(const Py_buffer *buffer);
 
 PyObject *py_search(PyObject *self, PyObject *arguments);
 PyObject *py_near(PyObject *self, PyObject *arguments);
+PyObject *py_moved(PyObject *self, PyObject *arguments);
 
 #endif

@@ -170,8 +170,9 @@ typedef struct {
     const pair_in_memory_t *spectra;    /* (G, 3, R): of the map, eight columns together */
     plan_t down, along;                 /* along columns of R and rows of C numbers */
     int groups, bands;                  /* G, and bands of sixteen rows that are wanted */
+    int channels, wanted;               /* of the strips, and rows of the surface */
     float *planes;                      /* of the view */
-    float *strips, *surface;            /* (G, 3, side, 16) and (G, R, 16) */
+    float *strips, *surface;            /* (G, channels, side, 16) and (G, wanted, 16) */
     pair_t *data, *scratch, *total;     /* of one transform, and of the sum of channels */
 } search_t;
 
@@ -203,7 +204,7 @@ INLINE void separate(const search_t *search, const pair_t *spectra, int side, co
             parts[1][0][at] = here.im + there.im, parts[1][1][at] = there.re - here.re;
         }
         for (int part = 0; part < 2; part++) {
-            const size_t strip = (size_t)group * CHANNELS + channel[part];
+            const size_t strip = (size_t)group * search->channels + channel[part];
             pair_t *into = (pair_t *)search->strips + strip * side + row[part];
             transpose(parts[part][0]);
             transpose(parts[part][1]);
@@ -282,7 +283,7 @@ FOR_EVERY_PROCESSOR(multiply_columns, (const search_t *search, int half), (searc
 
 /* Eight columns of a group, of the eight rows from `row` on: imaginary and real parts. */
 INLINE void columns_of(const search_t *search, int group, int row, wide *im, wide *re) {
-    const int rows = search->down.length;
+    const int rows = search->wanted;
     const pair_t *surface = (const pair_t *)search->surface + (size_t)group * rows + row;
     for (int lane = 0; lane < WIDE; lane++) {
         const pair_t found = row + lane < rows ? surface[lane] : (pair_t){{0}, {0}};
@@ -370,6 +371,7 @@ static int search_all(search_t *search, const view_t *view, const pose_t *poses,
         if (half <= most && half > largest) largest = half;
     }
     const size_t side = 2 * (size_t)largest;
+    search->channels = CHANNELS, search->wanted = rows;
     search->planes = memory_for(CHANNELS * side * side);
     search->strips = memory_for(search->groups * CHANNELS * side * PAIR);
     search->surface = memory_for((size_t)search->groups * rows * PAIR);
@@ -527,6 +529,202 @@ static int search_near(near_t *near, const view_t *view, const place_t *places, 
     return has_memory ? 0 : -1;
 }
 
+/* ---- A view moved a little aside ---- */
+
+typedef struct {
+    search_t parts;             /* plans and memory; channels of the view, then those of the map */
+    window_t view, made;        /* evidence of the view and of the map */
+    const double *weights, *matrix; /* of the kinds of evidence; from the window's pixels to the map's */
+    double turn, floor;         /* of the pose; power below this share of the mean counts less */
+    int rows, cols, side;       /* moves to each side; rows of the window with them */
+    float *map;                 /* (side, .., 4): the map as the window shows it */
+    wide *products;             /* (G, 3, R, 3): real and imaginary parts, and magnitudes */
+} moved_t;
+
+/* The map as the window shows it, and the factors that give both kinds of evidence their weight. */
+INLINE void sample_map_inline(const moved_t *moved, int width, float *gains) {
+    const double *const matrix = moved->matrix;
+    const float cosine2 = (float)cos(2 * moved->turn), sine2 = (float)sin(2 * moved->turn);
+    const float dx = (float)matrix[0], dy = (float)matrix[3];
+    const lanes straight = {cosine2, cosine2, 1.0f, 1.0f}, crossed = {-sine2, sine2, 0.0f, 0.0f};
+    double energies[2] = {0};
+    float *into = moved->map;
+    for (int row = 0; row < moved->side; row++) {
+        const float x = (float)(matrix[1] * row + matrix[2]), y = (float)(matrix[4] * row + matrix[5]);
+        lanes sum = {0};
+        for (int col = 0; col < width; col++, into += LANES) {
+            const lanes seen = sampled(&moved->made, x + dx * (float)col, y + dy * (float)col);
+            const lanes turned_by = seen * straight + (lanes){seen[1], seen[0], 0.0f, 0.0f} * crossed;
+            memcpy(into, &turned_by, sizeof turned_by);
+            sum += turned_by * turned_by;
+        }
+        energies[0] += sum[0] + sum[1], energies[1] += sum[2];
+    }
+    for (int kind = 0; kind < 2; kind++)
+        gains[kind] = energies[kind] > 0 ? (float)sqrt(moved->weights[kind] / energies[kind]) : 0.0f;
+}
+
+FOR_EVERY_PROCESSOR(sample_map, (const moved_t *moved, int width, float *gains), (moved, width, gains))
+
+/* Transforms of the rows of the view and of the map, one as real and one as imaginary parts. */
+INLINE void transform_both_inline(const moved_t *moved, const float *gains) {
+    const search_t *const parts = &moved->parts;
+    const int width = moved->view.cols + 2 * moved->cols;
+    pair_t *ended;
+    for (int channel = 0; channel < CHANNELS; channel++) {
+        const int channels[2] = {channel, CHANNELS + channel};
+        const float gain = 0.5f * gains[channel / 2];   /* taking both apart leaves a factor of two */
+        for (int from = 0; from < moved->side; from += WIDE) {
+            const int count = moved->side - from < WIDE ? moved->side - from : WIDE;
+            const int rows[2] = {from, from};
+            memset(parts->data, 0, parts->along.length * sizeof(pair_t));
+            for (int lane = 0; lane < count; lane++) {
+                float *const into = (float *)parts->data + lane;
+                const float *map = moved->map + (size_t)(from + lane) * width * LANES + channel;
+                const float *view = moved->view.first + (from + lane) * moved->view.stride + channel;
+                for (int col = 0; col < width; col++) into[col * PAIR + WIDE] = gain * map[col * LANES];
+                if (from + lane >= moved->view.rows) continue;
+                for (int col = 0; col < moved->view.cols; col++)
+                    into[col * PAIR] = 0.5f * view[col * LANES];
+            }
+            transform(&parts->along, parts->data, parts->scratch, &ended);
+            separate(parts, ended, moved->side, channels, rows, 1, count);
+        }
+    }
+}
+
+FOR_EVERY_PROCESSOR(transform_both, (const moved_t *moved, const float *gains), (moved, gains))
+
+/* Eight columns of one channel of the strips, of which `count` rows are not zero, transformed. */
+INLINE const pair_t *column_of(const moved_t *moved, int group, int channel, int count) {
+    const search_t *const parts = &moved->parts;
+    const size_t strip = (size_t)group * parts->channels + channel;
+    pair_t *ended;
+    memcpy(parts->data, (const pair_t *)parts->strips + strip * moved->side, count * sizeof(pair_t));
+    memset(parts->data + count, 0, (parts->down.length - count) * sizeof(pair_t));
+    transform(&parts->down, parts->data, parts->scratch, &ended);
+    return ended;
+}
+
+/* Whether a view shows nothing of a channel. */
+static int is_blank(const window_t *view, int channel) {
+    const size_t pixels = (size_t)view->rows * view->cols;
+    for (size_t at = 0; at < pixels; at++)
+        if (view->first[at * LANES + channel] != 0.0f) return 0;
+    return 1;
+}
+
+/* Products of the spectra of view and map, and the sum of their magnitudes by channel. Where either
+ * shows nothing of a channel, they are zero, not what rounding left when both were taken apart. */
+INLINE void multiply_both_inline(const moved_t *moved, const float *gains, double *sums) {
+    const search_t *const parts = &moved->parts;
+    const int rows = parts->down.length;
+    wide *into = moved->products;
+    for (int group = 0; group < parts->groups; group++)
+        for (int channel = 0; channel < CHANNELS; channel++) {
+            const float counts = gains[channel / 2] > 0 && !is_blank(&moved->view, channel) ? 1.0f : 0.0f;
+            wide sum = {0};
+            memcpy(parts->total, column_of(moved, group, channel, moved->view.rows), rows * sizeof(pair_t));
+            const pair_t *const view = parts->total;
+            const pair_t *const map = column_of(moved, group, CHANNELS + channel, moved->side);
+            for (int at = 0; at < rows; at++, into += 3) {
+                const wide re = counts * (view[at].re * map[at].re + view[at].im * map[at].im);
+                const wide im = counts * (view[at].re * map[at].im - view[at].im * map[at].re);
+                wide size = re * re + im * im;
+                for (int lane = 0; lane < WIDE; lane++) size[lane] = sqrtf(size[lane]);
+                into[0] = re, into[1] = im, into[2] = size;
+                sum += size;
+            }
+            for (int lane = 0; lane < WIDE; lane++) sums[channel] += sum[lane];
+        }
+}
+
+FOR_EVERY_PROCESSOR(multiply_both, (const moved_t *moved, const float *gains, double *sums),
+                    (moved, gains, sums))
+
+/* Transforms back along columns: of gradients, of grey, and of phases alone, one above the other. As in
+ * `multiply_columns`, imaginary parts first. */
+INLINE void columns_back_inline(const moved_t *moved, const float *floors) {
+    const search_t *const parts = &moved->parts;
+    const int rows = parts->down.length, height = 2 * moved->rows + 1;
+    pair_t *const total = parts->total, *ended;
+    for (int group = 0; group < parts->groups; group++)
+        for (int surface = 0; surface < 3; surface++) {
+            const wide *const of_group = moved->products + (size_t)group * CHANNELS * rows * 3;
+            const wide *const one = of_group, *const two = one + 3 * rows, *const grey = two + 3 * rows;
+            for (int at = 0; at < 3 * rows; at += 3) {
+                pair_t *const sum = total + at / 3;
+                if (surface == 0) *sum = (pair_t){one[at + 1] + two[at + 1], one[at] + two[at]};
+                else if (surface == 1) *sum = (pair_t){grey[at + 1], grey[at]};
+                else {
+                    const wide a = 1.0f / (one[at + 2] + floors[0]), b = 1.0f / (two[at + 2] + floors[1]);
+                    const wide c = 1.0f / (grey[at + 2] + floors[2]);
+                    *sum = (pair_t){a * one[at + 1] + b * two[at + 1] + c * grey[at + 1],
+                                    a * one[at] + b * two[at] + c * grey[at]};
+                }
+            }
+            transform(&parts->down, total, parts->scratch, &ended);
+            memcpy((pair_t *)parts->surface + (size_t)group * parts->wanted + surface * height, ended,
+                   height * sizeof(pair_t));
+        }
+}
+
+FOR_EVERY_PROCESSOR(columns_back, (const moved_t *moved, const float *floors), (moved, floors))
+
+/* Transforms back along the rows of all surfaces: (3, 2 rows + 1, 2 cols + 1). */
+INLINE void rows_back_inline(const moved_t *moved, float *out) {
+    const search_t *const parts = &moved->parts;
+    const int width = 2 * moved->cols + 1;
+    const float share = 1.0f / ((float)parts->along.length * (float)parts->down.length);
+    pair_t *scores;
+    for (int band = 0; band < parts->bands; band++) {
+        join_rows(parts, band);
+        transform(&parts->along, parts->data, parts->scratch, &scores);
+        for (int at = 0; at < PAIR && band * PAIR + at < parts->wanted; at++) {
+            const float *const from = (const float *)scores + (at + WIDE) % PAIR;
+            float *const into = out + ((size_t)band * PAIR + at) * width;
+            for (int col = 0; col < width; col++) into[col] = share * from[col * PAIR];
+        }
+    }
+}
+
+FOR_EVERY_PROCESSOR(rows_back, (const moved_t *moved, float *out), (moved, out))
+
+/* 0, or -1 without memory. */
+static int move_aside(moved_t *moved, float *out) {
+    search_t *const parts = &moved->parts;
+    const int rows = parts->down.length, cols = parts->along.length;
+    const int width = moved->view.cols + 2 * moved->cols, longest = rows > cols ? rows : cols;
+    const double spectrum = (double)rows * (cols / 2 + 1);
+    double sums[CHANNELS] = {0};
+    float gains[2], floors[CHANNELS];
+    moved->side = moved->view.rows + 2 * moved->rows;
+    parts->groups = cols / 2 / WIDE + 1, parts->channels = 2 * CHANNELS;
+    parts->wanted = 3 * (2 * moved->rows + 1), parts->bands = (parts->wanted + PAIR - 1) / PAIR;
+    const size_t groups = (size_t)parts->groups;
+    moved->map = memory_for((size_t)moved->side * width * LANES);
+    moved->products = memory_for(groups * CHANNELS * rows * 3 * WIDE);
+    parts->strips = memory_for(groups * parts->channels * moved->side * PAIR);
+    parts->surface = memory_for(groups * parts->wanted * PAIR);
+    parts->data = memory_for((size_t)longest * PAIR);
+    parts->scratch = memory_for((size_t)longest * PAIR);
+    parts->total = memory_for((size_t)rows * PAIR);
+    const int has_memory = moved->map && moved->products && parts->strips && parts->surface &&
+                           parts->data && parts->scratch && parts->total;
+    if (has_memory) {
+        sample_map(moved, width, gains);
+        transform_both(moved, gains);
+        multiply_both(moved, gains, sums);
+        for (int channel = 0; channel < CHANNELS; channel++)
+            floors[channel] = (float)(moved->floor * sums[channel] / spectrum + 1e-12);
+        columns_back(moved, floors);
+        rows_back(moved, out);
+    }
+    free(moved->map), free(moved->products), free(parts->strips), free(parts->surface);
+    free(parts->data), free(parts->scratch), free(parts->total);
+    return has_memory ? 0 : -1;
+}
+
 /* ---- What Python calls ---- */
 
 typedef struct {
@@ -638,5 +836,49 @@ PyObject *py_near(PyObject *self, PyObject *arguments) {
         if (failed) PyErr_NoMemory();
     }
     give_back(got, 4);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
+PyObject *py_moved(PyObject *self, PyObject *arguments) {
+    PyObject *from[3];
+    Py_buffer got[3];
+    double weights[2], matrix[6], turn, floor;
+    int rows, cols, size[2], failed = 0;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OO(dd)(dddddd)d(ii)(ii)dO", &from[0], &from[1], &weights[0],
+                          &weights[1], &matrix[0], &matrix[1], &matrix[2], &matrix[3], &matrix[4],
+                          &matrix[5], &turn, &rows, &cols, &size[0], &size[1], &floor, &from[2]))
+        return NULL;
+    const wanted_t wanted[2] = {{from[1], 3, LANES, 'f', 0, 0},
+                                {from[2], 3, 2 * (Py_ssize_t)cols + 1, 'f', PyBUF_WRITABLE, 0}};
+    if (borrow(from[0], got, 3, LANES, 'f', 0) < 0) return NULL;
+    if (borrow_all(wanted, got + 1, 2) < 0) {
+        PyBuffer_Release(got);
+        return NULL;
+    }
+    const Py_ssize_t *made = got[0].shape, *view = got[1].shape, *out = got[2].shape;
+    const Py_ssize_t stride = got[0].strides[0] / 4;
+    moved_t moved = {.view = {got[1].buf, LANES * view[1], (int)view[0], (int)view[1]},
+                     .made = {got[0].buf, stride, (int)made[0], (int)made[1]},
+                     .weights = weights, .matrix = matrix, .turn = -turn, .floor = floor,
+                     .rows = rows, .cols = cols};
+    search_t *const parts = &moved.parts;
+    if (made[1] > LARGEST || got[0].strides[0] % 4 || made[0] * stride > INT_MAX)
+        PyErr_SetString(PyExc_ValueError, "window must have at most 32768 columns and 2^31 numbers");
+    else if (rows < 0 || cols < 0 || rows > LARGEST || cols > LARGEST || out[0] != 3 ||
+             out[1] != 2 * rows + 1 || size[0] > LARGEST || size[1] > LARGEST ||
+             view[0] + 2 * rows > size[0] || view[1] + 2 * cols > size[1])
+        PyErr_SetString(PyExc_ValueError, "view, moves, sides of the transform and scores do not match");
+    else if ((failed = make_plan(size[0], &parts->down)) || (failed = make_plan(size[1], &parts->along))) {
+        if (failed == -2) PyErr_NoMemory();
+        else PyErr_SetString(PyExc_ValueError, "sides of the transform must be products of 2, 3 and 5");
+    } else {
+        Py_BEGIN_ALLOW_THREADS
+        failed = move_aside(&moved, got[2].buf);
+        Py_END_ALLOW_THREADS
+        if (failed) PyErr_NoMemory();
+    }
+    free(parts->down.twiddles), free(parts->along.twiddles);
+    give_back(got, 3);
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }

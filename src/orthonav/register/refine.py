@@ -11,6 +11,7 @@ by blocks of the view, and the spread of those sums is what moves the peak.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,6 +41,8 @@ MIN_CORRELATION = 0.08
 """Correlations below count as this in the gain, so that steps do not vanish."""
 WHOLE_OVERLAP = 0.97
 """Above this overlap the Gauss-Newton matrix of the whole view is used."""
+BLOCK_SUMS = 7
+"""Numbers of each block in `SpreadSums.blocks`."""
 MIN_CURVATURE = 0.05
 """Least curvature of a direction in the covariance, as a share of the Gauss-Newton matrix."""
 
@@ -103,13 +106,14 @@ class Refiner:
         placed, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
             return placed
-        pixels = _Pixels(self.template, window, placed.pose)
-        covariance = self._covariance(pixels)
+        sums = self._spread(window, placed.pose)
+        to_map = self._to_map(placed.pose)
+        covariance = np.asarray(to_map @ sums.covariance() @ to_map.T)
         if not placed.converged:
             # Still moving: its last step is an error of its own.
-            covariance += np.outer(move := self._to_map(placed.pose) @ step, move)
+            covariance += np.outer(move := to_map @ step, move)
         return replace(
-            placed, covariance=covariance, agreement=pixels.agreement(), blocks_t=pixels.blocks_t()
+            placed, covariance=covariance, agreement=sums.agreement(), blocks_t=sums.blocks_t()
         )
 
     def _refined(
@@ -118,18 +122,23 @@ class Refiner:
         """The best pose of so many steps at most, and the last step (4,)."""
         if KERNEL is None:
             return self._refined_by_numpy(window, pose, steps, small_step_px)
+        found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
+            *self._for_kernel(window, pose, steps, small_step_px)
+        )
+        numbers = score, correlations, weighted, overlap, bool(converged)
+        return Placed(Pose(*found), self.template.level, *numbers), step
+
+    def _for_kernel(
+        self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
+    ) -> tuple[object, ...]:
+        """The view beside the map at a pose, and the limits of steps."""
         template = self.template
         limits = (
             *(window.row, window.col, window.unit, steps, small_step_px),
             *(MAX_STEP_PX, DAMPING, MIN_CORRELATION, WHOLE_OVERLAP),
         )
         at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
-        images = window.made, template.values, template.slopes
-        found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
-            *images, template.numbers, at, limits
-        )
-        numbers = score, correlations, weighted, overlap, bool(converged)
-        return Placed(Pose(*found), template.level, *numbers), step
+        return window.made, template.values, template.slopes, template.numbers, at, limits
 
     def _refined_by_numpy(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
@@ -181,33 +190,15 @@ class Refiner:
             hessians = np.tensordot(seen.shares(), self.template.block_hessians, axes=1)
         return np.asarray(first * hessians[0] + second * hessians[1])
 
-    def _observed_inverse(self, pixels: "_Pixels") -> NDArray[np.float64]:
-        """Inverse (4, 4) of the view's derivatives times the map's.
-
-        Noise and change have derivatives too: counted as if they held the view in place, they
-        would make the position appear known along ground that runs in one direction.
-        """
-        seen, mine = pixels.seen, self.template.gradients
-        theirs = gradients(pixels.map, pixels.counts)
-        theirs *= np.repeat(seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
-        x, y = from_middle(*self.template.mask.shape)
-        rows, cols = (np.stack([np.ones(each.size, np.float32), each.ravel()]) for each in (y, x))
-        sums = np.empty((2, 4, 2, 2))  # of the view along x and y, of the map by the steps
-        for at in range(2):
-            products = mine[0, at] * theirs[0]
-            for one, other in zip(mine[1:, at], theirs[1:], strict=True):
-                products += one * other
-            sums[at] = rows @ by_steps(products) @ cols.T  # once, and times x and y
-        across, down = sums
-        observed = np.stack(
-            [
-                across[:, 0, 0],
-                down[:, 0, 0],
-                down[:, 0, 1] - across[:, 1, 0],
-                across[:, 0, 1] + down[:, 1, 0],
-            ]
-        )
-        return _bounded_inverse((observed + observed.T) / 2, self._hessian(seen))
+    def _spread(self, window: MapWindow, pose: Pose) -> "SpreadSums":
+        """What the covariance at a pose is made of."""
+        if KERNEL is None:
+            pixels = _Pixels(self.template, window, pose)
+            return SpreadSums(pixels.observed(), self._hessian(pixels.seen), pixels.sums_by_block())
+        out = np.empty(2 * 16 + BLOCKS**2 * BLOCK_SUMS)
+        KERNEL.spread(*self._for_kernel(window, pose, 0, 0.0), out)
+        observed, hessian = out[:32].reshape(2, 4, 4)
+        return SpreadSums(observed, hessian, out[32:].reshape(-1, BLOCK_SUMS))
 
     def _step(self, seen: "Comparison") -> list[float]:
         """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
@@ -226,14 +217,43 @@ class Refiner:
         to_map[:2, :2] = pose.linear * 2.0**self.template.level
         return to_map
 
-    def _covariance(self, pixels: "_Pixels") -> NDArray[np.float64]:
-        """Covariance (4, 4) of x, y (level-0 px), turn and log scale."""
-        terms = by_steps(np.einsum("cphw,chw->phw", self.template.gradients, pixels.residual))
-        sums = self.template.block_sums(terms).astype(np.float64)
-        spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
-        inverse = self._observed_inverse(pixels)
-        to_map = self._to_map(pixels.seen.pose)
-        return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
+
+class SpreadSums(NamedTuple):
+    """What a covariance is made of.
+
+    - `observed` (4, 4): products of the view's derivatives by the steps and the map's.
+    - `hessian` (4, 4): the Gauss-Newton matrix.
+    - `blocks` (B * B, 7): by block of the view, the derivatives (4) of the score by the steps, the
+      products of view and map of both kinds of evidence, and the pixels that count.
+    """
+
+    observed: NDArray[np.float64]
+    hessian: NDArray[np.float64]
+    blocks: NDArray[np.float64]
+
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance (4, 4) of the steps.
+
+        Noise and change have derivatives too: counted as if they held the view in place, they
+        would make the position appear known along ground that runs in one direction. So the
+        curvature is that of the view's derivatives times the map's.
+        """
+        terms = self.blocks[:, :4]
+        spread = terms.T @ terms * (BLOCKS**2 / (BLOCKS**2 - 4))
+        inverse = _bounded_inverse((self.observed + self.observed.T) / 2, self.hessian)
+        return np.asarray(inverse @ spread @ inverse.T)
+
+    def agreement(self) -> float:
+        """Share of the blocks of a view whose evidence correlates positively."""
+        sums, counts = self.blocks[:, 4] + self.blocks[:, 5], self.blocks[:, 6]
+        used = counts > 0.25 * counts.max()
+        return float((sums[used] > 0).mean()) if used.any() else 0.0
+
+    def blocks_t(self) -> float:
+        """Sum of the gradients' products over the blocks of a view, divided by the root of the sum
+        of their squares: large where many blocks agree, not a few strong ones."""
+        sums = self.blocks[:, 4]
+        return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))
 
 
 def _bounded_inverse(
@@ -305,7 +325,7 @@ class _Pixels:
     def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
         planes, valid = sampled_planes(template, window, pose)
         seen = Comparison(template, pose, compared(template, planes, valid, slopes=False))
-        self.seen = seen
+        self.seen, self._template = seen, template
         self.counts = template.mask * (valid > FULLY_VALID)
         self.map = planes * self.counts
         self._view = template.channels * self.counts
@@ -316,18 +336,33 @@ class _Pixels:
                 self.map[at], gains[at], self._view[at], -squares[at], 0, dst=self.residual[at]
             )
 
-    def agreement(self) -> float:
-        """Share of the blocks of a view whose evidence correlates positively."""
-        template = self.seen.template
-        sums = template.block_sums((self._view * self.map).sum(axis=0))
-        counts = template.block_sums(self.counts)
-        used = counts > 0.25 * counts.max()
-        return float((sums[used] > 0).mean()) if used.any() else 0.0
+    def observed(self) -> NDArray[np.float64]:
+        """Products (4, 4) of the view's derivatives by the steps and the map's."""
+        mine = self._template.gradients
+        theirs = gradients(self.map, self.counts)
+        theirs *= np.repeat(self.seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
+        x, y = from_middle(*self._template.mask.shape)
+        rows, cols = (np.stack([np.ones(each.size, np.float32), each.ravel()]) for each in (y, x))
+        sums = np.empty((2, 4, 2, 2))  # of the view along x and y, of the map by the steps
+        for at in range(2):
+            products = mine[0, at] * theirs[0]
+            for one, other in zip(mine[1:, at], theirs[1:], strict=True):
+                products += one * other
+            sums[at] = rows @ by_steps(products) @ cols.T  # once, and times x and y
+        across, down = sums
+        return np.stack(
+            [
+                across[:, 0, 0],
+                down[:, 0, 0],
+                down[:, 0, 1] - across[:, 1, 0],
+                across[:, 0, 1] + down[:, 1, 0],
+            ]
+        )
 
-    def blocks_t(self) -> float:
-        """Sum of the gradients' products over the blocks of a view, divided by the root of the sum
-        of their squares: large where many blocks agree, not a few strong ones."""
-        gradients = GROUPS[0]
-        products = (self._view[gradients] * self.map[gradients]).sum(axis=0)
-        sums = self.seen.template.block_sums(products).astype(np.float64)
-        return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))
+    def sums_by_block(self) -> NDArray[np.float64]:
+        """`SpreadSums.blocks`."""
+        terms = by_steps(np.einsum("cphw,chw->phw", self._template.gradients, self.residual))
+        products = self._view * self.map
+        kinds = [products[group].sum(axis=0) for group in GROUPS]
+        each = np.stack([*terms, *kinds, self.counts])
+        return self._template.block_sums(each).astype(np.float64).T

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from orthonav.register.evidence import CHANNELS, GROUPS
+from orthonav.register.kernel import KERNEL
 from orthonav.register.map_window import MapWindow
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
@@ -83,6 +84,15 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     height, width = template.mask.shape
     rows, cols = (max(MIN_REACH_PX, int(side * REACH_SHARE)) for side in (height, width))
     window = MapWindow.of(template, reference, pose, 0, (rows, cols))
+    # Moves of less than the margin never reach over the border: no padding.
+    size = tuple(next_fast_len(side, real=True) for side in window.shape)
+    if KERNEL is not None:
+        moved = np.empty((3, 2 * rows + 1, 2 * cols + 1), np.float32)
+        KERNEL.moved(
+            *(window.made, template.values, template.weights, window.matrix(pose), pose.turn_rad),
+            *((rows, cols), size, PHASE_FLOOR, moved),
+        )
+        return moved
     sampled = np.empty((*window.shape, CHANNELS), np.float32)
     window.sample(pose, sampled)
     planes, scratch = np.empty((2, CHANNELS, *window.shape), np.float32)
@@ -90,8 +100,6 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = float(np.square(planes[group]).sum())
         planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
-    # Moves of less than the margin never reach over the border: no padding.
-    size = tuple(next_fast_len(side, real=True) for side in window.shape)
     products = np.conj(rfft2(template.channels, s=size)) * rfft2(planes[:3], s=size)
     power = np.abs(products)
     floor = PHASE_FLOOR * power.mean(axis=(1, 2), keepdims=True) + 1e-12
