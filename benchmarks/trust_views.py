@@ -35,7 +35,8 @@ FAR_PX, FAR_M, FAR_FROM_PRIOR_PX = 10.0, 35.0, 20.0
 finds places within 35 m of it too. Maps and views of Tours are up to 17 px apart."""
 METRES_PER_DEG = 111_320.0
 BESIDE_SHARE = 0.9
-"""Views beside the map are farther from its border than this share of their width."""
+"""Views beside the map are farther from its border than this share of their width. One that reaches
+onto it all the same, and is placed where it was taken, is right."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,7 @@ def _placed(
     place = localizer.camera_en_m(seen.prepared, found.placed.pose)
     error_m = float(np.hypot(*(place - localizer.sheet.frame.en_from_latlon(*truth))))
     far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
-    right = case.kind == "found" and error_m <= far_m
+    right = case.kind in ("found", "beside") and error_m <= far_m
     return {
         "evidence": found.evidence(),
         "chances": asdict(localizer.confidence.chances),
