@@ -137,7 +137,7 @@ class Stream:
     def __init__(self, seen: Callable[[], Grey]) -> None:
         self._seen = seen
 
-    def isOpened(self) -> bool:  # noqa: N802
+    def isOpened(self) -> bool:  # noqa: N802 - a name of OpenCV
         """Always."""
         return True
 

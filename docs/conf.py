@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 
+from orthonav import __version__
+
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent / "tools" / "docs"))
-
-from orthonav import __version__  # noqa: E402
 
 project = "orthonav"
 author = "the authors of orthonav"

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import zlib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -47,12 +48,11 @@ for arguments in json.loads(sys.argv[1]):
 
 def refused(*commands):
     """What commands in a process of their own with little memory say on stderr, a line each."""
-    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))  # noqa: E731
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}
     done = subprocess.run(
         [sys.executable, "-c", MANY, json.dumps([[*map(str, each)] for each in commands])],
         env=kept | {"OPENBLAS_NUM_THREADS": "1"},
-        preexec_fn=limit,
+        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES)),
         capture_output=True,
         text=True,
         timeout=60,

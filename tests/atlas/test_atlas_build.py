@@ -287,7 +287,6 @@ def test_sheets_count_where_snapshot_and_index_cannot_be_written(
 
 
 def test_the_index_is_made_at_the_end(built, ortho, tmp_path):
-    pytest.importorskip("faiss")
     place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
     result = made(place, ortho, index=True)
     assert result.finish_error is None and any((place / "index").iterdir())

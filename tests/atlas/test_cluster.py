@@ -37,7 +37,8 @@ START_S, END_S = 60.0, 240.0
 @pytest.fixture(scope="module")
 def ray():
     """Ray, ended whatever happens; what it leaves open as it ends is its own."""
-    ray = pytest.importorskip("ray")
+    import ray
+
     logging.getLogger("ray").setLevel(logging.ERROR)
     yield ray
     ray.shutdown()

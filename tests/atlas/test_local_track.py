@@ -7,8 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
-
 from orthonav.atlas import locate
 from orthonav.atlas.agreement import Placement
 from orthonav.atlas.find import FoundPlace

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
+pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.find import rectified

@@ -1,10 +1,8 @@
 """When a track begins, ends and is replaced, shown with a finder and tracks made for it."""
 
-import pytest
-
-pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
-
 from types import SimpleNamespace
+
+import pytest
 
 from orthonav.atlas import locate
 from orthonav.atlas.find import FoundPlace

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
+pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
 from orthonav.atlas import matches
 from orthonav.atlas.find import PlaceFinder, rectified

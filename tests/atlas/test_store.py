@@ -6,6 +6,7 @@ import os
 import pickle
 import sys
 import time
+from typing import ClassVar
 
 import fsspec
 import pytest
@@ -19,7 +20,7 @@ class Trouble(LocalFileSystem):
     """A remote file system that shows incomplete files, and fails as `fails` says."""
 
     protocol = "trouble"
-    fails = {}  # noqa: RUF012
+    fails: ClassVar = {}
 
     @classmethod
     def _strip_protocol(cls, path):

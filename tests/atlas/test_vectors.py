@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("faiss")
-
 from orthonav.atlas.index_manifest import Part, ShardInfo
 from orthonav.atlas.index_shards import ShardedIndex, write_shard
 from orthonav.atlas.quantizers import QUANTIZERS_NAME, Quantizers, VectorRecipe, train

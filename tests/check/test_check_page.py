@@ -231,7 +231,6 @@ def test_leaflet_brings_its_licence():
 
 @pytest.fixture(scope="module")
 def browser():
-    pytest.importorskip("playwright.sync_api")
     from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
 
     if chromium() is None:
@@ -364,7 +363,8 @@ def test_scripts_write_numbers_as_python_does(browser):
 @pytest.mark.long
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_rules_of_accessibility(visit, scheme):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    from axe_playwright_python.sync_playwright import Axe
+
     page = visit("small_route", bypass_csp=True, color_scheme=scheme)
-    found = axe.run(page).response["violations"]
+    found = Axe().run(page).response["violations"]
     assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []

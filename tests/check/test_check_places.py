@@ -89,8 +89,9 @@ def test_covered_share_of_every_cell():
 
 
 def test_a_map_that_shows_nothing():
+    coverage = covering(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_))
     with pytest.raises(AreaError, match="has no imagery"):
-        covering(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)).extent_en_m  # noqa: B018
+        _ = coverage.extent_en_m
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import onnx
 import pytest
 
 from orthonav.embed import TABLE
@@ -13,8 +14,6 @@ from orthonav.embed.stored import embedder_of
 from orthonav.errors import MapFileError, MissingExtraError, VariantError
 from orthonav.variants import variant_recipe
 
-onnx = pytest.importorskip("onnx", reason="making graphs needs ONNX")
-pytest.importorskip("onnxruntime", reason="neural encoders need onnxruntime")
 helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
 
 SIDE, DIMS = 8, 5

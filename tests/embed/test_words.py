@@ -22,9 +22,6 @@ from orthonav.variants import Variant, make_variant, variant_from_recipe, varian
 
 TABLE = {"bovw": Variant("orthonav.embed.words:WordsRecipe")}
 NOTHING = np.zeros(0, np.float32)
-needs_faiss = pytest.mark.skipif(
-    __import__("importlib.util").util.find_spec("faiss") is None, reason="faiss is not installed"
-)
 
 
 @functools.cache
@@ -67,7 +64,6 @@ def random_embedder(words=300, seed=0, tfidf=0, **parameters):
 
 @pytest.fixture(scope="module")
 def learnt():
-    pytest.importorskip("faiss")
     return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=1)
 
 
@@ -239,7 +235,6 @@ def test_learning_gives_words_of_its_pictures(learnt):
     assert within < 0.75 * whole
 
 
-@needs_faiss
 def test_learning_is_deterministic_and_seeded():
     shown = pictures_of(tiles(area())[:6])
     first, same, other = (
@@ -249,7 +244,6 @@ def test_learning_is_deterministic_and_seeded():
     assert first == same != other
 
 
-@needs_faiss
 def test_large_samples_are_drawn_evenly(monkeypatch):
     """More descriptors than are wanted: every picture still has its share."""
     import orthonav.neural.words as words
@@ -268,7 +262,6 @@ def test_large_samples_are_drawn_evenly(monkeypatch):
     assert made.vocabulary.shape == (256, 128) and made.idf.max() <= np.log(21) + 1e-5
 
 
-@needs_faiss
 def test_rare_words_weigh_more():
     """Half of the pictures are one and the same: their words are common."""
     common, *rest = tiles(area())
@@ -281,14 +274,12 @@ def test_rare_words_weigh_more():
     assert made.idf[counts[0] > 0].max() < made.idf.max()
 
 
-@needs_faiss
 @pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [area(size=100)]])
 def test_too_few_features_are_refused(greys):
     with pytest.raises(VariantError, match=r"1024 words cannot be learned from \d+ features"):
         learn_words(WordsRecipe(), pictures_of(greys))
 
 
-@needs_faiss
 def test_learning_reports_and_leaves_out_what_is_not_valid():
     shares, grey = [], area()
     grey = grey[:400, :400]
@@ -312,10 +303,8 @@ def test_without_faiss_the_extra_is_named(monkeypatch):
 
 @pytest.mark.slow
 def test_superpoint_words(tmp_path):
-    pytest.importorskip("faiss")
-    pytest.importorskip("torch")
-    transformers = pytest.importorskip("transformers")
     import torch
+    import transformers
 
     torch.manual_seed(3)
     model = transformers.SuperPointForKeypointDetection(

@@ -4,15 +4,11 @@ import hashlib
 
 import numpy as np
 import pytest
+import torch
+from experiments.paper import between_dates as between
+from experiments.paper.methods import BETWEEN_DATES
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-pytest.importorskip("onnx", reason="writing a network needs ONNX")
-pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
-
-from experiments.paper import between_dates as between  # noqa: E402
-from experiments.paper.methods import BETWEEN_DATES  # noqa: E402
-
-from orthonav.represent.learned import LearnedEdges  # noqa: E402
+from orthonav.represent.learned import LearnedEdges
 
 
 def dates(seed=0, size=150):

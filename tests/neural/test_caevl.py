@@ -5,23 +5,20 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-pytest.importorskip("onnx", reason="writing what flies needs ONNX")
-pytest.importorskip("onnxruntime", reason="checking what flies needs onnxruntime")
-
-from orthonav.embed import TABLE  # noqa: E402
-from orthonav.embed.caevl import CaevlRecipe  # noqa: E402
-from orthonav.embed.stored import embedder_of  # noqa: E402
-from orthonav.errors import VariantError  # noqa: E402
-from orthonav.neural import caevl  # noqa: E402
-from orthonav.neural.augment import augmented  # noqa: E402
-from orthonav.neural.autoencoder import AutoEncoder  # noqa: E402
-from orthonav.neural.means import Means  # noqa: E402
-from orthonav.neural.tiles import SheetTiles  # noqa: E402
-from orthonav.neural.vicreg import local_vicreg, vicreg  # noqa: E402
-from orthonav.represent.canny import Canny  # noqa: E402
-from orthonav.variants import variant_recipe  # noqa: E402
+from orthonav.embed import TABLE
+from orthonav.embed.caevl import CaevlRecipe
+from orthonav.embed.stored import embedder_of
+from orthonav.errors import VariantError
+from orthonav.neural import caevl
+from orthonav.neural.augment import augmented
+from orthonav.neural.autoencoder import AutoEncoder
+from orthonav.neural.means import Means
+from orthonav.neural.tiles import SheetTiles
+from orthonav.neural.vicreg import local_vicreg, vicreg
+from orthonav.represent.canny import Canny
+from orthonav.variants import variant_recipe
 
 TILE_PX = 32
 QUICK = Means(save_every_s=1e6, workers=1, device="cpu", bf16=False)

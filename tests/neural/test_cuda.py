@@ -4,20 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
+from test_training import AUTO, TRIPLET, Killed, kill_at, losses, noisy, sheet
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-pytest.importorskip("onnx", reason="writing what flies needs ONNX")
-pytest.importorskip("onnxruntime", reason="checking what flies needs onnxruntime")
-if not torch.cuda.is_available():
-    pytest.skip("needs a GPU that PyTorch sees", allow_module_level=True)
+from orthonav.embed.network import TripletRecipe
+from orthonav.neural import means, training
+from orthonav.neural.means import Means
+from orthonav.neural.training import learn_network
 
-from test_training import AUTO, TRIPLET, Killed, kill_at, losses, noisy, sheet  # noqa: E402
-
-from orthonav.embed.network import TripletRecipe  # noqa: E402
-from orthonav.neural import means, training  # noqa: E402
-from orthonav.neural.means import Means  # noqa: E402
-from orthonav.neural.training import learn_network  # noqa: E402
-
+pytestmark = pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="needs a GPU that PyTorch sees"
+)
 GPU = Means(save_every_s=0, device="cuda")
 BOTH = pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
 

@@ -2,18 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
+from torch import nn
 
-torch = pytest.importorskip("torch", reason="training needs PyTorch")
-pytest.importorskip("onnx", reason="the export needs onnx")
-pytest.importorskip("onnxruntime", reason="the check of the export needs onnxruntime")
-
-from torch import nn  # noqa: E402
-
-from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe  # noqa: E402
-from orthonav.neural import export  # noqa: E402
-from orthonav.neural.autoencoder import AutoEncoder  # noqa: E402
-from orthonav.neural.export import ExportError, export_encoder, least_cosine_between  # noqa: E402
-from orthonav.neural.triplet import ResNet34  # noqa: E402
+from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
+from orthonav.neural import export
+from orthonav.neural.autoencoder import AutoEncoder
+from orthonav.neural.export import ExportError, export_encoder, least_cosine_between
+from orthonav.neural.triplet import ResNet34
 
 
 def maps(count, tile_px, seed=0, channels=1):

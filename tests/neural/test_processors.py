@@ -7,9 +7,6 @@ import sys
 
 import pytest
 
-pytest.importorskip("torch", reason="learning needs PyTorch")
-pytest.importorskip("onnx", reason="writing what flies needs ONNX")
-
 SWITCHES = {
     "this processor": {},
     "AVX2": {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"},

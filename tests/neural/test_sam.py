@@ -9,10 +9,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("transformers")
-
 import torch
 import transformers
 
@@ -280,11 +276,12 @@ def test_suppression_equals_that_of_opencv():
 
 @pytest.mark.slow
 def test_pixels_equal_those_of_the_librarys_processor():
-    processing = pytest.importorskip("transformers.models.sam.image_processing_pil_sam")
+    from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
+
     for shape in ((100, 256), (256, 200), (1500, 700)):
         grey = picture(shape)
         made = sam.network_pixels(grey, 1024).numpy()
-        expected = processing.SamImageProcessorPil()(
+        expected = SamImageProcessorPil()(
             np.repeat(grey[..., None], 3, axis=2), return_tensors="np"
         )["pixel_values"]
         assert made.shape == expected.shape == (1, 3, 1024, 1024)

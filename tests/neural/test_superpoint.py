@@ -7,10 +7,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("transformers")
-
 import torch
 import transformers
 

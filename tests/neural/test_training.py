@@ -15,18 +15,15 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-pytest.importorskip("onnx", reason="writing what flies needs ONNX")
-pytest.importorskip("onnxruntime", reason="checking what flies needs onnxruntime")
-
-from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe  # noqa: E402
-from orthonav.errors import OutputError  # noqa: E402
-from orthonav.neural import checkpoints, means, training  # noqa: E402
-from orthonav.neural.checkpoints import TrainingError, loss_picture  # noqa: E402
-from orthonav.neural.means import Means  # noqa: E402
-from orthonav.neural.tiles import SheetTiles  # noqa: E402
-from orthonav.neural.training import learn_network  # noqa: E402
+from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
+from orthonav.errors import OutputError
+from orthonav.neural import checkpoints, means, training
+from orthonav.neural.checkpoints import TrainingError, loss_picture
+from orthonav.neural.means import Means
+from orthonav.neural.tiles import SheetTiles
+from orthonav.neural.training import learn_network
 
 TILE_PX = 32
 AUTO = AutoEncoderRecipe(dims=16, width=16, epochs=3, batch=8, learning_rate=3e-3)

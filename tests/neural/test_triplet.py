@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-
-from orthonav.embed.network import TripletRecipe  # noqa: E402
-from orthonav.neural.tiles import SheetTiles  # noqa: E402
-from orthonav.neural.triplet import ResNet34, Triplets, hard_negatives, triplet_loss  # noqa: E402
+from orthonav.embed.network import TripletRecipe
+from orthonav.neural.tiles import SheetTiles
+from orthonav.neural.triplet import ResNet34, Triplets, hard_negatives, triplet_loss
 
 
 def test_it_has_the_papers_number_of_parameters():

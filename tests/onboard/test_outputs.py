@@ -7,6 +7,7 @@ import pty
 import socket
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pynmeagps
@@ -275,7 +276,7 @@ def test_lines_on_stdout(capsys):
     print("stdout is still there", file=sys.stdout)
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")  # noqa: PTH110
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_writing_continues_after_a_full_disk(tmp_path):
     path = tmp_path / "lines.jsonl"
     path.symlink_to("/dev/full")

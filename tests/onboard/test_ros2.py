@@ -14,9 +14,6 @@ import cv2
 import numpy as np
 import pyproj
 import pytest
-
-pytest.importorskip("cyclonedds", reason="the extra ros2 (cyclonedds) is not installed")
-
 import ros2_types as ros
 from bags import Messages, record
 from blots import AGL_M, CAMERA, GROUND, known_map, rendered

@@ -112,7 +112,8 @@ def test_interrupted_training_resumes(area, tmp_path):
         work=tmp_path / "work",
         **SMALL,
     )
-    training = pytest.importorskip("orthonav.neural.training")
+    from orthonav.neural import training
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 24)
         often = functools.partial(training.Means, save_every_s=0.0)

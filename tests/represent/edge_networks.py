@@ -2,11 +2,6 @@
 
 import numpy as np
 
-try:
-    import onnx
-except ImportError:
-    onnx = None
-
 
 def sharp(side=5, threshold=0.02):
     """Kernel of a pixel's difference to its neighbourhood."""
@@ -19,6 +14,8 @@ def write(
     path, *, kernel=None, pads=(0, 0, 0, 0), names=("grey", "edges"), kind=None, strides=(1, 1)
 ):
     """A network of one convolution."""
+    import onnx
+
     weights, bias = sharp() if kernel is None else kernel
     helper, arrays = onnx.helper, onnx.numpy_helper
     kind = kind or onnx.TensorProto.FLOAT

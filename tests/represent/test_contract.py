@@ -25,8 +25,6 @@ SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (64, 64), (256, 255)]
 def variant(request, monkeypatch, tmp_path):
     """Every entry of the table, with its defaults; edges by a network with a small one."""
     if request.param == "onnx":
-        pytest.importorskip("onnx", reason="a network for the test needs ONNX")
-        pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
         monkeypatch.setenv("ORTHONAV_EDGES", str(write(tmp_path / "edges.onnx")))
     return make_variant(TABLE, request.param)
 

@@ -3,21 +3,18 @@
 import json
 
 import numpy as np
+import onnx
 import pytest
+from edge_networks import sharp, write
 
-onnx = pytest.importorskip("onnx", reason="networks for the tests need ONNX")
-pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
-
-from edge_networks import sharp, write  # noqa: E402
-
-from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, VariantError  # noqa: E402
-from orthonav.localizer import Localizer  # noqa: E402
-from orthonav.mapfile import open_map  # noqa: E402
-from orthonav.prepare import BuildRequest, build_map  # noqa: E402
-from orthonav.prepare.methods import stored_representation  # noqa: E402
-from orthonav.represent import TABLE, learned  # noqa: E402
-from orthonav.represent.learned import VARIABLE, LearnedEdges  # noqa: E402
-from orthonav.variants import make_variant, variant_from_recipe  # noqa: E402
+from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, VariantError
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.methods import stored_representation
+from orthonav.represent import TABLE, learned
+from orthonav.represent.learned import VARIABLE, LearnedEdges
+from orthonav.variants import make_variant, variant_from_recipe
 
 DOUBLE = onnx.TensorProto.DOUBLE
 

@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("skimage")
-
 from orthonav.errors import MissingExtraError, VariantError
 from orthonav.represent.segments import Segments, boundaries
 from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe

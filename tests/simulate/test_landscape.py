@@ -180,7 +180,8 @@ def test_noise_has_the_promised_spread():
 
 @pytest.mark.long
 def test_geotiff_has_position_and_date(tmp_path: Path):
-    rasterio = pytest.importorskip("rasterio")
+    import rasterio
+
     seen: list[float] = []
     paths = generate_area(
         tmp_path / "area",

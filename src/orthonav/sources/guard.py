@@ -43,7 +43,7 @@ def _silence() -> Iterator[None]:
     sink = os.open(os.devnull, os.O_WRONLY)
     try:
         with (
-            open(os.devnull, "w", encoding="utf-8") as nowhere,  # noqa: PTH123
+            Path(os.devnull).open("w", encoding="utf-8") as nowhere,
             contextlib.redirect_stdout(nowhere),
             contextlib.redirect_stderr(nowhere),
         ):

@@ -242,7 +242,7 @@ class Handler(BaseHTTPRequestHandler):
         """Respond to a request."""
         self._send(self._refused() or self._pages.answer(self.path))
 
-    do_HEAD = do_GET  # noqa: N815
+    do_HEAD = do_GET  # noqa: N815 - a name of http.server
 
     def _refused(self) -> Response | None:
         """The response that refuses a request; None if it is allowed."""
@@ -259,7 +259,7 @@ class Handler(BaseHTTPRequestHandler):
         reply = self._refused() or _error(HTTPStatus.METHOD_NOT_ALLOWED, "this server is read-only")
         self._send(reply)
 
-    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _only_reads  # noqa: N815
+    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _only_reads  # noqa: N815 - names of http.server
 
     def _send(self, reply: Response) -> None:
         self.send_response(reply.status)
