@@ -150,7 +150,7 @@ class SiftMatch:
     def __init__(self, reference: Reference) -> None:
         self.name = "SIFT, ratio test, RANSAC"
         self._reference = reference
-        self._sift = cv2.SIFT_create()  # type: ignore[attr-defined]
+        self._sift = cv2.SIFT.create()
         points, descriptors = self._features(reference.grey, reference.valid)
         self._points = points
         self._matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 64})

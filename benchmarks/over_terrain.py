@@ -333,6 +333,7 @@ def ways(
     yield "level", on_level_ground
     over = Localizer(ground.opened)
     assert over.registration is not None
+    # It gives heights as a terrain layer does.
     over.registration.relief = Relief(terrain, over.grid)  # type: ignore[arg-type]
 
     def on_terrain(view: View) -> Fix | NoFix:

@@ -52,6 +52,7 @@ def measured(bench: Bench, row: Row, with_terrain: bool) -> str:
     localizer = Localizer(ground.opened)
     if terrain is not None:
         assert localizer.registration is not None
+        # It gives heights as a terrain layer does.
         localizer.registration.relief = Relief(terrain, localizer.grid)  # type: ignore[arg-type]
     rng = np.random.default_rng(11)
     cameras, pixels, errors, axes = [], [], [], []

@@ -250,6 +250,7 @@ class Keypoints:
 
     def __init__(self, picture: Picture, *, orb: bool = False, near_m: float | None = None) -> None:
         self._picture, self._near_m = picture, near_m
+        # `SIFT_create` and `ORB_create` are not in the stubs of OpenCV.
         self._detector: Any = cv2.SIFT_create()  # type: ignore[attr-defined]
         index: dict[str, Any] = {"algorithm": 1, "trees": 5}
         if orb:

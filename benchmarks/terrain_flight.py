@@ -123,6 +123,7 @@ def rows(opened: MapFile, folder: Path, wrong: str) -> Iterator[tuple[str, ...]]
     for method in ("one by one", "tracked"):
         localizer = Localizer(opened)
         assert localizer.registration is not None
+        # It gives heights as a terrain layer does.
         localizer.registration.relief = Relief(terrain, localizer.grid)  # type: ignore[arg-type]
         locator: Locator = SingleViews(localizer)
         if method == "tracked":

@@ -61,7 +61,7 @@ def network() -> nn.Sequential:
     for dilation in DILATIONS:
         layers += [nn.Conv2d(WIDTH, WIDTH, 3, dilation=dilation), nn.ReLU(inplace=True)]
     last = nn.Conv2d(WIDTH, 1, 1)
-    nn.init.constant_(last.bias, RARE)  # type: ignore[arg-type]
+    nn.init.constant_(last.bias, RARE)  # type: ignore[arg-type]  # it has a bias
     return nn.Sequential(*layers, last)
 
 
@@ -162,7 +162,7 @@ def learn(areas: Sequence[Dates], steps: int = STEPS) -> nn.Sequential:
             found = model(seen)
         loss = loss_of(found.float(), wanted)
         optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call]  # PyTorch's
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
         schedule.step()

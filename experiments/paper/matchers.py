@@ -135,7 +135,7 @@ class Sift:
 
     def features(self, grey: NDArray[np.uint8], most: int) -> Features:
         """As `Local`."""
-        detector = cv2.SIFT_create(nfeatures=most)  # type: ignore[attr-defined]
+        detector = cv2.SIFT_create(nfeatures=most)  # type: ignore[attr-defined]  # not in its stubs
         keypoints, descriptors = detector.detectAndCompute(grey, None)
         points = np.array([each.pt for each in keypoints], np.float32).reshape(-1, 2) + 0.5
         if descriptors is None:

@@ -161,9 +161,15 @@ class OpenShard:
         index.implem = SCAN_ONE if len(rotated) == 1 else 0
         point = module.swig_ptr
         index.search_preassigned_c(
-            len(rotated), point(rotated), count, point(lists), point(scores),
-            point(found), point(rows), False,
-        )  # fmt: skip
+            len(rotated),
+            point(rotated),
+            count,
+            point(lists),
+            point(scores),
+            point(found),
+            point(rows),
+            False,
+        )
         if rows.max(initial=NONE) >= self.info.rows or rows.min(initial=NONE) < NONE:
             raise AtlasError(f"codes of shard {self.info.name} are damaged; rebuild the index")
         if len(self._retired):

@@ -15,7 +15,7 @@ from orthonav.extras import missing_extra
 try:
     import pyproj
     from pyproj.exceptions import ProjError
-except ImportError as error:  # pragma: no cover - depends on the installation
+except ImportError as error:
     raise missing_extra("heights of terrain", "geo", "pyproj", error) from error
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ try:
     from rasterio.windows import Window
 
     from orthonav.imagery.quiet import quiet
-except ImportError as error:  # pragma: no cover - depends on the installation
+except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
 OUTLINE_POINTS = 21

@@ -29,7 +29,7 @@ try:
 
     from orthonav.imagery.datum import VerticalDatum, geoid, horizontal_and_vertical
     from orthonav.imagery.quiet import quiet
-except ImportError as error:  # pragma: no cover - depends on the installation
+except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 
 Array = NDArray[np.float64]
@@ -92,9 +92,14 @@ class Dem:
         return bool(0 <= col[0] <= self._data.width and 0 <= row[0] <= self._data.height)
 
     def in_plane(
-        self, frame: LocalFrame, west_m: float, north_m: float, posting_m: float,
-        rows: int, cols: int,
-    ) -> Array:  # fmt: skip
+        self,
+        frame: LocalFrame,
+        west_m: float,
+        north_m: float,
+        posting_m: float,
+        rows: int,
+        cols: int,
+    ) -> Array:
         """Mean heights (rows, cols) above mean sea level of squares of `posting_m` in a plane.
 
         The north-west corner of the first one is `west_m`, `north_m`. NaN for holes. Raises as

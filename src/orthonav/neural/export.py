@@ -143,13 +143,13 @@ def encoder_graph(encoder: nn.Module, shape: tuple[int, ...]) -> Any:
 
 def int8(model: Any, calibration: Array) -> bytes:
     """The model with 8-bit weights and activations, ranges from calibration tiles (N, C, S, S)."""
-    from onnxruntime.quantization import (  # type: ignore[import-untyped, import-not-found, unused-ignore]
+    from onnxruntime.quantization import (
         CalibrationDataReader,
         QuantType,
         quantize_static,
     )
 
-    class Tiles(CalibrationDataReader):  # type: ignore[misc, unused-ignore]
+    class Tiles(CalibrationDataReader):  # type: ignore[misc]  # untyped
         def __init__(self) -> None:
             starts = range(0, len(calibration), CALIBRATION_BATCH)
             self._parts = iter([calibration[at : at + CALIBRATION_BATCH] for at in starts])

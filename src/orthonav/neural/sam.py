@@ -30,7 +30,7 @@ from orthonav.neural.superpoint import chosen_device, require_device, weights_st
 
 try:
     import torch
-except ImportError as error:  # pragma: no cover - depends on the installation
+except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
 
 PER = ("sheet", "tile")

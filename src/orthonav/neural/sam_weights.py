@@ -18,7 +18,7 @@ from orthonav.neural.superpoint import pretrained, quiet, transformers
 
 try:
     import torch
-except ImportError as error:  # pragma: no cover - depends on the installation
+except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
 
 WHERE = (

@@ -24,7 +24,7 @@ from orthonav.extras import missing_extra, needed
 
 try:
     import torch
-except ImportError as error:  # pragma: no cover - depends on the installation
+except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
 
 CELL_PX = 8

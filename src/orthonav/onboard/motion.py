@@ -117,6 +117,7 @@ def _tracked(before: Grey, now: Grey, corners: Corners) -> tuple[Corners, Corner
     """Corners (N, 2) of an image and where they are in the next one; None where too few are
     found again."""
     options = {"winSize": _WINDOW, "maxLevel": 3}
+    # The stubs of OpenCV require the argument that is None.
     ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, **options)  # type: ignore[call-overload]
     back, returned, _ = cv2.calcOpticalFlowPyrLK(now, before, ahead, None, **options)  # type: ignore[call-overload]
     off = np.abs(back - corners).reshape(-1, 2).max(axis=1)

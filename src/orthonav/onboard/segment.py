@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+# Some functions of mcap have no types: calling them needs `type: ignore[no-untyped-call]`.
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -72,7 +73,7 @@ class Segment:
         self._file = path.open("xb", buffering=0)
         self._tail = _Tail()
         self._writer = Writer(
-            self._tail,  # type: ignore[arg-type]
+            self._tail,  # type: ignore[arg-type]  # has what the writer calls
             chunk_size=2**62,  # chunks end by `flush` only
             compression=CompressionType.ZSTD,
         )

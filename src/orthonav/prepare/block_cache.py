@@ -111,7 +111,7 @@ class BlockCache:
         path = self._folder / self._names[block]
         try:
             with replacing(path) as temporary:
-                np.savez(temporary, **parts)  # type: ignore[arg-type]
+                np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
         except OutputError as error:
             raise OutputError(
                 f"{error}; earlier blocks stay cached for a rerun of the same build; or name "

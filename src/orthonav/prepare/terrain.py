@@ -123,9 +123,13 @@ def _chunks(table: ChunkTable) -> Iterator[tuple[int, int]]:
 
 
 def _may_matter(
-    area: Area, grid: TileGrid, west_m: float, north_m: float, shape: tuple[int, int],
+    area: Area,
+    grid: TileGrid,
+    west_m: float,
+    north_m: float,
+    shape: tuple[int, int],
     posting_m: float,
-) -> bool:  # fmt: skip
+) -> bool:
     """Whether a view of the area may show a chunk; False only far from a route."""
     if area.route is None:
         return True

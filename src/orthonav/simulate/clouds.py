@@ -120,6 +120,7 @@ def _sampled(texture: NDArray[np.float32], corners_px: Array, size: tuple[int, i
     bottom = corners_px[3] + across[:, None] * (corners_px[2] - corners_px[3])
     maps = (top + down * (bottom - top)) % TEXTURE_PX
     wrapped = cv2.copyMakeBorder(texture, 0, 1, 0, 1, cv2.BORDER_WRAP)
+    # The stubs of OpenCV require the argument that is None.
     seen = cv2.remap(wrapped, maps.astype(np.float32), None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
     return np.asarray(seen, dtype=np.float64)
 

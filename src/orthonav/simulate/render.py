@@ -112,5 +112,6 @@ def _projected(
     index = (en - corner_en_m) / gsd_m * [1, -1] - 0.5
     maps = index.astype(np.float32).reshape(size[1], size[0], 2)
     border = cv2.BORDER_REPLICATE
+    # The stubs of OpenCV require the argument that is None.
     seen = cv2.remap(ground_rgb, maps, None, cv2.INTER_CUBIC, borderMode=border)  # type: ignore[call-overload]
     return np.asarray(seen, dtype=np.uint8)

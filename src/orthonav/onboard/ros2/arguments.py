@@ -159,7 +159,7 @@ def _parameters(pairs: Sequence[tuple[str, str]]) -> Parameters:
             raise VariantError(f"parameter {name} is {' or '.join(_CHOICES[name])}, got '{text}'")
         else:
             values[name] = text.strip("\"'")
-    return Parameters(**values)  # type: ignore[arg-type]
+    return Parameters(**values)  # type: ignore[arg-type]  # each has the type of its field
 
 
 def _domain_id(text: str) -> int:
