@@ -54,11 +54,10 @@ def test_every_page_is_in_the_contents():
 
 def test_pictures_that_are_shown_are_made():
     made = (ROOT / "tools" / "docs" / "pictures.py").read_text("utf-8")
-    for page in PAGES:
-        for link in LINK.findall(prose(page)):
-            if "pictures/" in link:
-                stem = Path(link).stem
-                assert f'"{stem}' in made, f"{page.name} shows {link}"
+    links = [link for page in PAGES for link in LINK.findall(prose(page)) if "pictures/" in link]
+    assert links
+    for link in links:
+        assert f'"{Path(link).stem}' in made, link
 
 
 def test_lines_of_the_pages_that_were_written_for_the_site():

@@ -1,7 +1,6 @@
 """Views are located in an atlas of another year without a prior; negatives never are."""
 
 import dataclasses
-import itertools
 import json
 import re
 import shutil
@@ -93,12 +92,10 @@ def test_options_of_maps_are_refused(atlas, flown, tmp_path, run):
     assert refused.code == 1 and "--track" in refused.err
 
 
-def test_negatives_never_have_a_confident_fix(locator, flown):
-    flight = open_flight(flown)
-    for view in itertools.islice(flight.views, 1):
-        mirrored = np.ascontiguousarray(view.grey()[:, ::-1])
-        outcome = locator.locate(View(mirrored, flight.camera, view.telemetry))
-        assert not (isinstance(outcome, Fix) and outcome.confidence > 0.8)
+def test_a_negative_has_no_confident_fix(locator, first_view):
+    mirrored = np.ascontiguousarray(first_view.grey[:, ::-1])
+    outcome = locator.locate(dataclasses.replace(first_view, grey=mirrored))
+    assert not (isinstance(outcome, Fix) and outcome.confidence > 0.8)
 
 
 def test_the_index_finds_what_comparing_all_tiles_finds(atlas, search, first_view, monkeypatch):

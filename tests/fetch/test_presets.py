@@ -68,13 +68,13 @@ def test_terrain_names_the_datum_of_its_heights():
 
 def test_express_layers_warn_that_they_are_no_other_date():
     for name in ("ign", "ign-wms"):
-        for id_, layer in presets()[name].layers.items():
-            if "express" in id_:
-                assert "no other date" in layer.note
-                assert (
-                    "no other date"
-                    in parse_source(f"{name}:{id_}", ImageryOptions()).provenance.note
-                )
+        layers = presets()[name].layers
+        express = [id_ for id_ in layers if "express" in id_]
+        assert express
+        for id_ in express:
+            assert "no other date" in layers[id_].note
+            spec = parse_source(f"{name}:{id_}", ImageryOptions())
+            assert "no other date" in spec.provenance.note
 
 
 def test_unknown_names_list_the_known_ones():

@@ -156,8 +156,9 @@ def test_no_point_beyond_the_fold_of_the_lens_model_is_placed(distortion):
 
 def test_distort_leaves_its_input_alone():
     plane = np.array([[0.1, 0.2], [3.0, 3.0]])
-    plane.flags.writeable = False
+    before = plane.copy()
     distort(Camera(640, 480, 500.0, 500.0, 320, 240, (-0.5, 0, 0, 0)), plane)
+    np.testing.assert_array_equal(plane, before)
 
 
 def test_resized_camera_sees_the_same_ground():

@@ -484,12 +484,11 @@ def test_a_camera_that_stops_is_a_failure(flight):
 
 
 def test_health_goes_to_the_ground_station(flight):
-    flight.views(30, grey=BAD["too_dark"])
-    flight.health()
-    texts = [each["text"].rstrip(b"\0").decode() for each in flight.port.sent("STATUSTEXT")]
-    assert texts == [] or texts[-1].startswith("orthonav DEGRADED")
-    for _ in range(70):
+    texts = []
+    for _ in range(100):
         flight.view(grey=BAD["too_dark"])
+        texts += [frame for frame in flight.port.gone if b"orthonav DEGRADED: " in frame]
+    assert 0 < len(texts) <= 2  # at most one in five seconds
     heard = flight.written()
     assert [each for each in heard if each.get("health") == "DEGRADED"]
     assert flight.link.system_status == Level.DEGRADED.value
