@@ -15,15 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from benchmarks.flights import FlownView
     from benchmarks.inputs import Workplace
     from benchmarks.record import Section, Table
+    from orthonav.geo.frames import LocalFrame
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 TRACK, SIFT, ORB, ENCODER = "track", "sift", "orb", "encoder"
 NEAR_M = 300.0
 TILE_PX, DIMS, WARM_UP = 256, 1024, 3
 OPENCV = ("opencv-python-headless", "numpy")
-Placer = Callable[[Any], Any]
+Placer = Callable[["FlownView"], Any]
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ SEARCHING = object()
 """What a track answers before it has found a place."""
 
 
-def _method(task: Task, frame: Any) -> tuple[Placer, int]:
+def _method(task: Task, frame: "LocalFrame") -> tuple[Placer, int]:
     """What places a view, and the number of tiles where it compares tiles."""
     if task.method == TRACK:
         return _track(task, frame), 0
@@ -178,14 +180,14 @@ def _method(task: Task, frame: Any) -> tuple[Placer, int]:
     picture = posed.Picture.read(Path(task.map_path), Path(task.pixels), 1)
     keypoints = posed.Keypoints(picture, orb=task.method == ORB, near_m=task.near_m)
 
-    def place(flown: Any) -> Any:
+    def place(flown: "FlownView") -> Any:
         near = frame.en_from_latlon(*flown.truth_latlon_deg) if task.near_m else None
         return keypoints.locate(flown.view, True, near)
 
     return place, 0
 
 
-def _track(task: Task, frame: Any) -> Placer:
+def _track(task: Task, frame: "LocalFrame") -> Placer:
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
@@ -193,7 +195,7 @@ def _track(task: Task, frame: Any) -> Placer:
 
     tracker = Tracker(Localizer(open_map(Path(task.map_path))))
 
-    def place(flown: Any) -> Any:
+    def place(flown: "FlownView") -> Any:
         found = tracker.locate(flown.view)
         if tracker.state_name != "tracking":
             return SEARCHING
@@ -222,7 +224,7 @@ def _encoder(task: Task) -> tuple[Placer, int]:
     embeddings = rng.standard_normal((sheet.tiles, DIMS), dtype=np.float32)
     edges_of = Canny()
 
-    def place(flown: Any) -> Any:
+    def place(flown: "FlownView") -> Any:
         seen = rectify(downsampled(flown.view, gsd_m), gsd_m=gsd_m, size_px=TILE_PX)
         edges = edges_of(seen.grey, seen.valid)[:1].astype(np.float32)
         with torch.inference_mode():

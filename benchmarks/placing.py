@@ -13,7 +13,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from orthonav.geo.frames import LocalFrame
+    from orthonav.records import View
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 BOTH, TILES, REGISTRATION = OWN = "both", "tiles", "registration"
@@ -101,16 +105,16 @@ def run(task: Task) -> dict[str, Any]:
     }
 
 
-Placer = Callable[[Any], Any]
+Placer = Callable[["View"], Any]
 
 
-def _timed(place: Placer, view: Any) -> tuple[Any, float]:
+def _timed(place: Placer, view: "View") -> tuple[Any, float]:
     start = time.process_time()
     found = place(view)
     return found, 1e3 * (time.process_time() - start)
 
 
-def row_of(found: Any, frame: Any, truth_latlon_deg: tuple[float, float]) -> list[float]:
+def row_of(found: Any, frame: "LocalFrame", truth_latlon_deg: tuple[float, float]) -> list[float]:
     """East and north error, confidence, radius, three numbers of the covariance."""
     from orthonav.records import Fix, NoFix
 
@@ -146,7 +150,7 @@ def _orthonav(task: Task) -> Placer:
     if task.track:
         return Tracker(localizer, heading_known=task.heading_known, use_prior=task.use_prior).locate
 
-    def place(view: Any) -> Any:
+    def place(view: "View") -> Any:
         return localizer.locate(
             view,
             prior=view.telemetry.prior if task.use_prior else None,
@@ -178,7 +182,7 @@ def _other(task: Task) -> Placer:
         }
         method = posed.BestOfPoses(picture, surfaces[task.method](), task.telemetry_only)
 
-    def place(view: Any) -> Any:
+    def place(view: "View") -> Any:
         return method.locate(view, task.heading_known)
 
     return place

@@ -12,9 +12,17 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from orthonav.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from experiments.paper.methods import Method
+    from experiments.paper.runs import Workplace
+    from experiments.paper.scenes import Scene
+    from experiments.paper.trajectories import Setting
+
+    Task = tuple[Workplace, Scene, Method]
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
@@ -115,7 +123,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return failed
 
 
-def _on_maps(place: Any, wanted: set[str], tasks: Sequence[Any]) -> Iterator[str]:
+def _on_maps(place: "Workplace", wanted: set[str], tasks: "Sequence[Task]") -> Iterator[str]:
     """Run what takes the maps of the rows; what was run, as it ends."""
     from experiments.paper import baselines
     from experiments.paper.methods import FIELD_SCENES
@@ -145,12 +153,12 @@ def _has_matchers(options: argparse.Namespace) -> bool:
     return True
 
 
-def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[Any]:
+def _tasks(options: argparse.Namespace, place: "Workplace", wanted: set[str]) -> "list[Task]":
     """All rows of the chosen parts: workplace, scene and method."""
     from experiments.paper import baselines
     from experiments.paper.methods import FIELD_SCENES, flown, methods
 
-    tasks: list[Any] = []
+    tasks: list[Task] = []
     for scene in _scenes(options, place.setting, wanted):
         tiles = scene.trajectory.tiles
         rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)
@@ -167,7 +175,7 @@ def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[An
     return tasks
 
 
-def _whole(scene: Any, wanted: set[str]) -> bool:
+def _whole(scene: "Scene", wanted: set[str]) -> bool:
     """Whether all rows of a scene are wanted, not only those that another part needs."""
     from experiments.paper.scenes import REAL, UNTUNED
     from experiments.paper.trajectories import TABLE_1
@@ -191,7 +199,7 @@ def _minutes(start: float) -> str:
     return f"{(time.perf_counter() - start) / 60:5.1f} min"
 
 
-def _has_gpu(options: argparse.Namespace, tasks: Sequence[Any]) -> bool:
+def _has_gpu(options: argparse.Namespace, tasks: "Sequence[Task]") -> bool:
     """Whether networks are learnt on a GPU."""
     if options.device == "cpu" or not any(task[2].family in NETWORKS for task in tasks):
         return False
@@ -200,7 +208,7 @@ def _has_gpu(options: argparse.Namespace, tasks: Sequence[Any]) -> bool:
     return torch.cuda.is_available()
 
 
-def _scenes(options: argparse.Namespace, setting: Any, wanted: set[str]) -> Iterator[Any]:
+def _scenes(options: argparse.Namespace, setting: "Setting", wanted: set[str]) -> "Iterator[Scene]":
     from experiments.paper import scenes
     from experiments.paper.methods import FIELD_SCENES
 

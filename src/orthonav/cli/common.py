@@ -73,7 +73,7 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-def add_area(parser: argparse._ActionsContainer, group: Any) -> None:
+def add_area(parser: argparse._ActionsContainer, group: argparse._ActionsContainer) -> None:
     """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser."""
     group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     group.add_argument(

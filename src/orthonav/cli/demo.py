@@ -103,7 +103,7 @@ def _is_earlier_demo(out: Path) -> bool:
     return made and all(name in known or name.endswith(".tif") for name in names)
 
 
-def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
+def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[dict[str, Any], str]:
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
     from orthonav.evaluate.flights import FlightReport, metrics_to_json, table, verdict

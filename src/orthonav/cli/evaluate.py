@@ -6,7 +6,7 @@ import logging
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orthonav.cli.changed import (
     add_report_changes,
@@ -257,7 +257,7 @@ def _names(paths: list[Path]) -> list[str]:
 
 
 def _write_report(
-    out: Path, flights: list[Any], whole: "Metrics", opened: "MapFile | None"
+    out: Path, flights: list["FlightReport"], whole: "Metrics", opened: "MapFile | None"
 ) -> None:
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text

@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from orthonav.cli.common import add_search
 from orthonav.cli.signed import add_signature
@@ -66,7 +65,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     _add_log(parser.add_argument_group("flight log"))
 
 
-def _add_camera(group: Any) -> None:
+def _add_camera(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--camera",
         type=Path,
@@ -97,7 +96,7 @@ def _add_camera(group: Any) -> None:
     )
 
 
-def _add_recording(group: Any) -> None:
+def _add_recording(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--recorded-telemetry",
         action="store_true",
@@ -126,7 +125,7 @@ def _add_recording(group: Any) -> None:
     )
 
 
-def _add_autopilot(group: Any) -> None:
+def _add_autopilot(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--autopilot",
         metavar="URL",
@@ -169,7 +168,7 @@ def _add_autopilot(group: Any) -> None:
     )
 
 
-def _add_ros2(group: Any) -> None:
+def _add_ros2(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--ros2",
         action="store_true",
@@ -185,7 +184,7 @@ def _add_ros2(group: Any) -> None:
     )
 
 
-def _add_outputs(group: Any) -> None:
+def _add_outputs(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--send",
         action="append",
@@ -244,7 +243,7 @@ def _add_outputs(group: Any) -> None:
     group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
 
 
-def _add_messages(group: Any) -> None:
+def _add_messages(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--stamp",
         choices=("utc", "boot"),
@@ -289,7 +288,7 @@ def _add_messages(group: Any) -> None:
     )
 
 
-def _add_flight(group: Any) -> None:
+def _add_flight(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--heading",
         choices=("known", "unknown"),
@@ -337,7 +336,7 @@ def _add_flight(group: Any) -> None:
     add_signature(group)
 
 
-def _add_log(group: Any) -> None:
+def _add_log(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--log", type=Path, metavar="FILE.mcap", help="write a flight log that can be replayed"
     )

@@ -198,7 +198,7 @@ def _source(
     link: AutopilotLink | None,
     camera: Camera,
     stopping: threading.Event,
-) -> Any:
+) -> cameras.ImageSource:
     if cameras.is_live(options.source):
         return cameras.LiveCamera(
             cameras.live_name(options.source),
@@ -207,7 +207,7 @@ def _source(
         )
     if not (options.pace > 0 and (options.rate_hz is None or options.rate_hz > 0)):
         raise VariantError("--pace and --rate-hz must be above 0")
-    due_ns: Any = cameras.own_pace(clocks, options.pace)
+    due_ns: Callable[[int], int | None] = cameras.own_pace(clocks, options.pace)
     if options.file_clock == "autopilot":
         if link is None:
             raise VariantError("--file-clock autopilot needs --autopilot")

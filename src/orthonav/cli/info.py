@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import print_json
 
 if TYPE_CHECKING:
-    from orthonav.mapfile.manifest import Manifest
+    from orthonav.mapfile.manifest import Manifest, SheetInfo
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -142,7 +142,7 @@ def _terrain(manifest: "Manifest") -> dict[str, Any] | None:
     }
 
 
-def _bounds_deg(sheet: Any) -> list[float]:
+def _bounds_deg(sheet: "SheetInfo") -> list[float]:
     """West, south, east, north of the outer tile centres in degrees."""
     import numpy as np
 

@@ -12,7 +12,7 @@ EVERYDAY = (
 )
 
 if TYPE_CHECKING:
-    from orthonav.geo.area import Area
+    from orthonav.geo.area import Area, Extent
     from orthonav.geo.planning import Caution, ViewPlan
     from orthonav.geo.route import Route
     from orthonav.geo.terrain import LegProfile
@@ -99,16 +99,18 @@ def run(options: argparse.Namespace) -> None:
         print(plan_text(plain))
 
 
-def _sheets(options: argparse.Namespace, route: "Route | None") -> tuple[list[Any], list["Area"]]:
+def _sheets(
+    options: argparse.Namespace, route: "Route | None"
+) -> "tuple[list[Route | Extent], list[Area]]":
     """Sheets as arguments of `build` (routes or bounds), and their areas."""
     from orthonav.geo.area import Area
     from orthonav.geo.sheets import sheets_of_bounds, sheets_of_route
 
     if route is None:
         boxes = sheets_of_bounds(options.bounds)
-        return boxes, [Area.from_bounds(box) for box in boxes]
+        return [*boxes], [Area.from_bounds(box) for box in boxes]
     parts = sheets_of_route(route, options.band_m)
-    return parts, [Area.from_route(part, options.band_m) for part in parts]
+    return [*parts], [Area.from_route(part, options.band_m) for part in parts]
 
 
 def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
@@ -203,7 +205,7 @@ def _view_plain(view: "ViewPlan", gsd_m: float, speed_mps: float | None) -> dict
 def _map_plain(
     options: argparse.Namespace,
     areas: list["Area"],
-    sheets: list[Any],
+    sheets: list["Route | Extent"],
     gsd_m: float,
     tile_px: int,
 ) -> dict[str, Any]:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from orthonav.cli.common import Progress
     from orthonav.confidence.accept import Acceptance
     from orthonav.flight.heights import FlownHeights
+    from orthonav.flight.mount import Mount
     from orthonav.localizer import Localizer
     from orthonav.onboard.setups import Tried
     from orthonav.records import Telemetry, ViewResult
@@ -61,7 +62,7 @@ class SetupAdvice:
         options: argparse.Namespace,
         flight: "Recording",
         localizer: "Localizer",
-        mount: Any,
+        mount: "Mount | None",
         heights: "FlownHeights | None",
     ) -> None:
         from orthonav.onboard.setups import LowConfidenceViews
