@@ -59,7 +59,7 @@ class Threaded(ThreadingMixIn, WSGIServer):
 def mapproxy(tmp_path_factory):
     """Address of a MapProxy that serves the ground as WMTS and WMS."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # those of MapProxy
         from mapproxy.wsgiapp import make_wsgi_app
 
         with servers.serving(servers.wms_map) as upstream:

@@ -199,7 +199,7 @@ def cog_source(client: Client, spec: SourceSpec, area: Area, urls: list[str]) ->
 def _inspect(file: RemoteFile, options: ImageryOptions, frame: LocalFrame) -> CogLevel:
     """A file at the level that fits `options`, read from its head."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # refused below
         with file.opened() as whole:
             level = _level(whole, options, frame, file)
         with file.opened(level) as dataset:
