@@ -216,8 +216,8 @@ def _scenes_table(judged: Judged) -> Table:
         *("calibration error", "shipped: accepted", "wrong", "calibration error"),
     )
     notes = (
-        f"accepted: confidence of {CONFIDENT:g} or more; correct: within 35 m or 10 px, with a prior "
-        "within 20 px; heading sd 10 deg, height sd 10 %, tracked: 2 deg and 3 %",
+        f"accepted: confidence of {CONFIDENT:g} or more; correct: within 35 m or 10 px, with a "
+        "prior within 20 px; heading sd 10 deg, height sd 10 %, tracked: 2 deg and 3 %",
         "by a fit to the other scenes; shipped: by the weights of the program, fitted to views of "
         "these scenes",
     )
@@ -234,7 +234,10 @@ def _features_table(judged: Judged) -> Table:
         loss = -np.mean(np.log(np.where(judged.right, clipped, 1 - clipped)))
         everything = np.ones(len(judged.rows), np.bool_)
         rows.append([name, *_verdict(judged, confidence, everything), f"{loss:.4f}"])
-    header = ("evidence", "accepted of correct", "wrong of accepted", "calibration error", "log loss")
+    header = (
+        *("evidence", "accepted of correct", "wrong of accepted", "calibration error"),
+        "log loss",
+    )
     return Table("What each kind of evidence brings", header, rows)
 
 
@@ -258,7 +261,10 @@ def _cases_table(judged: Judged) -> Table:
                 *_verdict(judged, confidence, inside),
             ]
         )
-    header = ("views", "n", "correct", "accepted of correct", "wrong of accepted", "calibration error")
+    header = (
+        *("views", "n", "correct", "accepted of correct", "wrong of accepted"),
+        "calibration error",
+    )
     return Table("By kind of view, scenes left out", header, rows)
 
 
