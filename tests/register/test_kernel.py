@@ -55,7 +55,7 @@ def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
     def work():
         found = []
         for made, near in views(12, 5, level, view_valid):
-            fresh = template.Template(made.level, made.values, made.weights, made.recipe)
+            fresh = template.Template(made.level, made.planes, made.weights, made.recipe)
             found.append(Refiner(fresh, reference).place(near, with_covariance=True))
         return found
 
@@ -88,7 +88,7 @@ def test_curvatures_are_the_same(monkeypatch):
     made, _ = next(views(1, 3, 0))
 
     def work():
-        fresh = template.Template(made.level, made.values, made.weights, made.recipe)
+        fresh = template.Template(made.level, made.planes, made.weights, made.recipe)
         return fresh.block_hessians, fresh.hessians, fresh.self_slopes
 
     compiled, plain = both(monkeypatch, work)

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,8 +90,7 @@ def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None
         return NoFix(
             "too_small", f"view covers {share:.0%} of a tile, {min_valid_share:.0%} are needed"
         )
-    seen = view.grey[view.valid]
-    if float(seen.std()) < MIN_STD / 2:
+    if _is_uniform(view):
         return NoFix("blank", "the part of the view that would be compared is uniform")
     return None
 
@@ -100,12 +100,17 @@ def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> No
 
     `pixel` is the size of its pixels in pixels of the map, `min_side_px` the least side, in those.
     """
-    side = math.sqrt(float(view.valid.sum())) * pixel
+    side = math.sqrt(cv2.countNonZero(view.valid.view(np.uint8))) * pixel
     if side < min_side_px:
         return NoFix(
             "too_small",
             f"view covers {side:.0f} pixels of the map across, {min_side_px:.0f} needed",
         )
-    if float(view.grey[view.valid].std()) < MIN_STD / 2:
+    if _is_uniform(view):
         return NoFix("blank", "the part of the view that would be compared is uniform")
     return None
+
+
+def _is_uniform(view: RectifiedView) -> bool:
+    _, std = cv2.meanStdDev(view.grey, mask=view.valid.view(np.uint8))
+    return float(std[0, 0]) < MIN_STD / 2

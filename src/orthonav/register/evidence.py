@@ -61,10 +61,16 @@ def evidence(
 
     The last channel is 1 where the evidence counts: valid, and not on the border of `valid`.
     """
+    return np.asarray(cv2.merge(evidence_planes(grey, valid, recipe)), np.float32)
+
+
+def evidence_planes(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: EvidenceRecipe
+) -> list[Array]:
+    """The channels of `evidence`, each (H, W)."""
     whole = bool(valid.all())
     picture = np.asarray(grey, dtype=np.float32)
     share = np.ones(grey.shape, np.float32) if whole else valid.astype(np.float32)
-    out = np.empty((*grey.shape, CHANNELS), dtype=np.float32)
     local = _LocalMean(share, whole)
     if not whole:
         picture = np.where(valid, picture, local(picture * share, recipe.deviation_px))
@@ -74,10 +80,8 @@ def evidence(
         counts = np.asarray(
             cv2.erode(share, np.ones((reach, reach), np.uint8), borderValue=1.0), np.float32
         )
-    out[..., 0], out[..., 1] = _gradients(picture, counts, local, recipe)
-    out[..., 2] = _grey(picture, share, local, recipe) * counts
-    out[..., 3] = counts
-    return out
+    east, north = _gradients(picture, counts, local, recipe)
+    return [east, north, _grey(picture, share, local, recipe) * counts, counts]
 
 
 class _LocalMean:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.register.evidence import CHANNELS, FINE, GROUPS, EvidenceRecipe, evidence
+from orthonav.register.evidence import CHANNELS, FINE, GROUPS, EvidenceRecipe, evidence_planes
 from orthonav.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
@@ -20,12 +20,12 @@ BLOCKS = 6
 class Template:
     """One view at one level.
 
-    `values` (H, W, 4): evidence, each kind scaled to the energy that its weight gives it, and 1
+    `planes` (4, H, W): evidence, each kind scaled to the energy that its weight gives it, and 1
     where it counts; `weights` of the kinds; `level` of the map whose ground resolution it has.
     """
 
     level: int
-    values: Array
+    planes: Array
     weights: tuple[float, ...]
     recipe: EvidenceRecipe
 
@@ -34,27 +34,26 @@ class Template:
         cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: EvidenceRecipe
     ) -> "Template":
         """The template of grey levels (H, W) at the ground resolution of `level`."""
-        made, weights = evidence(grey, valid, recipe), (1.0, recipe.grey_share)
-        energies, gains = np.einsum("hwc,hwc->c", made, made), np.ones(CHANNELS, np.float32)
+        planes, weights = np.stack(evidence_planes(grey, valid, recipe)), (1.0, recipe.grey_share)
         for group, weight in zip(GROUPS, weights, strict=True):
-            energy = float(energies[group].sum())
-            gains[group] = math.sqrt(weight / energy) if energy > 0 else 0.0
-        made *= gains
-        return cls(level, made, weights, recipe)
+            energy = energy_of(planes[group])
+            planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
+        return cls(level, planes, weights, recipe)
 
-    @cached_property
+    @property
     def channels(self) -> Array:
-        """The evidence as planes (3, H, W)."""
-        return self._planes[:3]
+        """The evidence (3, H, W)."""
+        return self.planes[:3]
 
-    @cached_property
+    @property
     def mask(self) -> Array:
         """1 where the view counts (H, W) float32."""
-        return np.asarray(self._planes[3], np.float32)
+        return np.asarray(self.planes[3], np.float32)
 
     @cached_property
-    def _planes(self) -> Array:
-        return np.ascontiguousarray(np.moveaxis(self.values, -1, 0))
+    def values(self) -> Array:
+        """The planes side by side (H, W, 4)."""
+        return np.asarray(cv2.merge(list(self.planes)), np.float32)
 
     @cached_property
     def pixels(self) -> float:
