@@ -32,7 +32,7 @@ from orthonav.check.places import CellGrid
 from orthonav.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
 from orthonav.check.request import CheckRequest
 from orthonav.check.run import check_map
-from orthonav.check.verdict import GO_LOW
+from orthonav.check.verdict import GO_LOW, NARROW_PX
 from orthonav.files import write_text
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
@@ -75,11 +75,20 @@ class Outcome:
     error_m: float
     measured_m: float
 
+    @property
+    def side_px(self) -> float:
+        """Root of the area of a view, pixels of the map."""
+        extent = DEFAULT_CAMERA.extent
+        return self.width_px * math.sqrt(math.prod(extent)) / min(extent)
+
     def predicted(self, by: Recalibration) -> Array:
         """Predicted shares (N,)."""
-        extent = DEFAULT_CAMERA.extent
-        side_px = self.width_px * math.sqrt(math.prod(extent)) / min(extent)
-        return by(np.array(self.shares), side_px, self.prior)
+        return by(np.array(self.shares), self.side_px, self.prior)
+
+    def is_go(self, by: Recalibration) -> bool:
+        """Whether a check of nothing else would say *go*."""
+        is_wide = self.prior or self.side_px >= NARROW_PX
+        return is_wide and self.low(by) >= GO_LOW
 
     def low(self, by: Recalibration) -> float:
         """Lower end of the 80 % interval of the mean."""
@@ -258,7 +267,7 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
         *("scene, map", "views", "n", "predicted", "80 % low", "measured", "verdict alone"),
         *("error m expected", "measured", "confident and wrong"),
     )
-    gone = [each for each in found if each.right and each.low(by[each.scene]) >= GO_LOW]
+    gone = [each for each in found if each.right and each.is_go(by[each.scene])]
     bad = [each for each in gone if np.mean(each.right) < GO_LOW]
     above = [each for each in found if each.right]
     under = sum(np.mean(each.right) < each.low(by[each.scene]) for each in above)
@@ -266,8 +275,8 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
         f"heading sd {YAW_STD_DEG:g} deg, height sd {AGL_STD:.0%}, prior {PRIOR_PX:g} px or none; "
         f"{options.views} views over the later date each, those beside the map left out, checks of "
         f"effort {options.effort:g} (40 trials); recalibrated by the other scenes",
-        f"go by the low bound: {len(gone)} of {len(above)}, of which {len(bad)} measured below "
-        f"{GO_LOW:g}; measured below the low bound: {under} of {len(above)}",
+        f"go by the low bound and the width: {len(gone)} of {len(above)}, of which {len(bad)} "
+        f"measured below {GO_LOW:g}; measured below the low bound: {under} of {len(above)}",
     )
     return [
         Table("Checks and what came out", header, rows, notes),
@@ -285,7 +294,7 @@ def _row(found: Outcome, by: Recalibration) -> list[str]:
         f"{float(found.predicted(by).mean()):.2f}" if found.right else "-",
         f"{low:.2f}",
         f"{float(np.mean(found.right)):.2f}" if found.right else "-",
-        "go" if low >= GO_LOW else "not go",
+        "go" if found.is_go(by) else "not go",
         f"{found.error_m:.1f}",
         f"{found.measured_m:.1f}",
         str(found.wrong),

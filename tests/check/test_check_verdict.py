@@ -31,6 +31,7 @@ FINE = dict(
     lookalikes=(),
     changed=0.0,
     allowed_m=50.0,
+    predicted_px=256.0,
 )
 FLOWN = FINE | {"along": ALONG}
 
@@ -54,6 +55,22 @@ def stretch(length_m, drift_m, *, ends_lost=False, allowed_m=50.0, start_m=1000.
 def test_go():
     assert judged(FINE) == (Word.GO, {"fixes": Word.GO})
     assert judged(FLOWN) == (Word.GO, {"fixes": Word.GO, "drift": Word.GO})
+
+
+@pytest.mark.parametrize(
+    ("allowed_m", "predicted_px", "word"),
+    [
+        (None, 130.0, Word.MARGINAL),
+        (None, 150.0, Word.GO),
+        (50.0, 130.0, Word.GO),
+        (None, None, Word.GO),  # tried on a second date
+    ],
+)
+def test_predictions_alone_are_no_go_for_narrow_views_without_a_prior(
+    allowed_m, predicted_px, word
+):
+    found, reasons = judged(FINE | dict(allowed_m=allowed_m, predicted_px=predicted_px))
+    assert found is word and ("narrow_views" in reasons) == (word is Word.MARGINAL)
 
 
 def test_changed_ground_is_a_warning_and_much_of_it_is_marginal():

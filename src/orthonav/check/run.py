@@ -195,6 +195,7 @@ class _Check:
             outside=outside,
             changed=changed,
             allowed_m=request.prior_std_m,
+            predicted_px=None if other else side_m / self.sheet.grid.gsd_m,
         )
         route = request.route
         return CheckResult(

@@ -20,6 +20,9 @@ GO_WRONG, NO_GO_WRONG = 0.005, 0.02
 """Share of trials that were confident and wrong."""
 MAX_CHANGED = 0.1
 """Share of the ground that changed since the map was made, beyond which a route is marginal."""
+NARROW_PX = 140.0
+"""Views that show fewer pixels of the map across, without a prior, were located far less often than
+predicted on two of nine scenes (docs/check.md): no go by predictions alone."""
 MIN_WRONG = 2
 """A single wrong trial may be chance."""
 TOO_FAR = 2.0
@@ -40,6 +43,7 @@ def verdict_of(
     outside: float,
     changed: float,
     allowed_m: float | None,
+    predicted_px: float | None,
 ) -> Verdict:
     """The worst of all reasons, worst first.
 
@@ -47,12 +51,15 @@ def verdict_of(
     interval. `calibrated`: the map carries a confidence model. `wrong`, `trials`: number of
     confident and wrong trials, and of all. `outside`: share of the route outside the map, 0 to 1.
     `changed`: share of the checked area that changed since the map was made, 0 to 1. `allowed_m`:
-    standard deviation of the prior, None without one.
+    standard deviation of the prior, None without one. `predicted_px`: width of a view in pixels of
+    the map, None where it was tried on imagery of a second date.
     """
     where = "on the map" if along is None else "along the route"
     reasons = [*_trust(calibrated, wrong, trials), _mean(mean, low, where)]
     if along is not None:
         reasons += [*_outside(outside), _drift(along, allowed_m), *_blind(stretches)]
+    if allowed_m is None and predicted_px is not None:
+        reasons += _narrow(predicted_px)
     reasons += [*_changed(changed, where), *_lookalikes(lookalikes)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
@@ -77,6 +84,14 @@ def _mean(mean: float, low: float, where: str) -> Reason:
     if fine:
         return Reason("fixes", text, Word.GO)
     return Reason("few_fixes", text, Word.NO_GO if mean < NO_GO_MEAN else Word.MARGINAL)
+
+
+def _narrow(view_px: float) -> list[Reason]:
+    if view_px >= NARROW_PX:
+        return []
+    text = f"Views {view_px:.0f} pixels of the map wide, without a prior, may be located far less "
+    text += "often than predicted: fly higher, state a prior, or check with a second date."
+    return [Reason("narrow_views", text, Word.MARGINAL)]
 
 
 def _article(share: float) -> str:
