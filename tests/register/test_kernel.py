@@ -10,6 +10,7 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.register import refine, search, sharpness, template
+from orthonav.register.evidence import FINE
 from orthonav.register.kernel import KERNEL
 from orthonav.register.map_window import MapWindow
 from orthonav.register.pose import Pose
@@ -149,7 +150,9 @@ def test_other_arrays_are_refused(damage):
 @needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
-def test_what_a_covariance_is_made_of_is_the_same(reference, monkeypatch, level, whole):
+@pytest.mark.parametrize("cached", [True, False])
+def test_what_a_covariance_is_made_of_is_the_same(reference, monkeypatch, level, whole, cached):
+    monkeypatch.setattr(reference, "caches", lambda _: cached)
     view_valid = np.ones((96, 128), bool)
     view_valid[:40, 90:] = whole
     made, window = [], []
@@ -184,7 +187,9 @@ def test_sums_at_a_pose_beyond_all_bounds_touch_no_memory(pose):
 @needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
-def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole):
+@pytest.mark.parametrize("cached", [True, False])
+def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole, cached):
+    monkeypatch.setattr(reference, "caches", lambda _: cached)
     view_valid = np.ones((96, 128), bool)
     view_valid[:40, 90:] = whole
     seen = list(views(12, 8, level, view_valid))
@@ -202,6 +207,25 @@ def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole
 
 
 @needs_kernel
+@pytest.mark.parametrize("of_map", [True, False])
+@pytest.mark.parametrize("channel", range(3))
+def test_a_channel_that_shows_nothing_adds_nothing_aside(monkeypatch, channel, of_map):
+    rng = np.random.default_rng(6)
+    window = MapWindow(np.ones((60, 70, 4), np.float32), 0, 0, 1.0, (46, 58))
+    values = np.ones((30, 42, 4), np.float32)
+    for evidence, unit in ((window.made, 1.0), (values, 0.02)):
+        evidence[..., :3] = rng.normal(0, unit, (*evidence.shape[:2], 3))
+    (window.made if of_map else values)[..., channel] = 0
+    monkeypatch.setattr(MapWindow, "of", lambda *_: window)
+    made = template.Template(0, values, (1.0, 0.6), FINE)
+    one, other = both(
+        monkeypatch, lambda: sharpness._moved_scores(made, None, Pose(35.0, 30.0, 0.0, 0.0))
+    )
+    for mine, plain in zip(one, other, strict=True):
+        assert mine == pytest.approx(plain, abs=1e-3 * float(np.abs(plain).max()) + 1e-7)
+
+
+@needs_kernel
 @pytest.mark.parametrize(
     "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
 )
@@ -213,9 +237,12 @@ def test_moves_beyond_all_bounds_touch_no_memory(matrix):
 
 
 @needs_kernel
-@pytest.mark.parametrize("damage", ["size", "small", "moves", "scores", "strided", "window"])
+@pytest.mark.parametrize(
+    "damage", ["size", "small", "moves", "scores", "strided", "window", "rows", "cols"]
+)
 def test_moves_that_do_not_match_are_refused(damage):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    view = {"rows": made.values[:0], "cols": made.values[:, :0].copy()}.get(damage, made.values)
     size = {"size": (77, 100), "small": (made.mask.shape[0] + 5, 100)}.get(damage, (80, 100))
     window = np.ones((20, 30, 3 if damage == "window" else 4), np.float32)
     out = np.zeros((3, 8 if damage == "scores" else 7, 9), np.float32)
@@ -224,7 +251,7 @@ def test_moves_that_do_not_match_are_refused(damage):
     moves = (-3, 4) if damage == "moves" else (3, 4)
     matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     with pytest.raises(ValueError, match=r"match|expected|contiguous|products"):
-        KERNEL.moved(window, made.values, made.weights, matrix, 0.0, moves, size, 1e-3, out)
+        KERNEL.moved(window, view, made.weights, matrix, 0.0, moves, size, 1e-3, out)
 
 
 SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
@@ -320,3 +347,25 @@ def test_an_array_that_is_missing_is_refused(missing):
         KERNEL.search(spectra, values, made.weights, poses, 0, best, numbers, None)
     with pytest.raises(TypeError):
         KERNEL.near(None, made.values, made.weights, np.zeros((1, 4)), 2, np.zeros((1, 3)))
+
+
+@needs_kernel
+@pytest.mark.parametrize("missing", range(3))
+def test_moves_of_an_array_that_is_missing_are_refused(missing):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    given = [np.zeros((20, 30, 4), np.float32), made.values, np.zeros((3, 7, 9), np.float32)]
+    given[missing] = None
+    window, values, out = given
+    with pytest.raises(TypeError):
+        KERNEL.moved(window, values, made.weights, (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, out)
+
+
+@needs_kernel
+@pytest.mark.parametrize("missing", range(5))
+def test_sums_of_an_array_that_is_missing_are_refused(missing):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    window, out = np.zeros((20, 30, 4), np.float32), np.zeros(2 * 16 + 36 * refine.BLOCK_SUMS)
+    given = [window, made.values, made.slopes, made.numbers, out]
+    given[missing] = None
+    with pytest.raises(TypeError):
+        KERNEL.spread(*given[:4], (0,) * 4, (0,) * 9, given[4])

@@ -1,10 +1,11 @@
-/* Search of a view on the map: orthonav.register.search, compiled.
+/* Search of a view on the map: orthonav.register.search and sharpness, compiled.
  *
  * `search` lays a view on every place of a window under each of many poses, by Fourier transforms of
  * eight columns or rows at a time: those along a column, the product with the spectra of the map and
  * the one back stay in the processor's cache. `near` lays it on the places around each of many poses,
- * one by one. The Python module does the same with SciPy and OpenCV; it is the oracle of this file and
- * takes its place where it was not compiled. */
+ * one by one. `moved` lays it on the places a little aside of one pose, by the same transforms. The
+ * Python modules do the same with SciPy and OpenCV; they are the oracle of this file and take its place
+ * where it was not compiled. */
 
 #include "_kernel.h"
 
@@ -535,7 +536,7 @@ typedef struct {
     search_t parts;             /* plans and memory; channels of the view, then those of the map */
     window_t view, made;        /* evidence of the view and of the map */
     const double *weights, *matrix; /* of the kinds of evidence; from the window's pixels to the map's */
-    double turn, floor;         /* of the pose; power below this share of the mean counts less */
+    double turn, floor;         /* from map to view; power below this share of the mean counts less */
     int rows, cols, side;       /* moves to each side; rows of the window with them */
     float *map;                 /* (side, .., 4): the map as the window shows it */
     wide *products;             /* (G, 3, R, 3): real and imaginary parts, and magnitudes */
@@ -606,25 +607,26 @@ INLINE const pair_t *column_of(const moved_t *moved, int group, int channel, int
     return ended;
 }
 
-/* Whether a view shows nothing of a channel. */
-static int is_blank(const window_t *view, int channel) {
-    const size_t pixels = (size_t)view->rows * view->cols;
+/* Whether contiguous evidence is zero in all of a channel. */
+static int is_blank(const float *evidence, size_t pixels, int channel) {
     for (size_t at = 0; at < pixels; at++)
-        if (view->first[at * LANES + channel] != 0.0f) return 0;
+        if (evidence[at * LANES + channel] != 0.0f) return 0;
     return 1;
 }
 
-/* Products of the spectra of view and map, and the sum of their magnitudes by channel. Where either
- * shows nothing of a channel, they are zero, not what rounding left when both were taken apart. */
-INLINE void multiply_both_inline(const moved_t *moved, const float *gains, double *sums) {
+/* Products of the spectra of view and map, and the sum of their magnitudes by channel. `shown`: 0 for
+ * channels in which either is zero everywhere, else 1. There the products are zero, not what rounding
+ * left when both were taken apart. */
+INLINE void multiply_both_inline(const moved_t *moved, const float *shown, double *sums) {
     const search_t *const parts = &moved->parts;
     const int rows = parts->down.length;
     wide *into = moved->products;
     for (int group = 0; group < parts->groups; group++)
         for (int channel = 0; channel < CHANNELS; channel++) {
-            const float counts = gains[channel / 2] > 0 && !is_blank(&moved->view, channel) ? 1.0f : 0.0f;
+            const float counts = shown[channel];
             wide sum = {0};
-            memcpy(parts->total, column_of(moved, group, channel, moved->view.rows), rows * sizeof(pair_t));
+            memcpy(parts->total, column_of(moved, group, channel, moved->view.rows),
+                   rows * sizeof(pair_t));
             const pair_t *const view = parts->total;
             const pair_t *const map = column_of(moved, group, CHANNELS + channel, moved->side);
             for (int at = 0; at < rows; at++, into += 3) {
@@ -639,8 +641,8 @@ INLINE void multiply_both_inline(const moved_t *moved, const float *gains, doubl
         }
 }
 
-FOR_EVERY_PROCESSOR(multiply_both, (const moved_t *moved, const float *gains, double *sums),
-                    (moved, gains, sums))
+FOR_EVERY_PROCESSOR(multiply_both, (const moved_t *moved, const float *shown, double *sums),
+                    (moved, shown, sums))
 
 /* Transforms back along columns: of gradients, of grey, and of phases alone, one above the other. As in
  * `multiply_columns`, imaginary parts first. */
@@ -697,7 +699,7 @@ static int move_aside(moved_t *moved, float *out) {
     const int width = moved->view.cols + 2 * moved->cols, longest = rows > cols ? rows : cols;
     const double spectrum = (double)rows * (cols / 2 + 1);
     double sums[CHANNELS] = {0};
-    float gains[2], floors[CHANNELS];
+    float gains[2], shown[CHANNELS], floors[CHANNELS];
     moved->side = moved->view.rows + 2 * moved->rows;
     parts->groups = cols / 2 / WIDE + 1, parts->channels = 2 * CHANNELS;
     parts->wanted = 3 * (2 * moved->rows + 1), parts->bands = (parts->wanted + PAIR - 1) / PAIR;
@@ -713,8 +715,13 @@ static int move_aside(moved_t *moved, float *out) {
                            parts->data && parts->scratch && parts->total;
     if (has_memory) {
         sample_map(moved, width, gains);
+        for (int channel = 0; channel < CHANNELS; channel++)
+            shown[channel] =
+                gains[channel / 2] > 0 &&
+                !is_blank(moved->view.first, (size_t)moved->view.rows * moved->view.cols, channel) &&
+                !is_blank(moved->map, (size_t)moved->side * width, channel);
         transform_both(moved, gains);
-        multiply_both(moved, gains, sums);
+        multiply_both(moved, shown, sums);
         for (int channel = 0; channel < CHANNELS; channel++)
             floors[channel] = (float)(moved->floor * sums[channel] / spectrum + 1e-12);
         columns_back(moved, floors);
@@ -865,8 +872,8 @@ PyObject *py_moved(PyObject *self, PyObject *arguments) {
     search_t *const parts = &moved.parts;
     if (made[1] > LARGEST || got[0].strides[0] % 4 || made[0] * stride > INT_MAX)
         PyErr_SetString(PyExc_ValueError, "window must have at most 32768 columns and 2^31 numbers");
-    else if (rows < 0 || cols < 0 || rows > LARGEST || cols > LARGEST || out[0] != 3 ||
-             out[1] != 2 * rows + 1 || size[0] > LARGEST || size[1] > LARGEST ||
+    else if (view[0] < 1 || view[1] < 1 || rows < 0 || cols < 0 || rows > LARGEST || cols > LARGEST ||
+             out[0] != 3 || out[1] != 2 * rows + 1 || size[0] > LARGEST || size[1] > LARGEST ||
              view[0] + 2 * rows > size[0] || view[1] + 2 * cols > size[1])
         PyErr_SetString(PyExc_ValueError, "view, moves, sides of the transform and scores do not match");
     else if ((failed = make_plan(size[0], &parts->down)) || (failed = make_plan(size[1], &parts->along))) {
