@@ -3,8 +3,9 @@
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
- * `spread` adds up what the covariance is made of. `derive` makes the view's derivatives and adds up their products. The Python modules do the same
- * with NumPy; they are the oracle of this file and take its place where it was not compiled.
+ * `spread` adds up what the covariance is made of. `derive` makes the view's derivatives and adds up
+ * their products. The Python modules do the same with NumPy; they are the oracle of this file and take
+ * its place where it was not compiled.
  *
  * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
 
@@ -360,8 +361,8 @@ static void refine(const window_t *window, const template_t *view, const numbers
     memcpy(best->step, step, sizeof step);
 }
 
-/* The map (H, W, 4) as the view's window shows it, edge directions turned, zero where either does not
- * count; the last of each four is 1 where both do. */
+/* The map (H, W, 4) as the view's window shows it, edge directions turned, zero where the view or the
+ * map does not count; the last of each four is 1 where both do. */
 INLINE void sample_inline(const window_t *window, const template_t *view, const double *matrix,
                           float cosine, float sine, float *into) {
     const lanes straight = {cosine, cosine, 1.0f, 0.0f}, crossed = {-sine, sine, 0.0f, 0.0f};
@@ -389,7 +390,7 @@ INLINE void by_steps(lanes dx, lanes dy, lanes x, float y, lanes out[4]) {
 }
 
 /* Products of the view's derivatives and those of the map (4, 4), then by block the sums of
- * `BlockSums` of refine.py. */
+ * `SpreadSums.blocks` of refine.py. */
 INLINE void correlate_inline(const template_t *view, const float *map, const seen_t *seen,
                              double *observed, double *out) {
     const float gain = (float)seen->gains[0], square = (float)seen->squares[0];
@@ -547,7 +548,7 @@ static void give_back_problem(problem_t *problem) {
     give_back(&problem->images);
 }
 
-/* 0, or -1 with an error; `out`: takes the last argument, NULL where there is none. */
+/* 0, or -1 with an error. `out` takes the last argument; NULL where the function has none. */
 static int borrow_problem(PyObject *arguments, problem_t *problem, PyObject **out) {
     PyObject *from[3], *numbers;
     pose_t *const pose = &problem->pose;
