@@ -28,7 +28,7 @@ from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footp
 from orthonav.records import CONFIDENT, NoFix, View
 
 # Values without another source: `python -m benchmarks.atlas_lost`.
-CANDIDATES = 24
+CANDIDATES = 40
 """Places of the whole atlas that are judged, 4 ms each."""
 TURN_STEP_DEG = 8.0
 LOG_SCALES = (-0.06, 0.06)
