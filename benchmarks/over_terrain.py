@@ -334,7 +334,7 @@ def ways(
     over = Localizer(ground.opened)
     assert over.registration is not None
     # It gives heights as a terrain layer does.
-    over.registration.relief = Relief(terrain, over.grid)  # type: ignore[arg-type]
+    over.registration.relief = Relief(terrain, over.grid)
 
     def on_terrain(view: View) -> Fix | NoFix:
         heights = map_heights(ground.opened, terrain, take_off=(float(lat), float(lon), 0.0))

@@ -53,7 +53,7 @@ def measured(bench: Bench, row: Row, with_terrain: bool) -> str:
     if terrain is not None:
         assert localizer.registration is not None
         # It gives heights as a terrain layer does.
-        localizer.registration.relief = Relief(terrain, localizer.grid)  # type: ignore[arg-type]
+        localizer.registration.relief = Relief(terrain, localizer.grid)
     rng = np.random.default_rng(11)
     cameras, pixels, errors, axes = [], [], [], []
     for each in seen:

@@ -124,7 +124,7 @@ def rows(opened: MapFile, folder: Path, wrong: str) -> Iterator[tuple[str, ...]]
         localizer = Localizer(opened)
         assert localizer.registration is not None
         # It gives heights as a terrain layer does.
-        localizer.registration.relief = Relief(terrain, localizer.grid)  # type: ignore[arg-type]
+        localizer.registration.relief = Relief(terrain, localizer.grid)
         locator: Locator = SingleViews(localizer)
         if method == "tracked":
             locator = Tracker(localizer)

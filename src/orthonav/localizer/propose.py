@@ -1,12 +1,11 @@
 """Candidates for registration: the tiles whose embeddings are most similar to the view's."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.embed.bank import embed_poses
+from orthonav.embed.bank import Representation, embed_poses
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
@@ -30,12 +29,12 @@ class TileProposer:
     centres_en_m: NDArray[np.float32]
     index: ExactIndex
     embedder: WhitenedEmbedder
-    representation: Any
+    representation: Representation
     neighbours: TileNeighbours
 
     @classmethod
     def of(
-        cls, tiles: TileMatcher, embedder: ViewEmbedder, representation: Any
+        cls, tiles: TileMatcher, embedder: ViewEmbedder, representation: Representation
     ) -> "TileProposer | None":
         """A proposer for whitened embeddings, None for others: those cannot embed a view under
         many poses at once."""

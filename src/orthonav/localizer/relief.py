@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -9,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.prepared import MIN_AGL_STD, PreparedView
-from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.records import DEFAULT_AGL_STD
 from orthonav.register.registrar import PosePrior
 from orthonav.register.scale_map import SIGMAS, ScaleMap
@@ -23,6 +23,14 @@ LARGEST_STD = 0.3
 Array = NDArray[np.float64]
 
 
+class Terrain(Protocol):
+    """Heights of the ground."""
+
+    def at_en_m(self, points_en_m: ArrayLike) -> Array:
+        """Heights (...) above sea level at points (..., 2), metres east and north; NaN where
+        unknown."""
+
+
 class LevelTerrain:
     """Level ground at sea level, for views far off nadir over maps without a terrain."""
 
@@ -34,7 +42,7 @@ class LevelTerrain:
 class Relief:
     """The ground of a sheet, for all views. Safe to share between threads."""
 
-    def __init__(self, terrain: TerrainLayer | LevelTerrain, grid: TileGrid) -> None:
+    def __init__(self, terrain: Terrain, grid: TileGrid) -> None:
         self.terrain, self.grid = terrain, grid
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
