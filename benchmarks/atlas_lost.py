@@ -10,11 +10,14 @@ the atlas: every fix of it is wrong.
 import argparse
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
