@@ -1,7 +1,7 @@
-"""From the share of trials that are placed to the share of views that will be.
+"""Recalibration: predicted shares of located views from the shares of trials that were located.
 
-Trials age the map's own imagery; what years do to other ground is more, or less. How much is
-learnt over real scenes of two dates: `python -m benchmarks.check_trust --fit`.
+Trials show the map's own imagery with simulated ageing. Real ground changes more or less than that.
+The relation is fitted to real scenes of two dates: `python -m benchmarks.check_trust --fit`.
 """
 
 import math

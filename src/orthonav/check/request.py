@@ -48,7 +48,7 @@ class CheckRequest:
     `extras`: also try other errors of heading and height, and other heights.
     `workers`: processes; None: one per core.
     `seed`: of the trials.
-    `tilt_std_deg`: standard deviation of the tilt of the camera that is not reported, 0 to 20.
+    `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
     `other_sensor`: the camera differs from the map's sensor by more than years do.
     `recalibration`: of what trials predict.
     `changes`: ground that changed since the map was made, as a flight saw it; optional.

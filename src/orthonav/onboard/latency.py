@@ -44,7 +44,7 @@ AGREE_S, AGREE_SIGMAS = 0.08, 3.0
 """Delays agree within the larger of both."""
 WALK_S, LARGEST_WALK_S = 0.01, 0.1
 """Growth of the standard deviation since the measurement, per square root of a second, and its
-limit: a delay without a sign of change is believed, as a stated one is."""
+limit: a delay without a sign of change stays in use, as a stated one does."""
 DRIFTS, TOO_FAST = 0.008, 0.05
 """Drift (s/s) above which a delay is extrapolated, and above which it is not steady."""
 EXTRAPOLATED_S = 15.0
@@ -144,7 +144,8 @@ class LatencyMonitor:
         """The delay after the position by an image: in doubt where that jumped to a place where the
         aircraft was earlier or later.
 
-        `exposed_ns`: its believed time of exposure. `std_m`: standard deviation of the position.
+        `exposed_ns`: its time of exposure by the delay in use. `std_m`: standard deviation of the
+        position.
         """
         if self._frame is None:
             self._frame = LocalFrame(*latlon_deg)

@@ -47,8 +47,8 @@ class PositionCheck:
         """Growth of the delay (s) by which the position jumped; None where it did not jump, or to a
         place that no change of the delay explains. The position counts for the next ones.
 
-        `exposed_ns`: believed time of exposure. `en_m` (2,): metres east and north, `std_m` their
-        standard deviation.
+        `exposed_ns`: time of exposure by the delay in use. `en_m` (2,): metres east and north,
+        `std_m` their standard deviation.
         """
         now = _Place(exposed_ns, en_m, std_m)
         while len(self._places) > 1 and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
