@@ -37,14 +37,22 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     coarse = parser.add_argument_group("coarse tiles, for views without a prior")
     coarse.add_argument(
-        "--coarse-gsd-m", type=float, help="ground resolution, metres per pixel (default 8)"
+        "--coarse-gsd-m",
+        type=float,
+        help="ground resolution of coarse tiles, metres per pixel (default 8)",
     )
-    coarse.add_argument("--coarse-tile-px", type=int, help="width of a tile (default 128)")
+    coarse.add_argument("--coarse-tile-px", type=int, help="width of a coarse tile (default 128)")
     coarse.add_argument(
-        "--coarse-overlap", type=float, metavar="SHARE", help="overlap of tiles (default 0.875)"
+        "--coarse-overlap",
+        type=float,
+        metavar="SHARE",
+        help="overlap of neighbouring coarse tiles, as a share of their width (default 0.875)",
     )
     coarse.add_argument(
-        "--no-coarse", dest="coarse", action="store_false", help="omit the coarse tiles"
+        "--no-coarse",
+        dest="coarse",
+        action="store_false",
+        help="omit the coarse tiles, from which the search index is made",
     )
     coarse.add_argument(
         "--no-index",

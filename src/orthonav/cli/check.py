@@ -1,4 +1,4 @@
-"""`orthonav check`: before take-off, where can views be placed and can a route be flown?"""
+"""`orthonav check`: predict before take-off where views will be localized along a route."""
 
 import argparse
 import logging
@@ -105,7 +105,7 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
         "--heading",
         choices=("known", "unknown"),
         default="known",
-        help="known: to --yaw-std-deg (default); unknown: all headings are tried",
+        help="known: with an error of --yaw-std-deg (default); unknown: all headings are tried",
     )
     group.add_argument(
         "--agl-std",

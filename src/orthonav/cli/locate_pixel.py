@@ -13,7 +13,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         "The 95 % ellipse is rather too large than too small; it holds no error of the terrain, "
         "nor the height of houses and trees."
     )
-    parser.add_argument("fixes", type=Path, metavar="fixes.jsonl", help="of `orthonav localize`")
+    parser.add_argument(
+        "fixes", type=Path, metavar="fixes.jsonl", help="fixes, as written by `orthonav localize`"
+    )
     parser.add_argument("frame", metavar="FRAME", help="name of the view, as in the file")
     parser.add_argument("x", type=float, metavar="X", help="pixels from the left border")
     parser.add_argument("y", type=float, metavar="Y", help="pixels from the upper border")

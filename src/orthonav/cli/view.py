@@ -60,7 +60,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default=LOOPBACK,
-        help=f"address to listen at (default {LOOPBACK}: this computer only)",
+        help=f"address to listen on (default {LOOPBACK}: this computer only)",
     )
     parser.add_argument(
         "--no-browser", action="store_true", help="print the address without opening a browser"
