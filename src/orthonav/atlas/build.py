@@ -51,7 +51,7 @@ GIVE_UP_AFTER = 8
 SCRATCH = "orthonav-sheet-"
 """Names of temporary folders begin with it."""
 _LOCK = "in-use"
-LEARNT = ("autoencoder", "triplet")
+LEARNT = ("autoencoder", "caevl", "triplet")
 """Methods for which a worker is given a GPU."""
 
 

@@ -1,7 +1,7 @@
 """Position, height, heading, pitch and roll of a camera from blocks of a registered view.
 
 Resection by linearized least squares: each block of the view pulls towards where it lies on the map
-(`orthonav.register.refine.BlockPulls`), the telemetry holds height and attitude within their
+(`orthonav.register.refine.Refiner.pulls`), the telemetry holds height and attitude within their
 standard deviations. Blocks that pull against the others count less (Huber).
 """
 

@@ -125,7 +125,7 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             if prior is None
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
-        "tilt that is not reported": f"{conditions.tilt_std_deg:g}° (standard deviation)",
+        "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)",
         "sensor": (
             "differs from the map's by more than years do (assumed)"
             if conditions.other_sensor
