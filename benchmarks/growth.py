@@ -230,6 +230,7 @@ def plot(curves: Sequence[Curve], path: Path) -> Path:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     columns = min(len(curves), 4)
     rows = math.ceil(len(curves) / columns)
@@ -241,6 +242,11 @@ def plot(curves: Sequence[Curve], path: Path) -> Path:
         axis.loglog(curve.x, first, "o-", label=f"{curve.labels[0]}, slope {curve.slope:.2f}")
         axis.loglog(curve.x, second, "o--", label=curve.labels[1])
         axis.set(xlabel=curve.title, ylabel=curve.unit)
+        axis.set_xticks(curve.x, labels=[f"{each:g}" for each in curve.x])
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.yaxis.set_major_formatter("{x:,g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_minor_formatter(NullFormatter())
         axis.grid(alpha=0.3, which="both")
         axis.legend(fontsize=8)
     for axis in axes.flat[len(curves) :]:
