@@ -217,7 +217,8 @@ def test_a_channel_that_shows_nothing_adds_nothing_aside(monkeypatch, channel, o
         evidence[..., :3] = rng.normal(0, unit, (*evidence.shape[:2], 3))
     (window.made if of_map else values)[..., channel] = 0
     monkeypatch.setattr(MapWindow, "of", lambda *_: window)
-    made = template.Template(0, values, (1.0, 0.6), FINE)
+    planes = np.ascontiguousarray(np.moveaxis(values, -1, 0))
+    made = template.Template(0, planes, (1.0, 0.6), FINE)
     one, other = both(
         monkeypatch, lambda: sharpness._moved_scores(made, None, Pose(35.0, 30.0, 0.0, 0.0))
     )
