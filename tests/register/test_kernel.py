@@ -46,12 +46,18 @@ def views(count, seed, level, view_valid=None):
         yield made, Pose(pose.x_px + 2, pose.y_px - 1, pose.turn_rad + 0.03, pose.log_scale - 0.02)
 
 
+def valid_but_a_corner(whole):
+    """Which pixels of a view (96, 128) are valid: all, or all but its upper right corner."""
+    valid = np.ones((96, 128), bool)
+    valid[:40, 90:] = whole
+    return valid
+
+
 @needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
-    view_valid = np.ones((96, 128), bool)
-    view_valid[:40, 90:] = whole
+    view_valid = valid_but_a_corner(whole)
 
     def work():
         found = []
@@ -99,8 +105,7 @@ def test_curvatures_are_the_same(monkeypatch):
 
 @needs_kernel
 def test_derivatives_are_the_same():
-    view_valid = np.ones((96, 128), bool)
-    view_valid[:40, 90:] = False
+    view_valid = valid_but_a_corner(False)
     made, _ = next(views(1, 3, 0, view_valid))
     along = np.moveaxis(made.gradients, (0, 1), (3, 2))  # (H, W, 2, 3)
     slopes = made.slopes.reshape(*made.mask.shape, 2, 4)
@@ -153,8 +158,7 @@ def test_other_arrays_are_refused(damage):
 @pytest.mark.parametrize("cached", [True, False])
 def test_what_a_covariance_is_made_of_is_the_same(reference, monkeypatch, level, whole, cached):
     monkeypatch.setattr(reference, "caches", lambda _: cached)
-    view_valid = np.ones((96, 128), bool)
-    view_valid[:40, 90:] = whole
+    view_valid = valid_but_a_corner(whole)
     made, window = [], []
     for template_, pose in views(12, 6, level, view_valid):
         made.append((Refiner(template_, reference), pose))
@@ -190,8 +194,7 @@ def test_sums_at_a_pose_beyond_all_bounds_touch_no_memory(pose):
 @pytest.mark.parametrize("cached", [True, False])
 def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole, cached):
     monkeypatch.setattr(reference, "caches", lambda _: cached)
-    view_valid = np.ones((96, 128), bool)
-    view_valid[:40, 90:] = whole
+    view_valid = valid_but_a_corner(whole)
     seen = list(views(12, 8, level, view_valid))
 
     def work():
