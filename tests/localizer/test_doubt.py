@@ -46,6 +46,9 @@ class Registrar:
         assert level <= levels.coarse  # candidates from above are compared at the coarse level
         return ["a place"]
 
+    def direct(self, *_):
+        return ["a place found at the final level"]
+
     def standing(self, *_):
         return 60.0, 60.0 / self._ratio
 
@@ -65,12 +68,14 @@ class Confidence:
 
 def searched(
     monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math.inf, *,
-    level=LOOK, from_tiles=False, learnt=True, ratio=1.0,
+    level=LOOK, from_tiles=False, learnt=True, ratio=1.0, last_level=None,
 ):  # fmt: skip
     """Searches that were run, candidates finished and whether they were compared one level finer,
     and the place found, where one finishing after the other has these confidences."""
     registrar, ran = Registrar(confidences, ratio), []
     searches = [Search(level, [(0.0, 0.0)], from_tiles, 8, cost_ms) for cost_ms in costs_ms]
+    if last_level is not None:
+        searches[-1] = replace(searches[-1], level=last_level)
     monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
     view = SimpleNamespace(
         levels=Levels(LOOK + 1, LOOK, final), prior=PosePrior(0.0, 0.1, 0.1), templates=None
@@ -114,15 +119,30 @@ def test_a_budget_leaves_it_out(monkeypatch):
     assert finished == [(3, False)] and found.cut_short
 
 
-def test_a_trial_before_an_expensive_search_can_make_it_needless(monkeypatch):
-    ran, finished, found = searched(monkeypatch, [0.999], costs_ms=(50.0, 300.0))
-    assert (ran, finished, found) == ([50.0], [(3, True)], Found(0.999))
+@pytest.mark.parametrize(
+    ("confidences", "kept"), [([0.999], [(3, False)]), ([0.9, 0.999], [(3, False), (3, True)])]
+)
+def test_a_trial_before_an_expensive_search_can_make_it_needless(monkeypatch, confidences, kept):
+    """First as candidates are finished, then compared one level finer."""
+    ran, finished, found = searched(monkeypatch, confidences, costs_ms=(50.0, 300.0))
+    assert (ran, finished, found) == ([50.0], kept, Found(0.999))
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.995])
 def test_where_it_proves_too_little_the_search_goes_on(monkeypatch, confidence):
-    ran, finished, _ = searched(monkeypatch, [confidence, 0.995], costs_ms=(50.0, 300.0))
-    assert (ran, finished) == ([50.0, 300.0], [(3, True), (3, False)])
+    ran, finished, _ = searched(monkeypatch, [confidence] * 2 + [0.995], costs_ms=(50.0, 300.0))
+    assert (ran, finished) == ([50.0, 300.0], [(3, False), (3, True), (3, False)])
+
+
+@pytest.mark.parametrize(("confidence", "number"), [(0.995, 1), (0.98, 2)])
+def test_the_final_level_is_searched_only_for_a_place_in_doubt(monkeypatch, confidence, number):
+    """However cheap that search is, and without a finer level."""
+    costs_ms = 5.0, 2.0
+    ran, finished, _ = searched(
+        monkeypatch, [confidence, 0.995], costs_ms=costs_ms, last_level=LOOK - 1
+    )
+    assert ran == list(costs_ms[:number])
+    assert finished == [(3, False)] * number
 
 
 @pytest.mark.parametrize("changes", [{"from_tiles": True}, {"level": LOOK + 1}])
@@ -132,6 +152,13 @@ def test_where_few_places_were_compared_it_must_stand_out_too(monkeypatch, chang
     assert ran == list(costs_ms)
     ran, *_ = searched(monkeypatch, [0.999], costs_ms=costs_ms, ratio=1.3, **changes)
     assert ran == [50.0]
+
+
+def test_a_place_that_does_not_stand_out_is_not_compared_one_level_finer(monkeypatch):
+    _, finished, _ = searched(
+        monkeypatch, [0.999, 0.999], costs_ms=(50.0, 300.0), ratio=1.2, from_tiles=True
+    )
+    assert finished == [(3, False)] * 2
 
 
 def test_a_place_that_stands_out_ends_the_search_unless_few_places_were_compared(monkeypatch):

@@ -53,6 +53,23 @@ def test_where_the_coarse_level_takes_too_long_the_level_above_is_searched():
     assert search.level == LEVELS.coarse  # the first search is run whatever it costs
 
 
+@pytest.mark.parametrize(("pose_ms", "left_out"), [(0.5, False), (8.0, True)])
+def test_the_last_stage_is_left_out_where_it_is_dear(pose_ms, left_out):
+    """Poses far from the telemetry are tried at the judged level only where that is cheap."""
+    prior = PosePrior(0.5, math.radians(10.0), 0.1)
+    searches = DEFAULT_PLAN.searches(
+        LEVELS, prior, lambda level, poses: poses * (0.01, pose_ms, 0.01)[level], lambda: (0, 0)
+    )
+    nats = [
+        prior.nats(*pose, within=(math.radians(3.0), 0.045))
+        for search in searches
+        if search.level == LEVELS.look
+        for pose in search.poses
+    ]
+    least = DEFAULT_PLAN.stages_nats[-2]
+    assert (max(nats) <= least) == left_out and max(nats) > 1.5
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that only moves when advanced, s."""

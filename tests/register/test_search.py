@@ -17,7 +17,14 @@ from scenes import (
 
 from orthonav.register.evidence import FINE
 from orthonav.register.pose import Pose
-from orthonav.register.search import Bank, SearchWindow, bank, best_near, search
+from orthonav.register.search import (
+    Bank,
+    SearchWindow,
+    bank,
+    best_near,
+    largest_half_px,
+    search,
+)
 from orthonav.register.template import Template
 
 SHAPE = (384, 448)
@@ -153,6 +160,26 @@ def test_no_middle_is_sought_in_the_margin(reference):
         pose = Pose(x_px, 2 * (20 + 60.0), 0.4, 0.0)
         best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]
         assert (apart_px(best.pose, pose) / 2**LEVEL < 0.25) == inside
+
+
+@pytest.mark.parametrize("by_kernel", [True, False])
+def test_a_window_as_small_as_a_view_allows_gives_the_same(monkeypatch, reference, by_kernel):
+    """No middle sought sees across the border, however its view is turned and scaled."""
+    if not by_kernel:
+        monkeypatch.setattr("orthonav.register.search.KERNEL", None)
+    made, margin_px, poses = reference.window(LEVEL, 20, 30, 90, 84), 27, ALL_TURNS.poses[::3]
+    poses += [(turn, 0.2) for turn, _ in poses]
+    template = templates_of(GROUND, Pose(150.0, 130.0, 0.4, 0.1)).at(LEVEL)
+    half_px = largest_half_px(template, poses)
+    assert half_px > margin_px
+    small = SearchWindow(made, LEVEL, 20, 30, 55, margin_px, half_px)
+    large = SearchWindow(made, LEVEL, 20, 30, 55, margin_px, 200)
+    assert max(small.size) < 90 + 55 and min(large.size) >= 400
+    found, expected = (search(template, window, poses, 6) for window in (small, large))
+    assert len(found) == len(expected) > 2
+    for one, other in zip(found, expected, strict=True):
+        assert one.score == pytest.approx(other.score, rel=1e-4)
+        assert apart_px(one.pose, other.pose) < 0.05 and one.pose.turn_rad == other.pose.turn_rad
 
 
 def test_a_view_over_the_border_of_the_sheet(window):

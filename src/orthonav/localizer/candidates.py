@@ -15,7 +15,7 @@ from orthonav.mapfile.manifest import SheetInfo
 from orthonav.records import PRIOR_SIGMAS, Prior
 from orthonav.register.pose import rotation
 from orthonav.register.registrar import Registrar
-from orthonav.register.search import Candidate, search
+from orthonav.register.search import Candidate, largest_half_px, search
 from orthonav.search.exact import rows_within
 
 
@@ -128,13 +128,14 @@ class ViewCandidates:
         """The best places of the sheet, or of what the prior allows, at the level of a search."""
         view, level = self.view, run.level
         recipe = view.levels.recipe(level)
+        template = view.templates.at(level, recipe)
         if self.prior is None:
             window = self.registrar.whole_window(level, recipe, view.side_px)
         else:
+            half_px = largest_half_px(template, run.poses)
             window = self.registrar.part_window(
-                level, recipe, view.side_px, self.middle_px, self.reach_px
+                level, recipe, view.side_px, self.middle_px, self.reach_px, half_px
             )
-        template = view.templates.at(level, recipe)
         # Every thread has memory for a whole window.
         fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
         pool = self.pool if fits else None

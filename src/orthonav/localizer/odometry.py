@@ -14,7 +14,7 @@ from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Levels, PosePrior, Registrar
-from orthonav.register.search import bank, search
+from orthonav.register.search import bank, largest_half_px, search
 from orthonav.register.template import ViewTemplates
 from orthonav.track import CameraDisplacement
 
@@ -312,8 +312,16 @@ def _registered(
     level = levels.coarse
     recipe = levels.recipe(level)
     registrar = before.registrar
-    window = registrar.part_window(level, recipe, side_px, before.middle_px, reach + 2.0 * 2**level)
-    candidates = search(templates.at(level, recipe), window, poses, CANDIDATES)
+    template = templates.at(level, recipe)
+    window = registrar.part_window(
+        level,
+        recipe,
+        side_px,
+        before.middle_px,
+        reach + 2.0 * 2**level,
+        largest_half_px(template, poses),
+    )
+    candidates = search(template, window, poses, CANDIDATES)
     if not candidates:
         return None
     judged = registrar.judged(templates, levels, candidates, level, prior)

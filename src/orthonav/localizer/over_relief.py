@@ -23,7 +23,7 @@ from orthonav.register.registrar import (
     Registrar,
     apart_px,
 )
-from orthonav.register.search import search
+from orthonav.register.search import largest_half_px, search
 from orthonav.register.template import ViewTemplates
 
 RIVAL_SHARE = 0.75
@@ -211,15 +211,17 @@ class ViewOverRelief(ViewOnLevelGround):
             return self._searched.get(pose)
         made, levels, side_px = found[0], self.view.levels, self.view.side_px
         recipe = levels.recipe(levels.coarse)
-        window = self.registrar.part_window(
-            levels.coarse, recipe, side_px, (pose.x_px, pose.y_px), NEAR_REACH * side_px
-        )
         poses = [
             (pose.turn_rad + turn, pose.log_scale + scale)
             for turn in NEAR_TURNS_RAD
             for scale in NEAR_SCALES
         ]
         template = made.at(levels.coarse, recipe)
+        place, reach_px = (pose.x_px, pose.y_px), NEAR_REACH * side_px
+        half_px = largest_half_px(template, poses)
+        window = self.registrar.part_window(
+            levels.coarse, recipe, side_px, place, reach_px, half_px
+        )
         for near in search(template, window, poses, 1, self.view.prior.scale_map):
             best = max(best, self._refined(near.pose, made), key=lambda each: each.score)
         self._searched[pose] = best

@@ -96,6 +96,9 @@ class SearchPlan:
     off the corners of the bank, where heading and scale are both far off."""
     stages_nats: tuple[float, ...] = (-1.0, 0.4, 2.0, math.inf)
     """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
+    last_stage_ms: float = 60.0
+    """The last stage, poses that one view in seven has, is left out where it would cost more: the
+    coarse level has tried them; docs/decisions/registration.md, 18."""
     candidates: int = 24
     """Candidates of a search by FFT at the coarse level."""
     far_candidates: int = 400
@@ -241,8 +244,10 @@ class SearchPlan:
         if judged_ms <= max(self.last_ms, self.cheap_ms):
             for least, most in pairwise(self.stages_nats):
                 stage = [pose for pose, nats in fine if least < nats <= most]
+                cost_ms = fft_ms(levels.look, len(stage))
+                if most == self.stages_nats[-1] and cost_ms > self.last_stage_ms:
+                    break
                 if stage:
-                    cost_ms = fft_ms(levels.look, len(stage))
                     yield Search(levels.look, stage, False, self.stage_candidates, cost_ms)
         final = self._poses(prior, self.final_turn_step_rad, self.final_scale_step)
         final_ms = fft_ms(levels.final, len(final))

@@ -325,7 +325,7 @@ class _Pixels:
     def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
         planes, valid = sampled_planes(template, window, pose)
         seen = Comparison(template, pose, compared(template, planes, valid, slopes=False))
-        self.seen, self._template = seen, template
+        self.seen = seen
         self.counts = template.mask * (valid > FULLY_VALID)
         self.map = planes * self.counts
         self._view = template.channels * self.counts
@@ -338,10 +338,10 @@ class _Pixels:
 
     def observed(self) -> NDArray[np.float64]:
         """Products (4, 4) of the view's derivatives by the steps and the map's."""
-        mine = self._template.gradients
+        mine = self.seen.template.gradients
         theirs = gradients(self.map, self.counts)
         theirs *= np.repeat(self.seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
-        x, y = from_middle(*self._template.mask.shape)
+        x, y = from_middle(*self.seen.template.mask.shape)
         rows, cols = (np.stack([np.ones(each.size, np.float32), each.ravel()]) for each in (y, x))
         sums = np.empty((2, 4, 2, 2))  # of the view along x and y, of the map by the steps
         for at in range(2):
@@ -361,8 +361,8 @@ class _Pixels:
 
     def sums_by_block(self) -> NDArray[np.float64]:
         """`SpreadSums.blocks`."""
-        terms = by_steps(np.einsum("cphw,chw->phw", self._template.gradients, self.residual))
+        terms = by_steps(np.einsum("cphw,chw->phw", self.seen.template.gradients, self.residual))
         products = self._view * self.map
         kinds = [products[group].sum(axis=0) for group in GROUPS]
         each = np.stack([*terms, *kinds, self.counts])
-        return self._template.block_sums(each).astype(np.float64).T
+        return self.seen.template.block_sums(each).astype(np.float64).T

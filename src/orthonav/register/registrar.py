@@ -246,8 +246,12 @@ class Registrar:
         view_px: float,
         centre_px: tuple[float, float],
         reach_px: float,
+        half_px: int | None = None,
     ) -> SearchWindow:
-        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y)."""
+        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y).
+
+        `half_px`: see `SearchWindow`.
+        """
         unit = 2.0**level
         margin = math.ceil(view_px / 2 / unit)
         rows, cols = self.reference.shape(level)
@@ -260,7 +264,7 @@ class Registrar:
             size.append(max(last - first, 1) + 2 * margin)
         made = self.reference.window(level, low[1], low[0], size[1], size[0], recipe)
         side = _rounded_side(view_px / unit)
-        return SearchWindow(made, level, low[1], low[0], side, margin)
+        return SearchWindow(made, level, low[1], low[0], side, margin, half_px)
 
     def nearby(
         self,

@@ -92,18 +92,30 @@ class SearchWindow:
 
     (`row`, `col`) is its first pixel on that level of the sheet; `view_px` about the side of the
     views that will be laid on it; within `margin_px` of the border no middle of a view is sought.
+    `half_px`: the largest `posed_half_px` of these views; None: not known yet.
     """
 
     def __init__(
-        self, made: Array, level: int, row: int, col: int, view_px: int, margin_px: int = 0
+        self,
+        made: Array,
+        level: int,
+        row: int,
+        col: int,
+        view_px: int,
+        margin_px: int = 0,
+        half_px: int | None = None,
     ) -> None:
         self.level, self.row, self.col, self.margin_px = level, row, col, margin_px
         self.height, self.width = made.shape[:2]
-        # Beyond the border the other side shows: harmless where the window is far larger.
-        pad = view_px if min(self.height, self.width) < 3 * view_px else 0
+        if half_px is None:
+            # Beyond the border the other side shows: harmless where the window is far larger.
+            pad, least = view_px if min(self.height, self.width) < 3 * view_px else 0, view_px
+        else:
+            # A view reaches so far beyond the border; beyond it is nothing.
+            pad, least = max(half_px - margin_px, 0), 2 * half_px
         self.size = (
-            next_fast_len(max(self.height + pad, view_px), real=True),
-            next_fast_len(max(self.width + pad, view_px), real=True),
+            next_fast_len(max(self.height + pad, least), real=True),
+            next_fast_len(max(self.width + pad, least), real=True),
         )
         self._made, self._view_px = made, view_px
 
@@ -357,6 +369,11 @@ class _Scratch:
 def posed_half_px(template: Template, log_scale: float) -> int:
     """Half the side of the square in which a template fits under any turn."""
     return math.ceil(math.exp(log_scale) * math.hypot(*template.mask.shape) / 2) + 1
+
+
+def largest_half_px(template: Template, poses: Sequence[tuple[float, float]]) -> int:
+    """The largest `posed_half_px` of a template under poses (turn, log scale)."""
+    return posed_half_px(template, max(log_scale for _, log_scale in poses))
 
 
 def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
