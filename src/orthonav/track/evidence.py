@@ -13,6 +13,7 @@ from orthonav.track.model import (
     Model,
     ReportedAttitude,
     Sighting,
+    log_densities,
     log_density,
     measurement,
 )
@@ -21,6 +22,8 @@ TRUSTED = (0.1, 0.5)
 """Views with a probability of their own below the first do not count, above the second fully."""
 MOST_OF_ONE = 0.75
 """A single view counts at most so much: less than `CONFIRMED`."""
+ROWS, COLUMNS = np.ix_(SEEN[:4], SEEN[:4])
+"""Rows and columns of position, heading and scale in a covariance of the state."""
 POSE = slice(2, 4)
 """Heading and scale in a measurement."""
 SEARCHED_SIGMAS = 6.0
@@ -91,20 +94,20 @@ def tempered(
 
 
 def recognition(
-    seen: Measurement, covariance: Array, innovation: Array, most_agreement: float
-) -> float:
-    """Probability that a view showed the map, given its place and the prediction of that.
+    seen: Measurement, covariances: Array, innovations: Array, most_agreement: float
+) -> Array:
+    """Probabilities (K,) that a view showed the map, given its place and predictions of that.
 
-    `covariance` (8, 8): of the prediction. `most_agreement`: see `Model`. The odds by the view
-    alone, times the likelihood ratio of the innovation (6,) in position, heading and scale between
-    a right place and one that chance finds in the area searched. A place within the gate is never
-    less likely for its distance.
+    `covariances` (K, 8, 8): of the predictions. `most_agreement`: see `Model`. The odds by the view
+    alone, times the likelihood ratio of the innovations (K, 6) in position, heading and scale
+    between a right place and one that chance finds in the area searched. A place within the gate is
+    never less likely for its distance.
     """
-    spread = covariance[np.ix_(SEEN[:4], SEEN[:4])] + seen.own_noise[:4, :4]
-    ratio = log_density(innovation[:4], spread) - seen.log_chance
-    agreement = math.exp(min(max(ratio, 0.0), math.log(most_agreement)))
+    spreads = covariances[:, ROWS, COLUMNS] + seen.own_noise[:4, :4]
+    ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
+    agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
     odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
-    return odds / (1 + odds)
+    return np.asarray(odds / (1 + odds))
 
 
 def confirmed_ground(alone: float, ground: float) -> float:

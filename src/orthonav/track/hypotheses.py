@@ -23,6 +23,7 @@ NORTH_STEP_M = 100.0
 """Length over which the convergence of two planes is measured."""
 COMPARED = [0, 1, 2, 3, 6, 7]
 """Components that decide whether two hypotheses are alike: position, velocity and tilt."""
+ROWS, COLUMNS = np.ix_(COMPARED, COMPARED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +55,8 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
     """Hypotheses, most likely first, with similar ones merged and the unlikely ones dropped."""
     likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
     left = likely or ordered[:1]  # the last one stays, however unlikely
-    means = np.stack([each.mean[COMPARED] for each in left])
-    covariances = np.stack([each.covariance[np.ix_(COMPARED, COMPARED)] for each in left])
+    means = np.array([each.mean for each in left])[:, COMPARED]
+    covariances = np.array([each.covariance for each in left])[:, ROWS, COLUMNS]
     numbers = np.arange(len(left))
     out: list[Hypothesis] = []
     while len(numbers) and len(out) < MAX_HYPOTHESES:
@@ -110,13 +111,15 @@ def _divergence(means: Array, covariances: Array) -> Array:
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """Mean (8,) and covariance (8, 8) of several hypotheses as one Gaussian."""
+    """Mean (8,) and covariance (8, 8) of several hypotheses as one Gaussian; not to be changed."""
+    if len(group) == 1:
+        return group[0].mean, group[0].covariance
     shares = np.array([each.share for each in group])
     shares = shares / shares.sum()
-    means = np.stack([each.mean for each in group])
+    means = np.array([each.mean for each in group])
     mean = shares @ means
     off = means - mean
-    covariance = sum(s * each.covariance for s, each in zip(shares, group, strict=True))
+    covariance = np.tensordot(shares, np.array([each.covariance for each in group]), axes=1)
     return mean, np.asarray(covariance + (off * shares[:, None]).T @ off)
 
 
@@ -139,7 +142,7 @@ def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
 
 def distance(one: Hypothesis, other: Hypothesis) -> float:
     """Metres between the positions of two hypotheses."""
-    return float(np.hypot(*(one.mean[POSITION] - other.mean[POSITION])))
+    return math.dist(one.mean[POSITION], other.mean[POSITION])
 
 
 def within(mean: Array, covariance: Array, radius_m: float, middle: Array | None = None) -> float:
@@ -147,8 +150,8 @@ def within(mean: Array, covariance: Array, radius_m: float, middle: Array | None
 
     Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
     """
-    variance = float(np.trace(covariance[POSITION, POSITION])) / 2
-    away = 0.0 if middle is None else float(np.hypot(*(mean[POSITION] - middle)))
+    variance = float(covariance[0, 0] + covariance[1, 1]) / 2
+    away = 0.0 if middle is None else math.dist(mean[POSITION], middle)
     if away > radius_m + 3 * math.sqrt(variance):
         return 0.0
     return 1 - math.exp(-(radius_m**2) / (2 * variance + away**2 + 1e-9))

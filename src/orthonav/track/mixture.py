@@ -32,11 +32,14 @@ from orthonav.track.model import (
     BIASES,
     POSITION,
     SEEN,
+    SEEN_COLUMNS,
+    SEEN_ROWS,
     STATE,
     Array,
     Model,
     ReportedAttitude,
     Sighting,
+    log_densities,
     log_density,
     updated,
 )
@@ -296,24 +299,22 @@ class Mixture:
             tempered(self.model, mounts, (self.area_m2, searched_m2), reported, each, newness)
             for each in sightings
         ]
+        starts = []
         for each in self.hypotheses:
             in_search = self._on_map(each.mean)
             if searched is not None:
-                in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
+                in_search &= math.dist(each.mean[:2], searched[0]) < searched[1]
             miss = missed_again if each.followed else missed
             share = each.share * (miss if in_search else 1.0)
             each = replace(each, uncounted=min(each.uncounted + ground, 1.0))
             made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
-            for start in self._with_bias_jump(each):
-                for seen in measurements:
-                    split = self._updated(start, seen, ground, confirms)
-                    if split is not None:
-                        made.append(replace(split, share=split.share * found))
-        made += [born for each in measurements for born in self._born(each, confirms)]
-        total = sum(each.share for each in made) + self.elsewhere
-        self.elsewhere /= total
-        made = [replace(each, share=each.share / total) for each in made]
-        self.hypotheses = merged(sorted(made, key=lambda each: -each.share))
+            starts += self._with_bias_jump(each)
+        for seen in measurements:
+            made += self._updated(starts, seen, found, ground, confirms)
+            made += self._born(seen, confirms)
+        self.hypotheses = made
+        self._settle()
+        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
         self._settle()
         shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
         confirmed = self._state is not State.SEARCHING
@@ -426,38 +427,56 @@ class Mixture:
         return [replace(each, share=each.share * (1 - rare)), other]
 
     def _updated(
-        self, each: Hypothesis, seen: Measurement, ground: float, confirms: bool
-    ) -> Hypothesis | None:
-        """The hypothesis after a measurement; None where that lies outside the gate.
+        self,
+        starts: Sequence[Hypothesis],
+        seen: Measurement,
+        found: float,
+        ground: float,
+        confirms: bool,
+    ) -> Iterator[Hypothesis]:
+        """Hypotheses after a measurement, without those for which it lies outside the gate.
 
-        `ground`: share of the view that the last one did not show. `confirms`: see `update`.
+        `found`: probability that a view is found. `ground`: share of the view that the last one did
+        not show. `confirms`: see `update`.
         """
-        innovation = seen.mean - each.mean[SEEN]
-        reach = np.trace(each.covariance[:2, :2]) + np.trace(seen.noise[:2, :2])
-        if innovation[:2] @ innovation[:2] > GATE * reach:
-            return None
-        spread = each.covariance[np.ix_(SEEN, SEEN)] + seen.noise
-        log_weight = seen.log_odds + log_density(innovation, spread)
-        mean, covariance = updated(each.mean, each.covariance, innovation, spread)
-        shown = recognition(seen, each.covariance, innovation, self.model.most_agreement)
-        sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
-        if shown >= RECOGNIZED:
-            # Only of a track that was confirmed: chance has many views to agree with a new one.
-            shown_anew = uncounted if each.followed else ground
-            counted = confirmed_ground(seen.alone, shown_anew) if confirms else 0.0
-            sighted = min(each.sighted + counted, MOST_SIGHTED)
-            uncounted = 0.0 if counted else uncounted
-        self._numbers += 1
-        return replace(
-            each,
-            share=each.share * math.exp(min(log_weight, 60.0)),
-            mean=mean,
-            covariance=covariance,
-            sighted=sighted,
-            uncounted=uncounted,
-            number=self._numbers,
-            recognized=shown,
+        near = [each for each in starts if self._is_near(each, seen)]
+        if not near:
+            return
+        # All at once: each is small, and calls of NumPy take longer than what they compute.
+        before = np.array([each.covariance for each in near])
+        innovations = np.array([seen.mean - each.mean[SEEN] for each in near])
+        spreads = before[:, SEEN_ROWS, SEEN_COLUMNS] + seen.noise
+        log_weights = (seen.log_odds + log_densities(innovations, spreads)).tolist()
+        means, covariances = updated(
+            np.array([each.mean for each in near]), before, innovations, spreads
         )
+        shown = recognition(seen, before, innovations, self.model.most_agreement).tolist()
+        for number, each in enumerate(near):
+            sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
+            if shown[number] >= RECOGNIZED:
+                # Only of a track that was confirmed: chance has many views to agree with a new one.
+                shown_anew = uncounted if each.followed else ground
+                counted = confirmed_ground(seen.alone, shown_anew) if confirms else 0.0
+                sighted = min(each.sighted + counted, MOST_SIGHTED)
+                uncounted = 0.0 if counted else uncounted
+            self._numbers += 1
+            yield replace(
+                each,
+                share=each.share * math.exp(min(log_weights[number], 60.0)) * found,
+                mean=means[number].copy(),  # a history of views must not keep them all
+                covariance=covariances[number].copy(),
+                sighted=sighted,
+                uncounted=uncounted,
+                number=self._numbers,
+                recognized=shown[number],
+            )
+
+    @staticmethod
+    def _is_near(each: Hypothesis, seen: Measurement) -> bool:
+        """Whether a measurement lies within the gate of a hypothesis."""
+        variances = each.covariance[0, 0] + each.covariance[1, 1]
+        reach = variances + seen.noise[0, 0] + seen.noise[1, 1]
+        return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
         """Mean (8,) and covariance (8, 8) of a state that may be anywhere on the map."""
@@ -476,7 +495,7 @@ class Mixture:
         """The hypotheses born from the belief elsewhere, at a measurement. `confirms`: see
         `update`."""
         for share, mean, covariance in self._mounts():
-            spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
+            spread = covariance[SEEN_ROWS, SEEN_COLUMNS] + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
             log_weight += log_density(seen.mean[2:], spread[2:, 2:])
             mean, covariance = updated(mean, covariance, seen.mean, spread)

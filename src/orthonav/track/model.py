@@ -27,6 +27,8 @@ TILT_WALK_SHARE = 1 / 30
 by as much."""
 SEEN = [0, 1, 4, 5, 6, 7]
 """Components of the state that a sighting measures."""
+SEEN_ROWS, SEEN_COLUMNS = np.ix_(SEEN, SEEN)
+"""Their rows and columns in a covariance."""
 
 
 @dataclass(frozen=True)
@@ -181,13 +183,21 @@ def measurement(
 def updated(
     mean: Array, covariance: Array, innovation: Array, spread: Array
 ) -> tuple[Array, Array]:
-    """Kalman update: posterior mean and covariance, by an innovation (6,) and its covariance."""
-    gain = np.linalg.solve(spread, covariance[SEEN]).T
-    after = covariance - gain @ spread @ gain.T
-    return mean + gain @ innovation, (after + after.T) / 2
+    """Kalman update: posterior mean (.., 8) and covariance (.., 8, 8), by an innovation (.., 6) and
+    its covariance (.., 6, 6)."""
+    gain = np.linalg.solve(spread, covariance[..., SEEN, :]).swapaxes(-1, -2)
+    after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
+    moved = mean + (gain @ innovation[..., None])[..., 0]
+    return moved, (after + after.swapaxes(-1, -2)) / 2
+
+
+def log_densities(off: Array, spread: Array) -> Array:
+    """Natural logarithms (..) of the densities of Gaussians (.., N, N) at `off` (.., N)."""
+    _, log_det = np.linalg.slogdet(2 * math.pi * spread)
+    weighted = np.linalg.solve(spread, off[..., None])[..., 0]
+    return np.asarray(-0.5 * ((off * weighted).sum(axis=-1) + log_det))
 
 
 def log_density(off: Array, spread: Array) -> float:
-    """Natural logarithm of a Gaussian's density at `off` (N,)."""
-    _, log_det = np.linalg.slogdet(2 * math.pi * spread)
-    return float(-0.5 * (off @ np.linalg.solve(spread, off) + log_det))
+    """The same of one Gaussian."""
+    return float(log_densities(off, spread))

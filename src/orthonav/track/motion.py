@@ -192,7 +192,9 @@ def velocity_forgotten(model: Model, covariance: Array) -> Array:
 
 def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
     """The same; position and velocity are reset where that is less certain than the map."""
-    if float(np.linalg.eigvalsh(expected.covariance[POSITION, POSITION])[-1]) <= area_m2:
+    spread = expected.covariance[POSITION, POSITION]
+    # The sum of both variances is no less than the larger one of its axes.
+    if spread[0, 0] + spread[1, 1] <= area_m2 or np.linalg.eigvalsh(spread)[-1] <= area_m2:
         return expected
     return expected.without(slice(0, 4), np.repeat([area_m2, model.speed_mps**2], 2))
 
