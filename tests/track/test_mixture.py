@@ -248,6 +248,8 @@ def test_history_of_a_long_flight_stays_small():
     _flown(7, views=60, history=history)
     kept = [len(view) for view in history._views]
     assert np.mean(kept[:-20]) < 4
+    rows = [each.row for view in history._views for each in view.values()]
+    assert len(set(rows)) == len(rows) and max(rows) < 256  # those of dropped ones are used again
 
 
 def test_far_hypotheses_and_gaps_stay_finite():

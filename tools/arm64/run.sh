@@ -54,7 +54,7 @@ kernel=orthonav/register/_kernel
 rm -rf "$work/src" && mkdir "$work/src" && cp -rs "$checkout/src/orthonav" "$work/src/"
 rm -f "$work/src/$kernel".*so
 if command -v aarch64-linux-gnu-gcc >/dev/null; then
-    aarch64-linux-gnu-gcc -O3 -shared -fPIC "-I$work/root/usr/include/$python" \
+    aarch64-linux-gnu-gcc -O3 -fno-math-errno -shared -fPIC "-I$work/root/usr/include/$python" \
         -idirafter "$work/root/usr/include" -o "$work/src/$kernel.abi3.so" \
         -Wno-psabi "$checkout/src/$kernel.c" "$checkout/src/orthonav/register/_search.c" -lm
 else
