@@ -53,12 +53,24 @@ def test_where_the_coarse_level_takes_too_long_the_level_above_is_searched():
     assert search.level == LEVELS.coarse  # the first search is run whatever it costs
 
 
-@pytest.mark.parametrize(("pose_ms", "left_out"), [(0.5, False), (8.0, True)])
-def test_the_last_stage_is_left_out_where_it_is_dear(pose_ms, left_out):
-    """Poses far from the telemetry are tried at the judged level only where that is cheap."""
+@pytest.mark.parametrize(
+    ("pose_ms", "tiles", "coarse_ms", "left_out"),
+    [
+        (0.5, 0, 0.01, False),
+        (8.0, 0, 0.01, True),
+        (8.0, 1000, 5.0, False),  # only tiles were compared
+        (8.0, 0, math.inf, False),  # there is no coarse level
+    ],
+)
+def test_the_last_stage_is_left_out_where_it_is_dear_and_was_tried_at_the_coarse_level(
+    pose_ms, tiles, coarse_ms, left_out
+):
     prior = PosePrior(0.5, math.radians(10.0), 0.1)
     searches = DEFAULT_PLAN.searches(
-        LEVELS, prior, lambda level, poses: poses * (0.01, pose_ms, 0.01)[level], lambda: (0, 0)
+        LEVELS,
+        prior,
+        lambda level, poses: poses * (0.01, pose_ms, coarse_ms, math.inf)[level],
+        lambda: (tiles, 128),
     )
     nats = [
         prior.nats(*pose, within=(math.radians(3.0), 0.045))

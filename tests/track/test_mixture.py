@@ -252,6 +252,26 @@ def test_history_of_a_long_flight_stays_small():
     assert len(set(rows)) == len(rows) and max(rows) < 256  # those of dropped ones are used again
 
 
+def test_history_in_many_blocks_gives_the_same(monkeypatch):
+    """What was smoothed before does not change by later views."""
+    whole, blocks = History(), History()
+    _flown(7, views=20, history=whole)
+    expected = whole.smoothed()
+    monkeypatch.setattr("orthonav.track.smooth.ROWS_OF_BLOCK", 3)
+    mixture = _flown(7, views=20, history=blocks)[1]
+    smoothed = blocks.smoothed()
+    copies = [(each.mean.copy(), each.covariance.copy()) for each in smoothed]
+    for one, other in zip(smoothed, expected, strict=True):
+        np.testing.assert_array_equal(one.mean, other.mean)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+    for _ in range(5):
+        mixture.predict(1.0)
+        blocks.record(mixture)
+    for each, (mean, covariance) in zip(smoothed, copies, strict=True):
+        np.testing.assert_array_equal(each.mean, mean)
+        np.testing.assert_array_equal(each.covariance, covariance)
+
+
 def test_far_hypotheses_and_gaps_stay_finite():
     flight, mixture, _ = flown(8, views=10)
     for seconds in (0.0, 1e-3, 600.0, 1e5):

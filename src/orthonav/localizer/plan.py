@@ -12,8 +12,8 @@ Where the judged level is cheap (a prior, a small sheet) only that one is search
 cheaper of the other two comes first; the next one follows only while the best place does not stand
 out, and only if its estimated cost is acceptable. At the judged level headings and scales come in
 stages, the most likely first, so that an ordinary view ends after the first stage. Where position,
-heading and scale are known so well that the *final level*, one below, is cheap too, it comes last:
-weak texture, such as that of bare ground, is only seen there.
+heading and scale are known so well that the *final level*, one below, is cheap too, it comes last,
+unless a place is proven before: weak texture, such as that of bare ground, is only seen there.
 
 This file decides; `view_search` executes.
 """
@@ -97,8 +97,8 @@ class SearchPlan:
     stages_nats: tuple[float, ...] = (-1.0, 0.4, 2.0, math.inf)
     """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
     last_stage_ms: float = 60.0
-    """The last stage, poses that one view in seven has, is left out where it would cost more: the
-    coarse level has tried them; docs/decisions/registration.md, 18."""
+    """The last stage, poses that one view in seven has, is left out where it would cost more and
+    the coarse level has tried them; docs/decisions/registration.md, 18."""
     candidates: int = 24
     """Candidates of a search by FFT at the coarse level."""
     far_candidates: int = 400
@@ -155,11 +155,11 @@ class SearchPlan:
     """At most so many candidates are placed on the terrain, the best that lie apart."""
     trials: int = 3
     """Before a search that costs more than a trial, so many of the best candidates are placed on
-    the terrain, finished and compared one level finer. The search ends if that proves one;
-    docs/decisions/registration.md, 14."""
+    the terrain and finished, and compared one level finer where that proves none. The search ends
+    if one is proven; docs/decisions/registration.md, 14 and 18."""
     trial_doubt: float = 0.002
     """A trial proves a place with a confidence above one minus this: its rivals were not all
-    searched."""
+    searched. Before the final level they were, and `doubt` counts."""
     trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
     """Where a trial compares only a part of all places, or only a few on the terrain, the place
     must also stand out so far; docs/decisions/registration.md, 14."""
@@ -228,6 +228,7 @@ class SearchPlan:
         rough = [pose for pose, _ in self._poses(prior, self.turn_step_rad, self.scale_step)]
         fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)
         judged_ms = fft_ms(levels.look, len(fine))
+        tried_all = False
         if judged_ms > self.cheap_ms:
             both = [self._coarse(levels, rough, fft_ms)]
             near, dims = tiles()
@@ -240,12 +241,15 @@ class SearchPlan:
             for number, each in enumerate(sorted(both, key=lambda each: each.cost_ms)):
                 if math.isinf(each.cost_ms) or (number and each.cost_ms > affordable):
                     break
+                # Over relief the expected scale is another one at every place.
+                tried_all |= not each.from_tiles and prior.scale_map is None
                 yield each
         if judged_ms <= max(self.last_ms, self.cheap_ms):
             for least, most in pairwise(self.stages_nats):
                 stage = [pose for pose, nats in fine if least < nats <= most]
                 cost_ms = fft_ms(levels.look, len(stage))
-                if most == self.stages_nats[-1] and cost_ms > self.last_stage_ms:
+                is_last = most == self.stages_nats[-1]
+                if is_last and tried_all and cost_ms > self.last_stage_ms:
                     break
                 if stage:
                     yield Search(levels.look, stage, False, self.stage_candidates, cost_ms)
@@ -314,14 +318,19 @@ class Budget:
         self._estimated_ms: float | None = None
         self.cut_short = False
 
+    def fits(self, cost_ms: float) -> bool:
+        """Whether what has an estimated cost would end in time; what comes first always does."""
+        if self._estimated_ms is None:
+            return True
+        spent_ms = 1e3 * (time.monotonic() - self._begun_s)
+        pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
+        return not spent_ms + pace * cost_ms > self._budget_ms  # no time at all takes none
+
     def allows(self, cost_ms: float) -> bool:
-        """Whether a search of an estimated cost would end in time; the first one always may."""
-        if self._estimated_ms is not None:
-            spent_ms = 1e3 * (time.monotonic() - self._begun_s)
-            pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
-            if spent_ms + pace * cost_ms > self._budget_ms:
-                self.cut_short = True
-                return False
+        """Whether to begin a search of an estimated cost; without it, the search is cut short."""
+        if not self.fits(cost_ms):
+            self.cut_short = True
+            return False
         self._estimated_ms = (self._estimated_ms or 0.0) + cost_ms
         return True
 

@@ -74,14 +74,16 @@ class ViewSearch:
         return found if proven and self._is_clear(found, margin) else None
 
     def _proven_before(self, run: Search) -> Registered | None:
-        """The best place so far, if a trial proves it that costs less than the next search, `run`.
+        """The best place so far, if a trial before the next search, `run`, proves it.
 
         The best few candidates are placed on the terrain, where there is one, and finished; where
         that proves none, they are compared one level finer, if there is such a level. Where only a
         part of all places was compared, or only a few on the terrain, the best must stand out too.
+        There is no trial before a search that costs less, except that of the final level.
 
-        A search of the final level comes after those of all places at the judged level: there the
-        best need only be as certain as at the end of all searches, and no finer level is needed.
+        The final level is searched only where all poses of the judged level are cheap, after them.
+        Before it, the best need only be as certain as at the end of all searches, by its candidates
+        as they are finished there.
         """
         plan, ground, last, levels = self._plan, self._ground, self._last, self._levels
         if last is None or self._confidence is None or levels.final == levels.look:
@@ -90,7 +92,8 @@ class ViewSearch:
         trial_ms = plan.trial_ms if ground.is_level else plan.terrain_trial_ms
         if not self._judged or not (at_final or run.cost_ms > trial_ms):
             return None
-        if not self._budget.allows(trial_ms):
+        # Without time for it the search goes on, and is cut short only where that has no time.
+        if not (self._budget.fits(trial_ms) and self._budget.allows(trial_ms)):
             return None
         placed = ground.placed_on_terrain(self._judged, plan.trials)
         compared_all = ground.is_level and last.level == levels.look and not last.from_tiles

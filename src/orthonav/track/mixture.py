@@ -112,7 +112,7 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The estimate of the track: its best cluster of hypotheses.
+    """The estimate of the track: its best cluster of hypotheses. Its arrays are not to be changed.
 
     `mean` (8,), `covariance` (8, 8): of the cluster. `confidence`: probability that the aircraft is
     within the radius asked for. `state`: of the track. `belief`: probability of the cluster,

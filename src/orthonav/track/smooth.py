@@ -18,8 +18,8 @@ from orthonav.track.motion import Expected
 SIZES = [STATE, STATE**2] * 3 + [STATE**2]
 """Numbers of a state, of its prediction and of the state before, and of their covariance."""
 STARTS = np.cumsum(SIZES)[:-1]
-ROWS = 256
-"""Rows of a block: 0.6 MB."""
+ROWS_OF_BLOCK = 256
+"""0.6 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +55,12 @@ class _Rows:
     def add(self, parts: Sequence[Array]) -> int:
         """Store arrays one after the other; the number of their row."""
         if not self._free:
-            first = ROWS * len(self._blocks)
-            self._blocks.append(np.empty((ROWS, sum(SIZES))))
-            self._free = list(range(first + ROWS - 1, first - 1, -1))
+            first = ROWS_OF_BLOCK * len(self._blocks)
+            self._blocks.append(np.empty((ROWS_OF_BLOCK, sum(SIZES))))
+            self._free = list(range(first + ROWS_OF_BLOCK - 1, first - 1, -1))
         number = self._free.pop()
-        row, end = self._row(number), 0
-        for part in parts:
-            end += part.size
-            row[end - part.size : end] = part.ravel()
+        made = np.concatenate([part.ravel() for part in parts])
+        self._row(number)[: len(made)] = made
         return number
 
     def remove(self, number: int) -> None:
@@ -83,7 +81,7 @@ class _Rows:
         return Expected(mean, covariance, mean_before, covariance_before, cross)
 
     def _row(self, number: int) -> Array:
-        block, row = divmod(number, ROWS)
+        block, row = divmod(number, ROWS_OF_BLOCK)
         return np.asarray(self._blocks[block][row])
 
 
