@@ -324,7 +324,7 @@ class Budget:
             return True
         spent_ms = 1e3 * (time.monotonic() - self._begun_s)
         pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
-        return not spent_ms + pace * cost_ms > self._budget_ms  # no time at all takes none
+        return not spent_ms + pace * cost_ms > self._budget_ms  # NaN where nothing took time yet
 
     def allows(self, cost_ms: float) -> bool:
         """Whether to begin a search of an estimated cost; without it, the search is cut short."""
