@@ -46,6 +46,9 @@ class Registrar:
         assert level <= levels.coarse  # candidates from above are compared at the coarse level
         return ["a place"]
 
+    def direct(self, *_):
+        return ["a place found at the final level"]
+
     def standing(self, *_):
         return 60.0, 60.0 / self._ratio
 
@@ -65,12 +68,14 @@ class Confidence:
 
 def searched(
     monkeypatch, confidences, costs_ms=(50.0,), final=1, budget_ms=math.inf, *,
-    level=LOOK, from_tiles=False, learnt=True, ratio=1.0,
+    level=LOOK, from_tiles=False, learnt=True, ratio=1.0, last_level=None, is_level=True,
 ):  # fmt: skip
     """Searches that were run, candidates finished and whether they were compared one level finer,
     and the place found, where one finishing after the other has these confidences."""
     registrar, ran = Registrar(confidences, ratio), []
     searches = [Search(level, [(0.0, 0.0)], from_tiles, 8, cost_ms) for cost_ms in costs_ms]
+    if last_level is not None:
+        searches[-1] = replace(searches[-1], level=last_level)
     monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
     view = SimpleNamespace(
         levels=Levels(LOOK + 1, LOOK, final), prior=PosePrior(0.0, 0.1, 0.1), templates=None
@@ -80,7 +85,7 @@ def searched(
         fft_ms=None, tiles=None, found=lambda run: ran.append(run.cost_ms) or ["a candidate"],
     )  # fmt: skip
     ground = SimpleNamespace(
-        is_level=True, finish=None, finer_score=lambda finalist: 0.0,
+        is_level=is_level, finish=None, finer_score=lambda finalist: 0.0,
         placed_on_terrain=lambda judged, at_most: judged,
     )  # fmt: skip
     found = ViewSearch(candidates, ground, Confidence() if learnt else None).best()
@@ -129,6 +134,17 @@ def test_where_it_proves_too_little_the_search_goes_on(monkeypatch, confidence):
     assert (ran, finished) == ([50.0, 300.0], [(3, False), (3, True), (3, False)])
 
 
+@pytest.mark.parametrize(("confidence", "number"), [(0.995, 1), (0.98, 2)])
+def test_the_final_level_is_searched_only_for_a_place_in_doubt(monkeypatch, confidence, number):
+    """However cheap that search is, and without a finer level."""
+    costs_ms = 5.0, 2.0
+    ran, finished, _ = searched(
+        monkeypatch, [confidence, 0.995], costs_ms=costs_ms, last_level=LOOK - 1
+    )
+    assert ran == list(costs_ms[:number])
+    assert finished == [(3, False)] * number
+
+
 @pytest.mark.parametrize("changes", [{"from_tiles": True}, {"level": LOOK + 1}])
 def test_where_few_places_were_compared_it_must_stand_out_too(monkeypatch, changes):
     costs_ms = 50.0, 300.0
@@ -136,6 +152,40 @@ def test_where_few_places_were_compared_it_must_stand_out_too(monkeypatch, chang
     assert ran == list(costs_ms)
     ran, *_ = searched(monkeypatch, [0.999], costs_ms=costs_ms, ratio=1.3, **changes)
     assert ran == [50.0]
+
+
+@pytest.mark.parametrize(("ratio", "number"), [(1.2, 2), (1.3, 1)])
+def test_over_relief_it_must_stand_out_before_the_final_level_too(monkeypatch, ratio, number):
+    """Only a few places were compared on the terrain."""
+    costs_ms = 5.0, 2.0
+    ran, *_ = searched(
+        monkeypatch, [0.999, 0.999], costs_ms=costs_ms, last_level=LOOK - 1, ratio=ratio,
+        is_level=False,
+    )  # fmt: skip
+    assert ran == list(costs_ms[:number])
+
+
+def test_a_trial_that_there_is_no_time_for_does_not_cut_a_search_short(monkeypatch):
+    """The search of the final level costs less than the trial."""
+    now = [100.0]
+    monkeypatch.setattr("orthonav.localizer.plan.time.monotonic", lambda: now[0])
+
+    def run(view_search, each):
+        now[0] += each.cost_ms / 1e3
+        return ran(view_search, each)
+
+    ran = ViewSearch._run
+    monkeypatch.setattr(ViewSearch, "_run", run)
+    costs_ms = 20.0, 5.0
+    searches, finished, found = searched(
+        monkeypatch, [0.995], costs_ms=costs_ms, budget_ms=40.0, last_level=LOOK - 1
+    )
+    assert searches == list(costs_ms) and finished == [(3, False)] and not found.cut_short
+    now[0] = 100.0
+    searches, finished, found = searched(
+        monkeypatch, [0.5], costs_ms=costs_ms, budget_ms=22.0, last_level=LOOK - 1
+    )
+    assert searches == [20.0] and found.cut_short
 
 
 def test_a_place_that_does_not_stand_out_is_not_compared_one_level_finer(monkeypatch):

@@ -12,8 +12,8 @@ Where the judged level is cheap (a prior, a small sheet) only that one is search
 cheaper of the other two comes first; the next one follows only while the best place does not stand
 out, and only if its estimated cost is acceptable. At the judged level headings and scales come in
 stages, the most likely first, so that an ordinary view ends after the first stage. Where position,
-heading and scale are known so well that the *final level*, one below, is cheap too, it comes last:
-weak texture, such as that of bare ground, is only seen there.
+heading and scale are known so well that the *final level*, one below, is cheap too, it comes last,
+unless a place is proven before: weak texture, such as that of bare ground, is only seen there.
 
 This file decides; `view_search` executes.
 """
@@ -159,7 +159,7 @@ class SearchPlan:
     if one is proven; docs/decisions/registration.md, 14 and 18."""
     trial_doubt: float = 0.002
     """A trial proves a place with a confidence above one minus this: its rivals were not all
-    searched."""
+    searched. Before the final level they were, and `doubt` counts."""
     trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
     """Where a trial compares only a part of all places, or only a few on the terrain, the place
     must also stand out so far; docs/decisions/registration.md, 14."""
@@ -318,14 +318,19 @@ class Budget:
         self._estimated_ms: float | None = None
         self.cut_short = False
 
+    def fits(self, cost_ms: float) -> bool:
+        """Whether what has an estimated cost would end in time; what comes first always does."""
+        if self._estimated_ms is None:
+            return True
+        spent_ms = 1e3 * (time.monotonic() - self._begun_s)
+        pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
+        return not spent_ms + pace * cost_ms > self._budget_ms  # NaN where nothing took time yet
+
     def allows(self, cost_ms: float) -> bool:
-        """Whether a search of an estimated cost would end in time; the first one always may."""
-        if self._estimated_ms is not None:
-            spent_ms = 1e3 * (time.monotonic() - self._begun_s)
-            pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
-            if spent_ms + pace * cost_ms > self._budget_ms:
-                self.cut_short = True
-                return False
+        """Whether to begin a search of an estimated cost; without it, the search is cut short."""
+        if not self.fits(cost_ms):
+            self.cut_short = True
+            return False
         self._estimated_ms = (self._estimated_ms or 0.0) + cost_ms
         return True
 

@@ -39,7 +39,7 @@ class ViewSearch:
             self._levels, self._view.prior, self._candidates.fft_ms, self._candidates.tiles
         )
         for each in searches:
-            if early := self._proven_before(each.cost_ms):
+            if early := self._proven_before(each):
                 return early
             if not self._budget.allows(each.cost_ms):
                 break
@@ -73,27 +73,36 @@ class ViewSearch:
         proven = compared_all or self._is_proven(found, self._plan.doubt)
         return found if proven and self._is_clear(found, margin) else None
 
-    def _proven_before(self, cost_ms: float) -> Registered | None:
-        """The best place so far, if a trial proves it that costs less than the next search.
+    def _proven_before(self, run: Search) -> Registered | None:
+        """The best place so far, if a trial before the next search, `run`, proves it.
 
-        `cost_ms`: that of the next search. The best few candidates are placed on the terrain, where
-        there is one, and finished; where that proves none, they are compared one level finer, if
-        there is such a level. Where only a part of all places was compared, or only a few on the
-        terrain, the best must stand out as well.
+        The best few candidates are placed on the terrain, where there is one, and finished; where
+        that proves none, they are compared one level finer, if there is such a level. Where only a
+        part of all places was compared, or only a few on the terrain, the best must stand out too.
+        There is no trial before a search that costs less, except that of the final level.
+
+        The final level is searched only where all poses of the judged level are cheap, after them.
+        Before it, the best need only be as certain as at the end of all searches, by its candidates
+        as they are finished there.
         """
         plan, ground, last, levels = self._plan, self._ground, self._last, self._levels
-        trial_ms = plan.trial_ms if ground.is_level else plan.terrain_trial_ms
         if last is None or self._confidence is None or levels.final == levels.look:
             return None
-        if not self._judged or cost_ms <= trial_ms or not self._budget.allows(trial_ms):
+        at_final = run.level < levels.look
+        trial_ms = plan.trial_ms if ground.is_level else plan.terrain_trial_ms
+        if not self._judged or not (at_final or run.cost_ms > trial_ms):
+            return None
+        # Without time for it the search goes on, and is cut short only where that has no time.
+        if not (self._budget.fits(trial_ms) and self._budget.allows(trial_ms)):
             return None
         placed = ground.placed_on_terrain(self._judged, plan.trials)
         compared_all = ground.is_level and last.level == levels.look and not last.from_tiles
-        for finer in (False, True) if levels.final > 0 else (False,):
+        doubt = plan.doubt if at_final else plan.trial_doubt
+        for finer in (False, True)[: 1 if at_final or levels.final == 0 else 2]:
             found = self._finished(placed, plan.trials, finer=finer)
             if not compared_all and not self._is_clear(found, plan.trial_clear):
                 return None
-            if self._is_proven(found, plan.trial_doubt):
+            if self._is_proven(found, doubt):
                 return found
         return None
 
