@@ -39,7 +39,7 @@ from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
-from orthonav.onboard.telemetry import Clocks, VehicleState
+from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
 from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
@@ -51,6 +51,9 @@ TICK_NS = 10**9
 """Interval of health and state."""
 UTC_JUMP_NS = 200_000_000
 """UTC that moves by more than this against the monotonic clock within a tick has been set."""
+LONG_GAP_S = 1.0
+"""After so long without a view, a velocity at one time no longer says how far the aircraft flew: it
+may have turned."""
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
 
@@ -159,6 +162,7 @@ class Runner:
         self._tick_ns = 0
         self._image_taken_ns: int | None = None
         self._tracked_ns: int | None = None
+        self._travelled: Travelled | None = None
         self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
@@ -307,7 +311,9 @@ class Runner:
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
-        self._tracked_ns = image.exposed_ns
+        if self._gap_s(image) > LONG_GAP_S and isinstance(outcome, Fix):
+            outcome = _without_velocity(outcome)
+        self._tracked_ns, self._travelled = image.exposed_ns, vehicle.travelled
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
@@ -413,7 +419,24 @@ class Runner:
         return None
 
     def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
-        """Telemetry at the exposure; waits a little for the samples that follow it."""
+        """Telemetry at the exposure; waits a little for the samples that follow it.
+
+        After a long time without a view its velocity is the mean since that view.
+        """
+        vehicle, telemetry = self._reported(image)
+        gap_s = self._gap_s(image)
+        if gap_s <= LONG_GAP_S or vehicle.travelled is None:
+            return vehicle, telemetry
+        moved = vehicle.travelled.since(self._travelled)
+        mean = None if moved is None else (moved[0] / gap_s, moved[1] / gap_s)
+        return vehicle, replace(telemetry, vel_en_mps=mean)
+
+    def _gap_s(self, image: CameraImage) -> float:
+        """Time since the exposure of the last view that was located; 0 for the first one."""
+        return 0.0 if self._tracked_ns is None else (image.exposed_ns - self._tracked_ns) / 1e9
+
+    def _reported(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
+        """What the autopilot reported for the exposure; waits a little for samples after it."""
         if self.options.recorded or self._link is None:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
             return image.vehicle or VehicleState(None), image.telemetry or nothing
@@ -604,6 +627,12 @@ class Runner:
 
 def _arrived_ns(image: CameraImage) -> int:
     return image.exposed_ns if image.arrival is None else image.arrival.arrived_ns
+
+
+def _without_velocity(fix: Fix) -> Fix:
+    """The fix of a track without its velocity, which is a mean over a long time."""
+    evidence = {key: value for key, value in fix.evidence.items() if not key.startswith("vel_")}
+    return replace(fix, evidence=MappingProxyType(evidence))
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:

@@ -7,11 +7,12 @@ port.
 
 import math
 import time
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ _SECOND_AMSL = "altitude"
 """Height above sea level of a second message, where the first gives none."""
 _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
+TRAVELLED = slice(4, 7)
+"""The displacement in a sample of the local frame, after velocity and down position."""
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 
@@ -63,6 +66,24 @@ class BufferLimits:
     slow_hold_s: float = 1.5
 
 
+class Travelled(NamedTuple):
+    """Displacement since an arbitrary time: the integral of the reported velocity.
+
+    `part`: number of the uninterrupted part of the telemetry that it was integrated over.
+    """
+
+    part: int
+    north_m: float
+    east_m: float
+
+    def since(self, before: "Travelled | None") -> tuple[float, float] | None:
+        """Metres east and north since an earlier one; None where the velocity in between is not
+        known."""
+        if before is None or before.part != self.part:
+            return None
+        return self.east_m - before.east_m, self.north_m - before.north_m
+
+
 @dataclass(frozen=True, eq=False)
 class VehicleState:
     """State of the aircraft that the autopilot reported for one time of its clock.
@@ -73,6 +94,7 @@ class VehicleState:
     `velocity_ned_mps`: velocity north, east, down.
     `down_m`: distance below the origin of the autopilot's local frame.
     `home_m`, `amsl_m`: height above the place of take-off, and above mean sea level.
+    `travelled`: displacement by the velocity; None where that is not known.
     """
 
     ned_from_body: Array | None
@@ -81,6 +103,7 @@ class VehicleState:
     down_m: float = math.nan
     home_m: float = math.nan
     amsl_m: float = math.nan
+    travelled: Travelled | None = None
 
     def attitude_rad(self) -> Triple:
         """Roll, pitch and yaw of the body in radians; NaN where not known."""
@@ -171,6 +194,7 @@ class TelemetryBuffer:
         """`heights` are those of `HEIGHT_SOURCES` that may be used, the best first."""
         self.limits = limits or BufferLimits()
         self._order = tuple(heights)
+        self._parts = 0
         self.clear()
 
     def clear(self) -> None:
@@ -182,6 +206,8 @@ class TelemetryBuffer:
         if "amsl" in self._order:
             self._heights[_SECOND_AMSL] = _Samples(*slow)
         self._local = _Samples(*slow)
+        self._parts += 1
+        self._travelled = Travelled(self._parts, 0.0, 0.0)
 
     def add_attitude(self, time_ns: int, wxyz: Sequence[float]) -> None:
         """Add a rotation from body (forward, right, down) to NED; invalid ones are dropped."""
@@ -213,9 +239,18 @@ class TelemetryBuffer:
 
     def add_local(self, time_ns: int, velocity_ned_mps: Triple, down_m: float) -> None:
         """Add velocity and down position of the autopilot's local frame."""
-        values = np.array([*velocity_ned_mps, down_m])
-        if np.isfinite(values).all():
-            self._local.add(time_ns, values, self._keep_ns)
+        values = np.array([*velocity_ned_mps, down_m, 0.0, 0.0, 0.0])
+        if not np.isfinite(values).all():
+            return
+        local = self._local
+        if local.times and time_ns > local.times[-1]:
+            if time_ns - local.times[-1] > local.gap_ns:
+                self._parts += 1
+            before, seconds = local.values[-1], (time_ns - local.times[-1]) / 1e9
+            north, east = before[TRAVELLED][1:] + seconds * (before[:2] + values[:2]) / 2
+            self._travelled = Travelled(self._parts, float(north), float(east))
+        values[TRAVELLED] = self._travelled
+        local.add(time_ns, values, self._keep_ns)
 
     @property
     def covered_ns(self) -> int | None:
@@ -241,8 +276,22 @@ class TelemetryBuffer:
         local = self._local.at(time_ns)
         if local is None:
             return state
-        north, east, down, below = local.tolist()
-        return replace(state, velocity_ned_mps=(north, east, down), down_m=below)
+        north, east, down, below = local[:4].tolist()
+        return replace(
+            state,
+            velocity_ned_mps=(north, east, down),
+            down_m=below,
+            travelled=self._travelled_at(time_ns, local[:2]),
+        )
+
+    def _travelled_at(self, time_ns: int, velocity_ne_mps: Array) -> Travelled:
+        """Displacement up to a time at which the velocity (2,) is known."""
+        times, values = self._local.times, self._local.values
+        last = bisect_right(times, time_ns) - 1
+        part, north, east = values[last][TRAVELLED].tolist()
+        seconds = (time_ns - times[last]) / 1e9
+        mean = (values[last][:2] + velocity_ne_mps) / 2
+        return Travelled(round(part), north + seconds * mean[0], east + seconds * mean[1])
 
     def _height(self, names: Sequence[str], time_ns: int) -> float:
         """The first of these heights that is known at a time, else NaN."""
