@@ -11,7 +11,9 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -285,6 +287,40 @@ def test_repeated_images_are_not_located(flight):
     assert "frozen_image" in flight.reasons()
     assert flight.runner.counter.total["frozen"] == 30
     assert reason_of(flight.views(2)[1]) == "fix"
+
+
+def test_after_a_gap_the_velocity_is_the_mean_since_the_last_view(begin):
+    """One velocity does not say how far an aircraft flew that turned while its camera stood."""
+    flight, told = begin(), {"vel_east_mps": 1.0, "vel_north_mps": 2.0, "vel_std_mps": 0.5}
+    flight.locator.outcome = lambda view: replace(fix(), evidence=MappingProxyType(told))
+
+    def views(count, north_mps, **options):
+        results = []
+        for _ in range(count):
+            now = flight.time.now_ns + AHEAD_NS
+            flight.hear(flight.autopilot.local(now, (north_mps, 0.0, 0.0)))
+            results += flight.views(1, **options)
+        return results
+
+    frozen = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
+    assert views(20, 20.0)[-1].outcome.evidence == told
+    views(1, 20.0, grey=frozen)
+    views(10, 20.0, grey=frozen)
+    views(10, -10.0, grey=frozen)
+    first, second = views(2, -10.0)[-2:]
+    mean, now = (each.vel_en_mps for each in flight.locator.seen[-2:])
+    assert mean == (0.0, pytest.approx(5.0, abs=1.5)) and now == (0.0, -10.0)
+    # That of one moment is sent, and a mean is not.
+    assert first.outcome.evidence == {} and second.outcome.evidence == told
+
+
+def test_after_a_gap_of_the_telemetry_no_velocity_is_known(begin):
+    flight = begin()
+    for pause_s in (0.1, 0.1, 3.0, 0.1):
+        flight.time.go(pause_s)
+        flight.hear(flight.autopilot.local(flight.time.now_ns + AHEAD_NS, (20.0, 0.0, 0.0)))
+        flight.views(1)
+    assert [each.vel_en_mps for each in flight.locator.seen[-2:]] == [(0.0, 20.0), None]
 
 
 BAD = {

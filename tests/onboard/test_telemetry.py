@@ -141,6 +141,51 @@ def test_velocity_and_height_of_the_local_frame():
     assert VehicleState(None).telemetry(0).vel_en_mps is None
 
 
+def circling(time_ns):
+    """Velocity north, east, down of an aircraft that turns once in 20 s."""
+    angle = math.tau * time_ns / (20 * S)
+    return 20 * math.cos(angle), 20 * math.sin(angle), 0.0
+
+
+def test_the_displacement_follows_turns_for_longer_than_samples_are_kept():
+    buffer = TelemetryBuffer(BufferLimits(keep_s=2.0))
+    buffer.add_local(0, circling(0), 0.0)
+    first = buffer.at(0).travelled
+    for time_ns in range(40 * MS, 50 * S + 1, 40 * MS):
+        buffer.add_local(time_ns, circling(time_ns), 0.0)
+    east, north = buffer.at(50 * S).travelled.since(first)
+    across_m = 20 * 20 / math.pi  # half a turn more than two
+    assert (east, north) == pytest.approx((across_m, 0.0), abs=0.1)
+    between = buffer.at(50 * S - 30 * MS).travelled
+    moved = buffer.at(50 * S).travelled.since(between)
+    assert moved == pytest.approx((0.0, -0.6), abs=0.01)
+
+
+def test_the_displacement_ends_between_and_after_samples():
+    buffer = TelemetryBuffer()
+    for second, speed in enumerate((10.0, 20.0)):
+        buffer.add_local(second * S, (speed, 0.0, 0.0), 0.0)
+    first = buffer.at(0).travelled
+    assert buffer.at(S // 2).travelled.since(first) == (0.0, pytest.approx(0.5 * 12.5))
+    assert buffer.at(S + S // 2).travelled.since(first) == (0.0, pytest.approx(15.0 + 0.5 * 20))
+
+
+def test_the_displacement_is_not_known_across_gaps_and_restarts():
+    buffer = TelemetryBuffer()
+    buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
+    first = buffer.at(0).travelled
+    later = round(BufferLimits().slow_gap_s * S) + 1
+    buffer.add_local(later, (10.0, 0.0, 0.0), 0.0)
+    second = buffer.at(later).travelled
+    assert second.since(first) is None and second.since(None) is None
+    buffer.clear()
+    assert buffer.at(later).travelled is None
+    buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
+    again = buffer.at(0).travelled
+    assert again.since(first) is None and again.since(second) is None
+    assert VehicleState(None).travelled is None
+
+
 @pytest.mark.parametrize("wxyz", [(0, 0, 0, 0), (math.nan, 0, 0, 0), (3, 0, 0, 0)])
 def test_an_invalid_attitude_is_dropped(wxyz):
     buffer = TelemetryBuffer()

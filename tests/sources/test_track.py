@@ -14,9 +14,11 @@ from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
     LEVEL_GROUND_IN_GAPS,
+    SourceView,
     check_overlap,
     fitted,
     warnings_of,
+    with_mean_velocities,
     with_options,
 )
 from orthonav.sources.track import GAP_NS, RecordedTrack, Samples, angles_at, attitude_of_angles
@@ -204,3 +206,36 @@ def test_cameras_fit_images_of_the_same_aspect_ratio():
     assert fitted(camera, 1333, 1000, "x").width_px == 1333  # a third, rounded
     with pytest.raises(CameraError, match="another aspect ratio"):
         fitted(camera, 4000, 2250, "x")
+
+
+def with_velocities(*samples):
+    collected = Samples(2)
+    for time_s, east, north in samples:
+        collected.add(round(time_s * S), east, north)
+    return RecordedTrack(None, velocity=collected.series())
+
+
+def seen_at(track, *times_s):
+    views = (
+        SourceView("", track.telemetry(round(each * S)), None, "", lambda: None) for each in times_s
+    )
+    return [each.telemetry.vel_en_mps for each in with_mean_velocities(views, track)]
+
+
+def test_between_distant_views_the_velocity_is_the_mean():
+    """An aircraft that turned round between two views ends where it began."""
+    track = with_velocities((0, 10, 0), (1, 10, 0), (2, 0, 0), (3, -10, 0), (4, -10, 0), (5, 0, 4))
+    assert seen_at(track, 0.5, 3.5) == [(10.0, 0.0), (0.0, 0.0)]
+    assert seen_at(track, 1, 4, 4.5, 5) == [
+        (10.0, 0.0),
+        pytest.approx((-10 / 3, 0.0)),
+        (-5.0, 2.0),
+        (0.0, 4.0),
+    ]
+
+
+def test_a_mean_over_a_gap_is_not_known():
+    track = with_velocities((0, 10, 0), (3, 10, 0), (4, 10, 0))
+    assert seen_at(track, 0, 4) == [(10.0, 0.0), None]
+    assert seen_at(track, 3, 4, 9) == [(10.0, 0.0), (10.0, 0.0), None]
+    assert RecordedTrack(None).mean_velocity_en_mps(0, S) is None

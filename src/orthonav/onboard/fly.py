@@ -305,14 +305,7 @@ class Runner:
             return self._refused(image, known, vehicle)
         telemetry, view = known, replace(view, telemetry=known)
         self._log_view(image, view, latency, withheld=False)
-        outcome: Fix | NoFix
-        try:
-            outcome, latency_ms = locate_view(self._locator, view)
-        except CameraError as error:  # ends `orthonav localize`, but must not end a flight
-            outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
-            latency_ms = math.nan
-        if self._gap_s(image) > LONG_GAP_S and isinstance(outcome, Fix):
-            outcome = _without_velocity(outcome)
+        outcome, latency_ms = self._placed(image, view)
         self._tracked_ns, self._travelled = image.exposed_ns, vehicle.travelled
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
@@ -344,6 +337,16 @@ class Runner:
             found = result.state in (None, "tracking") and isinstance(outcome, Fix)
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
+
+    def _placed(self, image: CameraImage, view: View) -> tuple[Fix | NoFix, float]:
+        """The position of a view, and the time that it took, ms."""
+        try:
+            outcome, latency_ms = locate_view(self._locator, view)
+        except CameraError as error:  # ends `orthonav localize`, but must not end a flight
+            return self._refusal("wrong_camera", "wrong_camera", str(error)), math.nan
+        if self._gap_s(image) > LONG_GAP_S and isinstance(outcome, Fix):
+            outcome = _without_velocity(outcome)
+        return outcome, latency_ms
 
     def _doubt(self, image: CameraImage, result: ViewResult) -> str | None:
         """Reason to doubt the time of exposure by the position of a view; None without one."""

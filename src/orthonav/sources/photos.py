@@ -29,6 +29,7 @@ from orthonav.sources.recording import (
     known_at,
     rounded,
     warnings_of,
+    with_mean_velocities,
     with_options,
 )
 from orthonav.sources.track import RecordedTrack
@@ -83,13 +84,14 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
         warnings += doubts
         warnings += _height_warnings([one.photo for one in taken], options)
         warnings += jump_warnings([(one.time_ns, one.photo.latlon_deg) for one in taken])
+    views = partial(_views, folder, taken, track, options)
     return Recording(
         kind="photos",
         path=folder,
         camera=camera,
         note="; ".join(filter(None, [f"photographs of {folder.name}", note])),
         expected=len(taken),
-        stream=partial(_views, folder, taken, track, options),
+        stream=views if track is None else lambda: with_mean_velocities(views(), track),
         warnings=tuple(filter(None, [*warnings, note])),
         take_off_latlon_deg=None if track is None else track.take_off_latlon_deg,
     )

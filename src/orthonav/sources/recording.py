@@ -1,7 +1,7 @@
 """A recorded flight that is read view by view."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,8 @@ from orthonav.sources.track import RecordedTrack
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
+LONG_GAP_NS = 1_000_000_000
+"""After so long a velocity at one time no longer says how far the aircraft flew."""
 JUMP_M, JUMP_MPS = 500.0, 150.0
 """Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
 that this program is for flies slower, and logs round positions to some metres."""
@@ -109,6 +111,19 @@ def known_at(
     truth = track.latlon_deg(time_ns)
     telemetry = track.telemetry(time_ns, options.ground_alt_m)
     return rounded(with_options(telemetry, truth, options)), truth
+
+
+def with_mean_velocities(views: Iterable[SourceView], track: RecordedTrack) -> Iterator[SourceView]:
+    """Views, in order; the velocity of each that follows another after `LONG_GAP_NS` is the mean
+    since that one, by the track: the aircraft may have turned in between."""
+    before_ns = None
+    for view in views:
+        now = view.telemetry
+        if before_ns is not None and now.vel_en_mps and now.time_ns - before_ns > LONG_GAP_NS:
+            mean = track.mean_velocity_en_mps(before_ns, now.time_ns)
+            view = replace(view, telemetry=rounded(replace(now, vel_en_mps=mean)))
+        before_ns = now.time_ns
+        yield view
 
 
 def jump_warnings(

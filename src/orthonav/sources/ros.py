@@ -26,6 +26,7 @@ from orthonav.sources.recording import (
     fitted,
     known_at,
     warnings_of,
+    with_mean_velocities,
 )
 from orthonav.sources.ros_images import camera_of_info, grey_of_message
 from orthonav.sources.ros_limits import bound_inflation, check_held
@@ -70,7 +71,9 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         camera=camera,
         note=f"{path.name}: {topics.summary()}",
         expected=expected,
-        stream=partial(_views, path, topics.image.topic, track, options),
+        stream=lambda: with_mean_velocities(
+            _views(path, topics.image.topic, track, options), track
+        ),
         warnings=(*warnings, *warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )

@@ -52,6 +52,16 @@ class TimeSeries:
         before, after, weight = found
         return np.asarray((1 - weight) * self.values[before] + weight * self.values[after])
 
+    def mean(self, start_ns: int, end_ns: int) -> Array:
+        """Mean values (D,) from a time to a later one; NaN where they are unknown in between."""
+        inner = (self.time_ns > start_ns) & (self.time_ns < end_ns)
+        times = np.array([start_ns, *self.time_ns[inner].tolist(), end_ns])
+        steps = np.diff(times)
+        if steps.max() > GAP_NS:
+            return np.full(self.values.shape[1], np.nan)
+        values = np.stack([self.at(start_ns), *self.values[inner], self.at(end_ns)])
+        return np.average((values[1:] + values[:-1]) / 2, axis=0, weights=steps)
+
 
 class Samples:
     """Collects samples in any order; `series` sorts them and drops those that are not finite."""
@@ -211,6 +221,13 @@ class RecordedTrack:
             amsl_m=_number(_at(self.amsl, time_ns, 1)[0]),
             hae_m=_number(_at(self.hae, time_ns, 1)[0]),
         )
+
+    def mean_velocity_en_mps(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
+        """Mean velocity from a time to a later one; None where it is unknown in between."""
+        if self.velocity is None:
+            return None
+        east, north = self.velocity.mean(start_ns, end_ns).tolist()
+        return (east, north) if math.isfinite(east + north) else None
 
     def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
         """Position by the aircraft's own GNSS receiver, or None."""

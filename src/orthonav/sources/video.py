@@ -26,6 +26,7 @@ from orthonav.sources.recording import (
     fitted,
     known_at,
     warnings_of,
+    with_mean_velocities,
 )
 from orthonav.sources.subtitles import end_ns
 from orthonav.sources.track import RecordedTrack
@@ -57,7 +58,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         camera=camera,
         note=f"video {path.name}, telemetry of {telemetry_path.name}",
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
-        stream=partial(_views, path, track, options),
+        stream=lambda: with_mean_velocities(_views(path, track, options), track),
         warnings=tuple(warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
