@@ -53,6 +53,34 @@ def test_where_the_coarse_level_takes_too_long_the_level_above_is_searched():
     assert search.level == LEVELS.coarse  # the first search is run whatever it costs
 
 
+@pytest.mark.parametrize("tiles", [0, 1000])
+def test_with_an_unknown_heading_the_likely_scales_come_first(tiles):
+    """All poses are tried in the end, each once, at their share of the cost."""
+    prior, pose_ms = PosePrior(None, math.pi, 0.1), (1e3, 20.0, math.inf if tiles else 0.1)
+    searches = list(
+        DEFAULT_PLAN.searches(
+            LEVELS,
+            prior,
+            lambda level, poses: poses * (*pose_ms, math.inf)[level],
+            lambda: (tiles, 128),
+        )
+    )
+    first, rest = (each for each in searches if each.level == LEVELS.coarse)
+    assert first.from_tiles == rest.from_tiles == bool(tiles)
+    turns = {turn for turn, _ in first.poses}
+    assert turns == {turn for turn, _ in rest.poses} and len(turns) == 45
+    scales = [sorted({scale for _, scale in each.poses}) for each in (first, rest)]
+    assert scales[0] == pytest.approx([-0.13, 0.0, 0.13]) and len(scales[1]) == 2
+    assert len(first.poses) + len(rest.poses) == 45 * 5
+    assert first.cost_ms / rest.cost_ms == pytest.approx(3 / 2)
+
+
+def test_with_a_known_heading_the_coarse_level_is_searched_at_once():
+    prior, pose_ms = PosePrior(0.5, math.radians(10.0), 0.1), (1e3, 20.0, 0.1)
+    levels = levels_of(prior, pose_ms)
+    assert levels.count(LEVELS.coarse) == 1
+
+
 @pytest.mark.parametrize(
     ("pose_ms", "tiles", "coarse_ms", "left_out"),
     [

@@ -10,10 +10,11 @@ three sources of candidates:
 
 Where the judged level is cheap (a prior, a small sheet) only that one is searched. Elsewhere the
 cheaper of the other two comes first; the next one follows only while the best place does not stand
-out, and only if its estimated cost is acceptable. At the judged level headings and scales come in
-stages, the most likely first, so that an ordinary view ends after the first stage. Where position,
-heading and scale are known so well that the *final level*, one below, is cheap too, it comes last,
-unless a place is proven before: weak texture, such as that of bare ground, is only seen there.
+out, and only if its estimated cost is acceptable. With an unknown heading both try the likely
+scales first. At the judged level headings and scales come in stages, the most likely first, so that
+an ordinary view ends after the first stage. Where position, heading and scale are known so well
+that the *final level*, one below, is cheap too, it comes last, unless a place is proven before:
+weak texture, such as that of bare ground, is only seen there.
 
 This file decides; `view_search` executes.
 """
@@ -21,7 +22,7 @@ This file decides; `view_search` executes.
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -96,6 +97,9 @@ class SearchPlan:
     off the corners of the bank, where heading and scale are both far off."""
     stages_nats: tuple[float, ...] = (-1.0, 0.4, 2.0, math.inf)
     """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
+    likely_nats: float = 1.0
+    """With an unknown heading, poses within so many nats come first at the coarse level and for
+    tiles: their scales are those of nine views in ten; docs/decisions/registration.md, 19."""
     last_stage_ms: float = 60.0
     """The last stage, poses that one view in seven has, is left out where it would cost more and
     the coarse level has tried them; docs/decisions/registration.md, 18."""
@@ -225,7 +229,9 @@ class SearchPlan:
         `fft_ms(level, poses)` is an estimated cost, infinite where a search is impossible.
         `tiles()`: how many to compare with the view, and how many numbers their embeddings have.
         """
-        rough = [pose for pose, _ in self._poses(prior, self.turn_step_rad, self.scale_step)]
+        rated = self._poses(prior, self.turn_step_rad, self.scale_step)
+        rough = [pose for pose, _ in rated]
+        likely = self._likely(prior, rated)
         fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)
         judged_ms = fft_ms(levels.look, len(fine))
         tried_all = False
@@ -243,7 +249,7 @@ class SearchPlan:
                     break
                 # Over relief the expected scale is another one at every place.
                 tried_all |= not each.from_tiles and prior.scale_map is None
-                yield each
+                yield from self._in_stages(each, likely)
         if judged_ms <= max(self.last_ms, self.cheap_ms):
             for least, most in pairwise(self.stages_nats):
                 stage = [pose for pose, nats in fine if least < nats <= most]
@@ -258,6 +264,20 @@ class SearchPlan:
         if levels.final < levels.look and final_ms <= self.cheap_ms:
             poses = [pose for pose, _ in final]
             yield Search(levels.final, poses, False, self.final_candidates, final_ms)
+
+    def _likely(self, prior: PosePrior, rated: list[tuple[Pose, float]]) -> int:
+        """Number of poses, most likely first, that come first: all with a known heading."""
+        if prior.turn_rad is not None:
+            return len(rated)
+        return sum(nats <= self.likely_nats for _, nats in rated)
+
+    @staticmethod
+    def _in_stages(run: Search, likely: int) -> Iterator[Search]:
+        """A search under its first `likely` poses, then under the others."""
+        for poses in (run.poses[:likely], run.poses[likely:]):
+            if poses:
+                share = len(poses) / len(run.poses)
+                yield replace(run, poses=poses, cost_ms=run.cost_ms * share)
 
     def _coarse(
         self, levels: Levels, poses: list[Pose], fft_ms: Callable[[int, int], float]
