@@ -289,8 +289,8 @@ def test_repeated_images_are_not_located(flight):
     assert reason_of(flight.views(2)[1]) == "fix"
 
 
-def test_after_a_gap_the_velocity_is_the_mean_since_the_last_view(begin):
-    """One velocity does not say how far an aircraft flew that turned while its camera stood."""
+def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
+    """One velocity does not say how far an aircraft flew that turned while images were frozen."""
     flight, told = begin(), {"vel_east_mps": 1.0, "vel_north_mps": 2.0, "vel_std_mps": 0.5}
     flight.locator.outcome = lambda view: replace(fix(), evidence=MappingProxyType(told))
 
@@ -310,8 +310,27 @@ def test_after_a_gap_the_velocity_is_the_mean_since_the_last_view(begin):
     first, second = views(2, -10.0)[-2:]
     mean, now = (each.vel_en_mps for each in flight.locator.seen[-2:])
     assert mean == (0.0, pytest.approx(5.0, abs=1.5)) and now == (0.0, -10.0)
-    # That of one moment is sent, and a mean is not.
-    assert first.outcome.evidence == {} and second.outcome.evidence == told
+    # The velocity of the fix is that of the moment: its error is that of the mean.
+    assert first.outcome.evidence["vel_north_mps"] == pytest.approx(2.0 + (-10.0 - mean[1]))
+    assert first.outcome.evidence["vel_east_mps"] == 1.0
+    assert second.outcome.evidence == told
+
+
+def test_samples_after_the_last_view_count_in_its_displacement(begin):
+    """It came 1.1 s after a sample of 20 m/s; the next one, 0.8 s later, has -20 m/s."""
+    flight = begin()
+    for tenth in range(51):
+        if tenth <= 10 or tenth >= 29:
+            now = flight.time.now_ns + AHEAD_NS
+            speed = 20.0 if tenth <= 10 else -20.0
+            flight.hear(flight.autopilot.local(now, (speed, 0.0, 0.0)))
+        if tenth in (10, 21, 50):
+            flight.view(age_s=0.0, wait_s=0.0)
+        elif tenth % 10 == 9:
+            flight.talk()
+        flight.time.go(0.1)
+    moved_m = 0.8 * (-20 + 40 * 0.8 / 1.9 - 20) / 2 + 2.1 * -20
+    assert flight.locator.seen[-1].vel_en_mps == (0.0, pytest.approx(moved_m / 2.9))
 
 
 def test_after_a_gap_of_the_telemetry_no_velocity_is_known(begin):

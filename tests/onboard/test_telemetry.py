@@ -183,6 +183,10 @@ def test_the_displacement_is_not_known_across_gaps_and_restarts():
     buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
     again = buffer.at(0).travelled
     assert again.since(first) is None and again.since(second) is None
+    for number, speed in enumerate((1e20, 10.0, 10.0, 10.0), 1):
+        buffer.add_local(number * S, (speed, 0.0, 0.0), 0.0)
+    after = buffer.at(4 * S).travelled
+    assert after.since(again) is None and after.since(buffer.at(2 * S).travelled) == (0.0, 20.0)
     assert VehicleState(None).travelled is None
 
 

@@ -52,6 +52,16 @@ def test_every_format(tmp_path, form):
     assert read_truth(tmp_path / "out/truth.csv")["000001.png"] == (46.5015, 2.5)
 
 
+def test_the_velocity_between_distant_images_is_the_mean(tmp_path, messages, topics):
+    """The heading turns from 355 to 15 deg in 2 s, at 5 m/s."""
+    topics["/cam/image_raw"] = topics["/cam/image_raw"][:3:2]
+    first, second = open_source(record(tmp_path / "flight", topics, messages)).views
+    assert second.telemetry.time_ns - first.telemetry.time_ns == 2 * 10**9
+    speed, course = 5 * math.sin(math.radians(10)) / math.radians(10), math.radians(5)
+    expected = speed * math.sin(course), speed * math.cos(course)
+    assert second.telemetry.vel_en_mps == pytest.approx(expected, abs=0.01)
+
+
 @pytest.mark.parametrize("form", [*FORMATS, "file"])
 def test_the_kind_is_found_by_content(tmp_path, form):
     messages = Messages(ros1=form == "bag")

@@ -234,6 +234,12 @@ def test_between_distant_views_the_velocity_is_the_mean():
     ]
 
 
+def test_a_log_with_a_row_for_each_view_is_used_as_it_is():
+    """Its velocities are means since the view before, as those of a flight folder."""
+    track = with_velocities((0, 10, 0), (1.5, 0, 10), (5, -10, 0))
+    assert seen_at(track, 0, 1.5, 5) == [(10.0, 0.0), (0.0, 10.0), (-10.0, 0.0)]
+
+
 def test_a_mean_over_a_gap_is_not_known():
     track = with_velocities((0, 10, 0), (3, 10, 0), (4, 10, 0))
     assert seen_at(track, 0, 4) == [(10.0, 0.0), None]

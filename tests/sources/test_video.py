@@ -87,6 +87,16 @@ def test_a_table_beside_the_video(tmp_path):
         open_source(path, options(path))
 
 
+def test_the_velocity_between_distant_views_is_the_mean(tmp_path):
+    path = video(tmp_path / "a.mkv")
+    camera_file(tmp_path / "camera.json")
+    rows = [f"{t},0,0,0,100,{east},0\n" for t, east in ((0, 5), (1, 5), (2, 0), (3, 0))]
+    header = "time_s,yaw_deg,pitch_deg,roll_deg,agl_m,vel_east_mps,vel_north_mps\n"
+    (tmp_path / "a.csv").write_text(header + "".join(rows))
+    views = list(open_source(path, options(path, rate_hz=0.5)).views)
+    assert [view.telemetry.vel_en_mps for view in views] == [(5.0, 0.0), (3.75, 0.0)]
+
+
 def test_the_offset_is_added_to_the_times_of_the_video(recorded):
     view = next(open_source(recorded, options(recorded, time_offset_s=0.9)).views)
     assert view.telemetry.time_ns == 900_000_000

@@ -56,6 +56,7 @@ LONG_GAP_S = 1.0
 may have turned."""
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
+Velocity = tuple[float, float]
 
 
 class LogSink(Protocol):
@@ -303,15 +304,16 @@ class Runner:
         known = self._above_ground(view.telemetry)
         if isinstance(known, NoFix):
             return self._refused(image, known, vehicle)
-        telemetry, view = known, replace(view, telemetry=known)
+        reported, telemetry = known, self._over_gap(known, image, vehicle)
+        view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
-        outcome, latency_ms = self._placed(image, view)
+        outcome, latency_ms = self._placed(view, reported)
         self._tracked_ns, self._travelled = image.exposed_ns, vehicle.travelled
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
         if latency is not None and isinstance(outcome, Fix):
-            outcome = _with_latency(outcome, telemetry, latency.std_s)
+            outcome = _with_latency(outcome, reported, latency.std_s)
         as_stated = latency is None or latency.stated
         result = self._result(image, outcome, latency_ms, as_stated=as_stated)
         doubt = self._doubt(image, result)
@@ -338,14 +340,32 @@ class Runner:
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
-    def _placed(self, image: CameraImage, view: View) -> tuple[Fix | NoFix, float]:
-        """The position of a view, and the time that it took, ms."""
+    def _over_gap(
+        self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState
+    ) -> Telemetry:
+        """Telemetry whose velocity is, after a long time without a located view, the mean since
+        that view; None where it is not known."""
+        before_ns, link = self._tracked_ns, self._link
+        if before_ns is None or telemetry.vel_en_mps is None or vehicle.travelled is None:
+            return telemetry
+        gap_s = (image.exposed_ns - before_ns) / 1e9
+        if gap_s <= LONG_GAP_S:
+            return telemetry
+        # Samples that followed that view were not known then.
+        again = None if link is None else link.state_at(before_ns).travelled
+        moved = vehicle.travelled.since(again or self._travelled)
+        mean = None if moved is None else (moved[0] / gap_s, moved[1] / gap_s)
+        return replace(telemetry, vel_en_mps=mean)
+
+    def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:
+        """The position of a view, and the time that it took, ms. `reported`: its telemetry with the
+        velocity at the exposure."""
         try:
             outcome, latency_ms = locate_view(self._locator, view)
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
             return self._refusal("wrong_camera", "wrong_camera", str(error)), math.nan
-        if self._gap_s(image) > LONG_GAP_S and isinstance(outcome, Fix):
-            outcome = _without_velocity(outcome)
+        if isinstance(outcome, Fix):
+            outcome = _at_exposure(outcome, view.telemetry.vel_en_mps, reported.vel_en_mps)
         return outcome, latency_ms
 
     def _doubt(self, image: CameraImage, result: ViewResult) -> str | None:
@@ -422,24 +442,7 @@ class Runner:
         return None
 
     def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
-        """Telemetry at the exposure; waits a little for the samples that follow it.
-
-        After a long time without a view its velocity is the mean since that view.
-        """
-        vehicle, telemetry = self._reported(image)
-        gap_s = self._gap_s(image)
-        if gap_s <= LONG_GAP_S or vehicle.travelled is None:
-            return vehicle, telemetry
-        moved = vehicle.travelled.since(self._travelled)
-        mean = None if moved is None else (moved[0] / gap_s, moved[1] / gap_s)
-        return vehicle, replace(telemetry, vel_en_mps=mean)
-
-    def _gap_s(self, image: CameraImage) -> float:
-        """Time since the exposure of the last view that was located; 0 for the first one."""
-        return 0.0 if self._tracked_ns is None else (image.exposed_ns - self._tracked_ns) / 1e9
-
-    def _reported(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
-        """What the autopilot reported for the exposure; waits a little for samples after it."""
+        """Telemetry at the exposure; waits a little for the samples that follow it."""
         if self.options.recorded or self._link is None:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
             return image.vehicle or VehicleState(None), image.telemetry or nothing
@@ -632,10 +635,17 @@ def _arrived_ns(image: CameraImage) -> int:
     return image.exposed_ns if image.arrival is None else image.arrival.arrived_ns
 
 
-def _without_velocity(fix: Fix) -> Fix:
-    """The fix of a track without its velocity, which is a mean over a long time."""
-    evidence = {key: value for key, value in fix.evidence.items() if not key.startswith("vel_")}
-    return replace(fix, evidence=MappingProxyType(evidence))
+def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> Fix:
+    """The fix of a track with its velocity at the exposure, where it was estimated with a mean.
+
+    A reported velocity and its mean have the same error.
+    """
+    if mean is None or reported is None or mean == reported:
+        return fix
+    own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")
+    moved = zip(names, reported, mean, strict=True)
+    at_exposure = {key: own[key] + now - over for key, now, over in moved if key in own}
+    return replace(fix, evidence=MappingProxyType({**own, **at_exposure}))
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:

@@ -33,6 +33,8 @@ _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
 TRAVELLED = slice(4, 7)
 """The displacement in a sample of the local frame, after velocity and down position."""
+FASTEST_MPS = 300.0
+"""A faster velocity is an error and is not integrated."""
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 
@@ -244,11 +246,14 @@ class TelemetryBuffer:
             return
         local = self._local
         if local.times and time_ns > local.times[-1]:
-            if time_ns - local.times[-1] > local.gap_ns:
-                self._parts += 1
             before, seconds = local.values[-1], (time_ns - local.times[-1]) / 1e9
-            north, east = before[TRAVELLED][1:] + seconds * (before[:2] + values[:2]) / 2
-            self._travelled = Travelled(self._parts, float(north), float(east))
+            fastest = np.abs([before[:2], values[:2]]).max()
+            if time_ns - local.times[-1] > local.gap_ns or fastest > FASTEST_MPS:
+                self._parts += 1
+                self._travelled = Travelled(self._parts, 0.0, 0.0)
+            else:
+                north, east = before[TRAVELLED][1:] + seconds * (before[:2] + values[:2]) / 2
+                self._travelled = Travelled(self._parts, float(north), float(east))
         values[TRAVELLED] = self._travelled
         local.add(time_ns, values, self._keep_ns)
 
@@ -290,8 +295,8 @@ class TelemetryBuffer:
         last = bisect_right(times, time_ns) - 1
         part, north, east = values[last][TRAVELLED].tolist()
         seconds = (time_ns - times[last]) / 1e9
-        mean = (values[last][:2] + velocity_ne_mps) / 2
-        return Travelled(round(part), north + seconds * mean[0], east + seconds * mean[1])
+        mean_n, mean_e = ((values[last][:2] + velocity_ne_mps) / 2).tolist()
+        return Travelled(round(part), north + seconds * mean_n, east + seconds * mean_e)
 
     def _height(self, names: Sequence[str], time_ns: int) -> float:
         """The first of these heights that is known at a time, else NaN."""

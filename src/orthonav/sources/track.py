@@ -223,10 +223,16 @@ class RecordedTrack:
         )
 
     def mean_velocity_en_mps(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
-        """Mean velocity from a time to a later one; None where it is unknown in between."""
-        if self.velocity is None:
+        """Mean velocity from a time to a later one; None where it is unknown in between.
+
+        Without a sample in between it is the one at the end: a log with a row for each view.
+        """
+        series = self.velocity
+        if series is None:
             return None
-        east, north = self.velocity.mean(start_ns, end_ns).tolist()
+        between = (series.time_ns > start_ns) & (series.time_ns < end_ns)
+        mean = series.mean(start_ns, end_ns) if between.any() else series.at(end_ns)
+        east, north = mean.tolist()
         return (east, north) if math.isfinite(east + north) else None
 
     def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
