@@ -586,13 +586,21 @@ def test_a_track_goes_on_in_the_plane_of_another_map(away_m):
     assert after.confidence == pytest.approx(before.confidence, abs=1e-6)
 
 
-@pytest.mark.parametrize(("off_m", "state"), [(2.0, State.TRACKING), (30.0, State.COASTING)])
-def test_the_map_must_be_recognized_at_the_estimated_position(off_m, state):
-    """A less likely place nearby, where the view shows the map, says nothing of the likely one."""
+@pytest.mark.parametrize(
+    ("off_m", "share", "state"),
+    [
+        (2.0, 0.2, State.TRACKING),
+        (30.0, 0.2, State.COASTING),
+        (2.0, 0.02, State.COASTING),
+    ],
+)
+def test_the_map_must_be_recognized_at_the_estimated_position(off_m, share, state):
+    """A less likely place nearby, where the view shows the map, says nothing of the likely one, nor
+    does one that hardly counts."""
     _, mixture, _ = flown(3, false_share=0.0)
-    likely = replace(mixture.hypotheses[0], share=0.9, recognized=0.0)
+    likely = replace(mixture.hypotheses[0], share=1 - share, recognized=0.0)
     beside = likely.mean + np.eye(8)[0] * off_m
-    other = replace(likely, share=0.1, recognized=1.0, mean=beside, number=likely.number + 1)
+    other = replace(likely, share=share, recognized=1.0, mean=beside, number=likely.number + 1)
     mixture.hypotheses, mixture.elsewhere = [likely, other], 0.0
     assert mixture.estimate(RADIUS_M).state is state
 

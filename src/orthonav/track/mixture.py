@@ -77,6 +77,9 @@ prediction. Without, a track is coasting (docs/decisions/tracking.md, 12)."""
 RECOGNIZED_SIGMAS = 1.5
 """Farther from the estimated position than this many standard deviations per axis, a view does not
 show the map there."""
+RECOGNIZED_SHARE = 0.1
+"""A hypothesis with less of the probability of its cluster does not show where the cluster is
+(docs/decisions/tracking.md, 16)."""
 UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
@@ -348,14 +351,16 @@ class Mixture:
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map at the estimated position.
 
-        Hypotheses of the cluster that are farther from it than it is certain do not speak for it.
+        Hypotheses of the cluster that are farther from it than it is certain, or that hardly
+        contribute to it, do not count.
         """
         reach_m = RECOGNIZED_SIGMAS * math.sqrt(float(np.trace(covariance[POSITION, POSITION])) / 2)
+        least = RECOGNIZED_SHARE * sum(each.share for each in near)
         return max(
             (
                 each.recognized
-                for each in major(near)
-                if float(np.hypot(*(each.mean - mean)[POSITION])) <= reach_m
+                for each in near
+                if each.share >= least and float(np.hypot(*(each.mean - mean)[POSITION])) <= reach_m
             ),
             default=0.0,
         )
