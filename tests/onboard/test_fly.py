@@ -291,8 +291,8 @@ def test_repeated_images_are_not_located(flight):
 
 def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
     """One velocity does not say how far an aircraft flew that turned while images were frozen."""
-    flight, told = begin(), {"vel_east_mps": 1.0, "vel_north_mps": 2.0, "vel_std_mps": 0.5}
-    flight.locator.outcome = lambda view: replace(fix(), evidence=MappingProxyType(told))
+    flight, own = begin(), {"vel_east_mps": 1.0, "vel_north_mps": 2.0, "vel_std_mps": 0.5}
+    flight.locator.outcome = lambda view: replace(fix(), evidence=MappingProxyType(own))
 
     def views(count, north_mps, **options):
         results = []
@@ -303,7 +303,7 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
         return results
 
     frozen = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
-    assert views(20, 20.0)[-1].outcome.evidence == told
+    assert views(20, 20.0)[-1].outcome.evidence == own
     views(1, 20.0, grey=frozen)
     views(10, 20.0, grey=frozen)
     views(10, -10.0, grey=frozen)
@@ -313,7 +313,7 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
     # The velocity of the fix is that of the moment: its error is that of the mean.
     assert first.outcome.evidence["vel_north_mps"] == pytest.approx(2.0 + (-10.0 - mean[1]))
     assert first.outcome.evidence["vel_east_mps"] == 1.0
-    assert second.outcome.evidence == told
+    assert second.outcome.evidence == own
 
 
 def test_samples_after_the_last_view_count_in_its_displacement(begin):

@@ -44,16 +44,13 @@ from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
 from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources.attitude import LOOKS_DOWN, Angles
-from orthonav.sources.recording import fitted
+from orthonav.sources.recording import LONG_GAP_NS, fitted
 
 log = logging.getLogger(__name__)
 TICK_NS = 10**9
 """Interval of health and state."""
 UTC_JUMP_NS = 200_000_000
 """UTC that moves by more than this against the monotonic clock within a tick has been set."""
-LONG_GAP_S = 1.0
-"""After so long without a view, a velocity at one time no longer says how far the aircraft flew: it
-may have turned."""
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
 Velocity = tuple[float, float]
@@ -348,13 +345,13 @@ class Runner:
         before_ns, link = self._tracked_ns, self._link
         if before_ns is None or telemetry.vel_en_mps is None or vehicle.travelled is None:
             return telemetry
-        gap_s = (image.exposed_ns - before_ns) / 1e9
-        if gap_s <= LONG_GAP_S:
+        gap_ns = image.exposed_ns - before_ns
+        if gap_ns <= LONG_GAP_NS:
             return telemetry
         # Samples that followed that view were not known then.
         again = None if link is None else link.state_at(before_ns).travelled
         moved = vehicle.travelled.since(again or self._travelled)
-        mean = None if moved is None else (moved[0] / gap_s, moved[1] / gap_s)
+        mean = None if moved is None else (moved[0] * 1e9 / gap_ns, moved[1] * 1e9 / gap_ns)
         return replace(telemetry, vel_en_mps=mean)
 
     def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:

@@ -209,7 +209,6 @@ class TelemetryBuffer:
             self._heights[_SECOND_AMSL] = _Samples(*slow)
         self._local = _Samples(*slow)
         self._parts += 1
-        self._travelled = Travelled(self._parts, 0.0, 0.0)
 
     def add_attitude(self, time_ns: int, wxyz: Sequence[float]) -> None:
         """Add a rotation from body (forward, right, down) to NED; invalid ones are dropped."""
@@ -245,16 +244,14 @@ class TelemetryBuffer:
         if not np.isfinite(values).all():
             return
         local = self._local
+        values[TRAVELLED] = self._parts, 0.0, 0.0
         if local.times and time_ns > local.times[-1]:
-            before, seconds = local.values[-1], (time_ns - local.times[-1]) / 1e9
-            fastest = np.abs([before[:2], values[:2]]).max()
+            fastest = np.abs([local.values[-1][:2], values[:2]]).max()
             if time_ns - local.times[-1] > local.gap_ns or fastest > FASTEST_MPS:
                 self._parts += 1
-                self._travelled = Travelled(self._parts, 0.0, 0.0)
+                values[TRAVELLED] = self._parts, 0.0, 0.0
             else:
-                north, east = before[TRAVELLED][1:] + seconds * (before[:2] + values[:2]) / 2
-                self._travelled = Travelled(self._parts, float(north), float(east))
-        values[TRAVELLED] = self._travelled
+                values[TRAVELLED] = self._travelled_at(time_ns, values[:2])
         local.add(time_ns, values, self._keep_ns)
 
     @property

@@ -19,7 +19,8 @@ from orthonav.sources.track import RecordedTrack
 Grey = NDArray[np.uint8]
 DECIMALS = 8
 LONG_GAP_NS = 1_000_000_000
-"""After so long a velocity at one time no longer says how far the aircraft flew."""
+"""After so long without a view a velocity at one time no longer says how far the aircraft flew: it
+may have turned."""
 JUMP_M, JUMP_MPS = 500.0, 150.0
 """Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
 that this program is for flies slower, and logs round positions to some metres."""
@@ -115,7 +116,7 @@ def known_at(
 
 def with_mean_velocities(views: Iterable[SourceView], track: RecordedTrack) -> Iterator[SourceView]:
     """Views, in order; the velocity of each that follows another after `LONG_GAP_NS` is the mean
-    since that one, by the track: the aircraft may have turned in between."""
+    since that one, by the track."""
     before_ns = None
     for view in views:
         now = view.telemetry
