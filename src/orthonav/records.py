@@ -28,6 +28,12 @@ three headings 6 deg apart, which is what docs/decisions/embedding.md measured; 
 five, and change every figure of the embedding alone."""
 DEFAULT_AGL_STD = 0.08
 """Standard deviation of a reported height that comes without one, over the height."""
+DEFAULT_TILT_STD_DEG = 3.0
+"""Standard deviation of reported pitch and of roll that come without one, degrees: mounts lean by 1
+to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
+RADIUS_SHARE = 0.025
+"""Least radius of the confidence over the height above ground: what an error of 1.4 deg of tilt
+makes."""
 
 MAP_STD_M = 3.0
 """Standard deviation, per axis, of a displacement of the map as a whole: it never averages out."""
@@ -72,7 +78,8 @@ class Telemetry:
     vel_en_mps: tuple[float, float] | None = None
     """Velocity over ground since the view before, true east and north."""
     tilt_std_deg: float | None = None
-    """Standard deviation of pitch and of roll from view to view; see `orthonav.track.Model`."""
+    """Standard deviation of the error of pitch and of roll, mount included; 0: they are exact.
+    `DEFAULT_TILT_STD_DEG` where None."""
     vel_std_mps: float | None = None
     """Standard deviation of the velocity per axis; see `orthonav.localizer.tracker`."""
     home_m: float | None = None
@@ -129,7 +136,15 @@ class Fix:
     agl_m: float
     evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
     ground_latlon_deg: tuple[float, float] | None = None
-    """Middle of the ground seen, where it was placed on terrain or looked far off nadir."""
+    """Ground that the middle of the picture shows."""
+    ground_cov_en_m2: NDArray[np.float64] | None = None
+    """Covariance (2, 2) of its east and north, m2."""
+    pitch_deg: float = math.nan
+    """Pitch and roll of the camera, estimated or, where they are exact, as reported."""
+    roll_deg: float = math.nan
+    pose_cov: NDArray[np.float64] | None = None
+    """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None
+    where the six were not estimated together."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from orthonav.localizer.camera import CameraFound, camera_found, tilt_std_deg
 from orthonav.localizer.prepared import PreparedView
-from orthonav.localizer.relief import LevelTerrain, Relief
-from orthonav.localizer.relief_camera import CameraFound, camera_found
+from orthonav.localizer.relief import Relief
 from orthonav.localizer.relief_view import ReliefView
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Placed, Refiner
@@ -58,8 +58,9 @@ class ViewOnLevelGround:
     is_level = True
     """Whether candidates stay as they were found; else they are placed again on the terrain."""
 
-    def __init__(self, registrar: Registrar, view: PreparedView) -> None:
+    def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
         self.registrar, self.view = registrar, view
+        self.seen = ReliefView(relief, view)
         self._finished: dict[Placed, Finished] = {}
         self._finer_scores: dict[Placed, float] = {}
 
@@ -81,19 +82,28 @@ class ViewOnLevelGround:
         """Judged candidates, at most `at_most` of them placed again, where none stands out."""
         return judged
 
-    def by_camera(self, found: Registered) -> tuple[Registered, ViewedGround | None]:
+    def by_camera(self, found: Registered) -> Registered:
         """The places found, as poses of the view on level ground below the camera."""
-        return found, None
+        return found
 
-    def resected(self, placed: Placed) -> CameraFound | None:
-        """The camera of a place with its pitch and roll; None where they are not examined."""
+    def viewed(self, found: Registered) -> ViewedGround | None:
+        """What the middle of the picture shows at the best of the places `by_camera`; None where
+        the ground is unknown."""
+        pose = _window(found.placed)
+        orientation = self.seen.orientation(pose)
+        if orientation is None:
+            return None
+        return ViewedGround(self.seen.middle_en_m(orientation, pose), self._terrain_gain(pose))
+
+    def camera(self, placed: Placed) -> CameraFound | None:
+        """The camera of a place `by_camera` with its pitch and roll; None where the reported ones
+        are exact or the view does not show them."""
+        if tilt_std_deg(self.view.picture_at(self.view.levels.final).telemetry) == 0:
+            return None
+        return camera_found(self.seen, self.registrar.reference, _window(placed))
+
+    def _terrain_gain(self, pose: Pose) -> float | None:
         return None
-
-    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
-        """Score at the final level near a pose of `by_camera`."""
-        levels = self.view.levels
-        refiner = self.registrar.refiner(self.view.templates, levels, levels.final)
-        return refiner.place(pose, steps, small_step_px).score
 
     def _finish(self, judged: Placed) -> Finished:
         return self.registrar.at_final(self.view.templates, self.view.levels, judged)
@@ -116,9 +126,8 @@ class ViewOverRelief(ViewOnLevelGround):
     """
 
     def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
-        super().__init__(registrar, view)
-        self.seen = ReliefView(relief, view)
-        self.is_level = isinstance(relief.terrain, LevelTerrain)
+        super().__init__(relief, registrar, view)
+        self.is_level = relief.is_level
         # By the pose of a finalist: score on the terrain at the judged level over that on level
         # ground; None: finished on level ground.
         self._gains: dict[Pose, float | None] = {}
@@ -251,38 +260,19 @@ class ViewOverRelief(ViewOnLevelGround):
             made = self.seen.templates_at(finalist.pose, self.view.levels.final - 1)
         return super()._finer_templates(finalist) if made is None else made
 
-    def by_camera(self, found: Registered) -> tuple[Registered, ViewedGround | None]:
+    def by_camera(self, found: Registered) -> Registered:
         """The same, of a view on the terrain: heights are counted from the ground below the camera,
         and the camera of the pose is where it is."""
         finalists = tuple((score, self._by_camera(each)) for score, each in found.finalists)
-        pose = found.placed.pose
-        orientation = self.seen.orientation(pose)
-        if orientation is None:
-            return found, None
-        gain = None
-        if not isinstance(self.seen.relief.terrain, LevelTerrain):
-            gain = self._gain(pose) or 1.0
-        seen = ViewedGround(self.seen.middle_en_m(orientation, pose), gain)
-        return replace(found, placed=self._by_camera(found.placed), finalists=finalists), seen
+        return replace(found, placed=self._by_camera(found.placed), finalists=finalists)
 
-    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
-        """The same on the terrain."""
-        window = self.seen.of_window(pose)
-        made = None if window is None else self.seen.templates_at(window, self.view.levels.final)
-        if made is None or window is None:
-            return super().score_near(pose, steps, small_step_px)
-        refiner = self.registrar.refiner(made, self.view.levels, self.view.levels.final)
-        return refiner.place(window, steps, small_step_px).score
-
-    def resected(self, placed: Placed) -> CameraFound | None:
-        """The camera of a place with its pitch and roll; None where their deviation is not reported
-        or the view does not show them."""
-        return camera_found(self.seen, self.registrar, placed)
+    def _terrain_gain(self, pose: Pose) -> float | None:
+        return None if self.seen.relief.is_level else self._gain(pose) or 1.0
 
     def _by_camera(self, placed: Placed) -> Placed:
         if self._gain(placed.pose) is None:
             return placed
-        return replace(placed, pose=self.seen.below_camera(placed.pose))
+        return replace(placed, pose=self.seen.below_camera(placed.pose), window=placed.pose)
 
     def _gain(self, pose: Pose) -> float | None:
         """The gain of the finalist at a pose, which may have been refined once more; None where it
@@ -294,3 +284,8 @@ class ViewOverRelief(ViewOnLevelGround):
 
         nearest = min(self._gains, key=apart, default=None)
         return None if nearest is None or apart(nearest) > near else self._gains[nearest]
+
+
+def _window(placed: Placed) -> Pose:
+    """The pose whose height is counted from the mean ground of the window."""
+    return placed.window or placed.pose

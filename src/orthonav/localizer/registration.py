@@ -6,9 +6,7 @@ them, and `orthonav.register` judges what they find. `locate` makes a fix of the
 `orthonav.atlas` and `orthonav.check` use the place itself.
 """
 
-import functools
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -18,38 +16,42 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import MapFileError, VariantError
+from orthonav.localizer.camera import CameraFound, tilt_std_deg
 from orthonav.localizer.candidates import ViewCandidates
-from orthonav.localizer.over_relief import ViewedGround, ViewOnLevelGround, ViewOverRelief
+from orthonav.localizer.over_relief import ViewOnLevelGround, ViewOverRelief
 from orthonav.localizer.plan import DEFAULT_PLAN, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import is_oblique, off_nadir_deg
 from orthonav.localizer.relief import LevelTerrain, Relief
-from orthonav.localizer.relief_camera import CameraFound
 from orthonav.localizer.view_search import ViewSearch
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.terrain import TerrainLayer
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.records import RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import Pose
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
+from orthonav.track.hypotheses import within
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredView:
     """A prepared view and its best place; `found` is a `NoFix` where it could not be compared.
 
-    `ground`: what it saw, where the map has a terrain or the view is oblique. `camera`: makes the
-    camera with its pitch and roll, None where these are not examined.
+    `ground`: the view on the ground of the map, None where it could not be compared.
     """
 
     prepared: PreparedView
     found: Registered | NoFix
-    ground: ViewedGround | None = None
-    camera: Callable[[], CameraFound | None] = lambda: None
+    ground: ViewOnLevelGround | None = None
+
+    def camera(self, placed: Placed) -> CameraFound | None:
+        """The camera of one of the places found, with its pitch and roll; None where the reported
+        ones are exact or the view does not show them."""
+        return None if self.ground is None else self.ground.camera(placed)
 
 
 class RegistrationLocalizer:
@@ -79,7 +81,7 @@ class RegistrationLocalizer:
         self.confidence, self.radius_m = confidence, radius_m
         self.propose, self.plan = propose, plan
         self.floor_px = floor_px
-        self.relief = None if terrain is None else Relief(terrain, self.grid)
+        self.relief = Relief(terrain or LevelTerrain(), self.grid)
 
     @classmethod
     def of_map(
@@ -131,7 +133,7 @@ class RegistrationLocalizer:
             return seen
         if isinstance(seen.found, NoFix):
             return seen.found
-        return self._fix(seen.prepared, seen.found, view.telemetry, seen)
+        return self._fix(seen, seen.found, view.telemetry)
 
     def register(
         self, view: View, prior: Prior | None = None, heading_known: bool = True
@@ -140,7 +142,7 @@ class RegistrationLocalizer:
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
-        if self.relief is not None:
+        if not self.relief.is_level:
             prepared = replace(prepared, prior=self.relief.expected(prepared))
         if not self._candidates(prepared, prior).touches_map:
             outside = NoFix("outside_map", "the area of the prior is outside the map")
@@ -152,8 +154,7 @@ class RegistrationLocalizer:
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
             return RegisteredView(prepared, NoFix("no_match", detail))
-        resect = functools.partial(ground.resected, found.placed)
-        return RegisteredView(prepared, *ground.by_camera(found), resect)
+        return RegisteredView(prepared, ground.by_camera(found), ground)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
@@ -176,71 +177,78 @@ class RegistrationLocalizer:
 
     def on_ground(self, view: PreparedView) -> ViewOnLevelGround:
         """A view on the terrain of the map, where it has one."""
-        if self.relief is not None:
-            return ViewOverRelief(self.relief, self.registrar, view)
-        if is_oblique(view.picture_at(view.levels.final)):
-            level = Relief(LevelTerrain(), self.grid)
-            return ViewOverRelief(level, self.registrar, view)
-        return ViewOnLevelGround(self.registrar, view)
+        level = self.relief.is_level and not is_oblique(view.picture_at(view.levels.final))
+        made = ViewOnLevelGround if level else ViewOverRelief
+        return made(self.relief, self.registrar, view)
 
-    def _fix(
-        self,
-        view: PreparedView,
-        best: Registered,
-        telemetry: Telemetry,
-        seen: RegisteredView,
-    ) -> Fix:
-        placed, camera = best.placed, seen.camera()
-        place = self.camera_en_m(view, placed.pose)
-        spread = self.covariance(view, placed)
-        covariance = spread[:2, :2]
-        heading_deg = math.degrees(placed.pose.turn_rad) % 360
-        agl_m = telemetry.agl_m * math.exp(placed.pose.log_scale)
-        assert placed.covariance is not None
-        gsd_m = self.grid.gsd_m
+    def _fix(self, seen: RegisteredView, best: Registered, telemetry: Telemetry) -> Fix:
+        assert seen.ground is not None
+        camera, viewed = seen.camera(best.placed), seen.ground.viewed(best)
         # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
-        floor_m = self.floor_px * gsd_m * 2.0**view.levels.final
-        of_middle: NDArray[np.float64] | None = placed.covariance[:2, :2] * gsd_m**2
-        stds = {
-            "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
-            "log_scale_std": math.sqrt(spread[3, 3]),
-        }
-        if camera is not None:
-            place, agl_m = camera.orientation.position_m[:2], camera.agl_m
-            heading_deg = float(camera.orientation.attitude_deg[0]) % 360
-            covariance = camera.covariance[:2, :2] + np.eye(2) * floor_m**2
-            stds = _attitude_found(camera, telemetry)
-            of_middle = camera.middle_covariance
-        elif telemetry.tilt_std_deg is not None:
-            # A line of sight off nadir meets the ground farther out by 1 / cos^2.
-            cos = math.cos(math.radians(off_nadir_deg(telemetry)))
-            tilt_m = agl_m * math.radians(telemetry.tilt_std_deg) / cos**2
-            covariance = covariance + np.eye(2) * tilt_m**2
-        if of_middle is not None:
-            widest = float(np.linalg.eigvalsh(of_middle)[-1])
-            stds["middle_std_m"] = math.sqrt(widest + floor_m**2)
-        lat, lon = self.sheet.frame.latlon_from_en(place)
-        covariance.flags.writeable = False
+        floor_m = self.floor_px * self.grid.gsd_m * 2.0**seen.prepared.levels.final
+        if camera is None:
+            found = self._by_similarity(seen.prepared, best.placed, telemetry, floor_m)
+            middle_en_m = None if viewed is None else viewed.middle_en_m
+        else:
+            found = _by_camera(camera, telemetry, floor_m)
+            middle_en_m = camera.middle_en_m
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
-        evidence |= stds
+        radius_m = max(self.radius_m, RADIUS_SHARE * found.agl_m)
+        # Of the camera: its place is right, and its error is within the radius.
+        confidence *= within(found.place_en_m, found.cov_en_m2, radius_m)
+        evidence |= found.stds
+        if found.middle_cov_en_m2 is not None:
+            widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
+            evidence["middle_std_m"] = math.sqrt(widest)
+        if viewed is not None and viewed.gain is not None:
+            evidence["terrain_gain"] = viewed.gain
+        lat, lon = self.sheet.frame.latlon_from_en(found.place_en_m)
         middle = None
-        if seen.ground is not None:
-            if seen.ground.gain is not None:
-                evidence["terrain_gain"] = seen.ground.gain
-            middle_en_m = seen.ground.middle_en_m if camera is None else camera.middle_en_m
+        if middle_en_m is not None:
             middle_deg = self.sheet.frame.latlon_from_en(middle_en_m)
             middle = float(middle_deg[0]), float(middle_deg[1])
+        for each in (found.cov_en_m2, found.middle_cov_en_m2, found.pose_cov):
+            if each is not None:
+                each.flags.writeable = False
+        heading_deg, pitch_deg, roll_deg = found.attitude_deg
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
-            cov_en_m2=covariance,
+            cov_en_m2=found.cov_en_m2,
             confidence=confidence,
-            radius_m=self.radius_m,
-            heading_deg=heading_deg,
-            agl_m=agl_m,
+            radius_m=radius_m,
+            heading_deg=heading_deg % 360,
+            agl_m=found.agl_m,
             evidence=MappingProxyType(evidence),
             ground_latlon_deg=middle,
+            ground_cov_en_m2=None if middle is None else found.middle_cov_en_m2,
+            pitch_deg=pitch_deg,
+            roll_deg=roll_deg,
+            pose_cov=found.pose_cov,
+        )
+
+    def _by_similarity(
+        self, view: PreparedView, placed: Placed, telemetry: Telemetry, floor_m: float
+    ) -> "_Found":
+        """Position, height and heading under the reported pitch and roll."""
+        assert placed.covariance is not None
+        spread = self.covariance(view, placed)
+        agl_m = telemetry.agl_m * math.exp(placed.pose.log_scale)
+        covariance = spread[:2, :2]
+        # A line of sight off nadir meets the ground farther out by 1 / cos^2.
+        cos = math.cos(math.radians(off_nadir_deg(telemetry)))
+        tilt_m = agl_m * math.radians(tilt_std_deg(telemetry)) / cos**2
+        return _Found(
+            self.camera_en_m(view, placed.pose),
+            (math.degrees(placed.pose.turn_rad), telemetry.pitch_deg, telemetry.roll_deg),
+            agl_m,
+            covariance + np.eye(2) * tilt_m**2,
+            placed.covariance[:2, :2] * self.grid.gsd_m**2 + np.eye(2) * floor_m**2,
+            {
+                "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
+                "log_scale_std": math.sqrt(spread[3, 3]),
+            },
         )
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
@@ -275,15 +283,39 @@ class RegistrationLocalizer:
         return np.asarray(metres @ spread @ metres)
 
 
-def _attitude_found(camera: CameraFound, telemetry: Telemetry) -> dict[str, float]:
-    """Pitch and roll by resection over the reported ones, and standard deviations."""
-    _, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
-    up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)[2:]).tolist()
-    return {
-        "heading_std_deg": heading,
-        "log_scale_std": up_m / camera.agl_m,
-        "pitch_bias_deg": pitch_deg - telemetry.pitch_deg,
-        "roll_bias_deg": roll_deg - telemetry.roll_deg,
-        "pitch_bias_std_deg": pitch,
-        "roll_bias_std_deg": roll,
-    }
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a fix says of the camera; see `Fix`. `stds` go into its evidence."""
+
+    place_en_m: NDArray[np.float64]
+    attitude_deg: tuple[float, float, float]
+    agl_m: float
+    cov_en_m2: NDArray[np.float64]
+    middle_cov_en_m2: NDArray[np.float64] | None
+    stds: dict[str, float]
+    pose_cov: NDArray[np.float64] | None = None
+
+
+def _by_camera(camera: CameraFound, telemetry: Telemetry, floor_m: float) -> _Found:
+    """Position, height and attitude from the blocks of the view."""
+    heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
+    _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
+    covariance = camera.covariance.copy()
+    covariance[:2, :2] += np.eye(2) * floor_m**2
+    middle = camera.middle_covariance
+    return _Found(
+        camera.orientation.position_m[:2],
+        (heading_deg, pitch_deg, roll_deg),
+        camera.agl_m,
+        covariance[:2, :2].copy(),
+        None if middle is None else middle + np.eye(2) * floor_m**2,
+        {
+            "heading_std_deg": heading,
+            "log_scale_std": up_m / camera.agl_m,
+            "pitch_bias_deg": pitch_deg - telemetry.pitch_deg,
+            "roll_bias_deg": roll_deg - telemetry.roll_deg,
+            "pitch_bias_std_deg": pitch,
+            "roll_bias_std_deg": roll,
+        },
+        covariance,
+    )

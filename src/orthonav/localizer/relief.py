@@ -32,7 +32,7 @@ class Terrain(Protocol):
 
 
 class LevelTerrain:
-    """Level ground at sea level, for views far off nadir over maps without a terrain."""
+    """Ground of one height, 0: that of maps without a terrain."""
 
     def at_en_m(self, points_en_m: ArrayLike) -> Array:
         """Zeros (...) at points (..., 2)."""
@@ -45,6 +45,11 @@ class Relief:
     def __init__(self, terrain: Terrain, grid: TileGrid) -> None:
         self.terrain, self.grid = terrain, grid
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the ground is level, as without a terrain."""
+        return isinstance(self.terrain, LevelTerrain)
 
     def en_m(self, map_px: Array) -> Array:
         """Metres east and north (..., 2) of map coordinates at level 0."""

@@ -14,6 +14,7 @@ from orthonav.geo.camera import enu_from_camera, undistort
 from orthonav.geo.ground import sight_on_ground
 from orthonav.localizer.orthorectify import Orientation, node_px, orthorectified
 from orthonav.localizer.prepared import PreparedView
+from orthonav.localizer.rectify import is_oblique
 from orthonav.localizer.relief import Relief
 from orthonav.register.pose import Pose
 from orthonav.register.template import ViewTemplates
@@ -40,6 +41,11 @@ class ReliefView:
         x, y = np.meshgrid(cols - valid.shape[1] / 2, rows - valid.shape[0] / 2)
         nodes = np.stack([x, y], axis=-1) * 2.0**view.levels.final
         self._reference_px = nodes[used] if used.any() else nodes.reshape(-1, 2)
+
+    @property
+    def is_oblique(self) -> bool:
+        """Whether the view is far off nadir."""
+        return is_oblique(self.view.picture_at(self.view.levels.final))
 
     def templates_at(
         self, pose: Pose, level: int, orientation: Orientation | None = None
@@ -108,18 +114,6 @@ class ReliefView:
         turned = replace(pose, log_scale=math.log((above_sea_m - below_m) / agl_m))
         x, y = pose.map_px(camera_px) - turned.linear @ camera_px
         return replace(turned, x_px=float(x), y_px=float(y))
-
-    def of_window(self, pose: Pose) -> Pose | None:
-        """The inverse of `below_camera`; None where the ground is unknown."""
-        agl_m = self.view.picture_at(self.view.levels.final).telemetry.agl_m
-        camera = pose.map_px(self.view.camera_px)
-        below_m = float(self.relief.terrain.at_en_m(self.relief.en_m(camera)))
-        above_m = below_m + agl_m * math.exp(pose.log_scale) - self.reference_m(pose)
-        if not above_m > 0:  # also where it is unknown
-            return None
-        scaled = replace(pose, log_scale=math.log(above_m / agl_m))
-        x, y = camera - scaled.linear @ self.view.camera_px
-        return replace(scaled, x_px=float(x), y_px=float(y))
 
     def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
         """Where the middle of the picture looks on the terrain; the middle of the window of `pose`

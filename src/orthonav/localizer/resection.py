@@ -1,10 +1,12 @@
-"""Position, height, heading, pitch and roll of a camera from blocks of a registered view.
+"""Position, height, heading, pitch and roll of a camera from the blocks of a registered view.
 
-Resection by linearized least squares: each block of the view pulls towards where it lies on the map
-(`orthonav.register.refine.Refiner.pulls`), the telemetry holds height and attitude within their
-standard deviations. Blocks that pull against the others count less (Huber).
+Each block of the view says how well it fits the map when it is moved a little aside
+(`orthonav.register.blocks`). The camera is where the blocks fit best together, moved as one camera
+moves them, and where the telemetry allows: the maximum of a posterior, found by Newton's method.
+Ground that changed fits nowhere and counts little (a mixture with outliers).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,78 +14,182 @@ from numpy.typing import NDArray
 
 from orthonav.geo.camera import Camera
 from orthonav.localizer.orthorectify import Orientation
+from orthonav.register.blocks import BlockScores
 
 STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Steps of the numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
 GROUND_STEP_M = 2.0
 """The same of a point along the ground: about the noise of a terrain model over its slope."""
-HUBER = 1.5
-"""Blocks farther off than so many standard deviations count less."""
-CORRELATED = 10.0
-"""Errors of blocks are not independent, for those of terrain and imagery reach over several: the
-variance is so many times larger. Neither are curvatures: those of the view also hold noise and what
-changed, and the derivatives that map and view share were 0.8 of them, 0.3 to 1.2 by direction.
-Chosen on `python -m benchmarks.pixel_ellipses --seed 1 --area 3`, scored on other ground."""
-REWEIGHTED = 3
+BLURS_PX = (2.0, 1.0, 0.7, 0.0, 0.0, 0.0)
+"""Gaussian blur of the correlations at each step: wide peaks first, so that a view off by several
+pixels is not caught by chance."""
+FINAL_STEPS = 3
+"""Steps after the information of the blocks was compared with the scatter of their slopes."""
+LONGEST_STEP_PX = 3.0
+"""A step moves no block farther."""
+PIXELS_PER_NUMBER = 5.0
+"""Pixels that hold one independent number. Only the odds of outliers depend on it."""
+LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9
+"""Limits of the mean correlation that a right block is expected to have."""
+CORRELATED = 3.5
+"""Errors of neighbouring blocks, of levels and of dates are not independent: the variance is so
+many times what the scatter between blocks implies (docs/decisions/camera.md)."""
 MIN_BLOCKS = 8
 """Fewer blocks do not show an attitude."""
+WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
+"""Standard deviations of a camera of which nothing is reported: metres and degrees."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Resection:
     """A correction (6,) of metres east, north, up and degrees of heading, pitch and roll, and the
-    covariance (6, 6) of what it corrects."""
+    covariance (6, 6) of what it corrects: `correction`, `covariance` by blocks and telemetry,
+    `alone`, `alone_covariance` by the blocks alone, as far as they show it (`WEAK`)."""
 
     correction: Array
     covariance: Array
+    alone: Array
+    alone_covariance: Array
 
 
 def resected(
-    camera: Camera,
-    orientation: Orientation,
-    ground_m: Array,
-    slopes: Array,
-    pulls: tuple[Array, Array],
-    prior: tuple[Array, Array],
+    seen: Sequence[tuple[BlockScores, Array]], prior: tuple[Array, Array]
 ) -> Resection | None:
-    """The camera at which the blocks of a view lie on the ground that they show.
+    """The camera under which the blocks of a view fit the map best.
 
-    `ground_m` (N, 3): middles of the blocks on the terrain, east, north, above sea; `slopes`
-    (N, 2): its rise per metre east and north there. `pulls`: what moves them over the ground, as
-    gradient (N, 2) and curvature (N, 2, 2) of the score by metres east and north. `prior`: expected
-    correction (6,) and its information (6, 6). None where too few blocks are seen.
+    `seen`: for each level of the map, all with the same reach, the blocks, and how far (N, 2, 6)
+    what they show moves over the window by metres and degrees of the camera, pixels of the level
+    right and down. `prior`: expected correction (6,) and its information (6, 6). None where too few
+    blocks are seen.
     """
-    moved = _moved_by_camera(camera, orientation, ground_m, slopes)
-    gradient, curvature = pulls
-    used = np.isfinite(moved).all(axis=(1, 2)) & (np.trace(curvature, axis1=1, axis2=2) > 0)
-    if used.sum() < MIN_BLOCKS:
+    blocks = _Blocks.of(seen)
+    if blocks is None:
         return None
-    moved, gradient, curvature = moved[used], gradient[used], curvature[used]
-    own = np.trace(curvature, axis1=1, axis2=2)[:, None, None]
-    inverse = np.linalg.inv(curvature + 0.02 * own * np.eye(2))
-    weights = np.ones(len(moved))
-    variance, correction = 1.0, np.zeros(6)
-    for _ in range(REWEIGHTED):
-        scaled = weights / variance
-        normal = np.einsum("n,nip,nij,njq->pq", scaled, moved, curvature, moved)
-        slope = np.einsum("n,nip,ni->p", scaled, moved, gradient)
-        mean, information = prior
-        covariance = np.linalg.inv(normal + information)
-        correction = covariance @ (slope + information @ mean)
-        left = gradient - np.einsum("nij,njp,p->ni", curvature, moved, correction)
-        off = np.einsum("ni,nij,nj->n", left, inverse, left)
-        # Two numbers of each block; the median of chi squared of two is 2 ln 2.
-        alone = max(float(np.median(off)) / (2 * np.log(2)), 1e-12)
-        variance = CORRELATED * alone
-        weights = np.minimum(1.0, HUBER / np.maximum(np.sqrt(off / (2 * alone)), 1e-9))
-    return Resection(correction, covariance)
+    mean, information = prior
+    correction = np.zeros(6)
+    for blur_px in BLURS_PX:
+        correction = blocks.stepped(correction, blur_px, 1.0, mean, information)
+    curvature, slopes = blocks.system(correction)
+    inverse = np.linalg.pinv(curvature, hermitian=True)
+    spread = slopes.T @ slopes * (len(slopes) / max(len(slopes) - 6, 1))
+    excess = max(1.0, CORRELATED * float(np.trace(inverse @ spread)) / 6)
+    for _ in range(FINAL_STEPS):
+        correction = blocks.stepped(correction, 0.0, excess, mean, information)
+    curvature = blocks.system(correction)[0] / excess
+    covariance = np.linalg.inv(curvature + information)
+    # Without the telemetry's share: where the quadratic of the blocks alone has its peak.
+    alone_covariance = np.linalg.inv(curvature + np.diag(WEAK**-2))
+    alone = correction + alone_covariance @ information @ (correction - mean)
+    if not all(np.isfinite(each).all() for each in (correction, covariance, alone_covariance)):
+        return None
+    return Resection(correction, covariance, alone, alone_covariance)
 
 
-def _moved_by_camera(
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Blocks (L * N) of all levels: correlations (L * N, S, S), pixels (L * N,), and their moves
+    (L * N, 2, 6) by the camera."""
+
+    levels: int
+    correlations: Array
+    pixels: Array
+    moved: Array
+
+    @classmethod
+    def of(cls, seen: Sequence[tuple[BlockScores, Array]]) -> "_Blocks | None":
+        """None where fewer than `MIN_BLOCKS` count at every level."""
+        moved = np.concatenate([each for _, each in seen])
+        known = np.isfinite(moved).all(axis=(1, 2))
+        pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
+        if (pixels.reshape(len(seen), -1) > 0).sum(axis=1).max() < MIN_BLOCKS:
+            return None
+        correlations = np.concatenate([scores.correlations for scores, _ in seen])
+        moved = np.where(known[:, None, None], moved, 0.0)
+        return cls(len(seen), correlations, pixels, moved)
+
+    def stepped(
+        self, correction: Array, blur_px: float, excess: float, mean: Array, information: Array
+    ) -> Array:
+        """The correction after one step of Newton's method; the blocks say less by `excess`."""
+        curvature, slopes = self.system(correction, blur_px)
+        pull = slopes.sum(axis=0) / excess + information @ (mean - correction)
+        step = np.linalg.solve(curvature / excess + information, pull)
+        longest = float(np.hypot(*(self.moved @ step).T).max())
+        return np.asarray(correction + step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9)))
+
+    def system(self, correction: Array, blur_px: float = 0.0) -> tuple[Array, Array]:
+        """Curvature (6, 6) of the log likelihood at a correction, and its slope (N, 6) by each
+        block, its levels added up."""
+        here, slope, curvature = _quadratic(
+            _blurred(self.correlations, blur_px), self.moved @ correction
+        )
+        by_level = (here * self.pixels).reshape(self.levels, -1).sum(axis=1)
+        pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
+        usual = by_level / np.maximum(pixels, 1.0)
+        usual = np.clip(usual, LEAST_CORRELATION, MOST_CORRELATION)
+        usual = np.repeat(usual, len(here) // self.levels)
+        # Log likelihood of a pair of Gaussians of this correlation, per unit of the measured one.
+        weight = usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
+        odds = np.clip(weight * (here - usual / 2), -30.0, 30.0)
+        weight /= 1 + np.exp(-odds)
+        terms = np.einsum("nip,ni->np", self.moved, slope * weight[:, None])
+        held = curvature * weight[:, None, None]
+        total = np.einsum("nip,nij,njq->pq", self.moved, held, self.moved)
+        return total, terms.reshape(self.levels, -1, 6).sum(axis=0)
+
+
+def _blurred(correlations: Array, blur_px: float) -> Array:
+    """Correlations (N, S, S) blurred by a Gaussian."""
+    if blur_px == 0:
+        return correlations
+    at = np.arange(correlations.shape[1])
+    kernel = np.exp(-((at[:, None] - at) ** 2) / (2 * blur_px**2))
+    kernel /= kernel.sum(axis=1, keepdims=True)
+    return np.asarray(kernel @ correlations @ kernel.T)
+
+
+def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
+    """Surfaces (N, S, S) at displacements (N, 2), x and y: their values (N,) at the nearest pixel,
+    slopes (N, 2) and curvatures (N, 2, 2), not negative.
+
+    By the quadratic through the pixels around; beyond the surface slope and curvature are 0.
+    """
+    reach = surfaces.shape[1] // 2
+    inside = (np.abs(moved_px) <= reach).all(axis=1)
+    held = np.clip(moved_px, 1 - reach, reach - 1)
+    nearest = np.rint(held)
+    x, y = (nearest.astype(int) + reach).T
+    rows = np.arange(len(surfaces))
+
+    def at(right: int, down: int) -> Array:
+        return np.asarray(surfaces[rows, y + down, x + right])
+
+    here = at(0, 0)
+    slope = np.stack([at(1, 0) - at(-1, 0), at(0, 1) - at(0, -1)], axis=-1) / 2
+    along = 2 * here - at(1, 0) - at(-1, 0)
+    down = 2 * here - at(0, 1) - at(0, -1)
+    across = (at(1, -1) + at(-1, 1) - at(1, 1) - at(-1, -1)) / 4
+    curvature = np.stack([along, across, across, down], axis=-1).reshape(-1, 2, 2)
+    slope = slope - np.einsum("nij,nj->ni", curvature, np.clip(moved_px - nearest, -1.0, 1.0))
+    return here, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
+
+
+def _positive(matrices: Array) -> Array:
+    """Symmetric matrices (N, 2, 2) with negative eigenvalues set to 0."""
+    values, vectors = np.linalg.eigh(matrices)
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(1, 2))
+
+
+def moved_by_camera(
     camera: Camera, orientation: Orientation, ground_m: Array, slopes: Array
 ) -> Array:
-    """How far (N, 2, 6) what is seen at an image point moves over the ground with the camera."""
+    """How far (N, 2, 6) what is seen at an image point moves over the ground, metres east and
+    north, by metres and degrees of the camera.
+
+    `ground_m` (N, 3): the ground seen, east, north, above sea; `slopes` (N, 2): its rise per metre
+    east and north. NaN where it cannot be seen.
+    """
     by_ground = []
     for axis in range(2):
         step = np.zeros((len(ground_m), 3))

@@ -4,8 +4,9 @@
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
  * `spread` adds up what the covariance is made of. `derive` makes the view's derivatives and adds up
- * their products. The Python modules do the same with NumPy; they are the oracle of this file and take
- * its place where it was not compiled.
+ * their products. `blocks` compares each block of a view with the map a little aside. The Python
+ * modules do the same with NumPy; they are the oracle of this file and take its place where it was
+ * not compiled.
  *
  * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
 
@@ -16,7 +17,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define LAYOUT 4        /* of all arguments and results; kernel.py has the same number */
+#define LAYOUT 5        /* of all arguments and results; kernel.py has the same number */
 #define BLOCKS 6        /* blocks along a side of a view: orthonav.register.template.BLOCKS */
 #define FULLY_VALID 0.99f
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
@@ -26,6 +27,7 @@
 #define BLOCK_SUMS 7    /* four steps' terms, both products, pixels that count */
 #define SPREAD (16 + 16 + BLOCKS * BLOCKS * BLOCK_SUMS)
 #define CHUNK 128       /* pixels of a row whose taps are found together */
+#define ASIDE 9         /* moves along a row that are added up together: as many vectors as registers hold */
 
 typedef struct {
     const float *view;      /* (H, W, 4): evidence of the view and its mask */
@@ -482,6 +484,44 @@ int is_whole(const Py_buffer *buffer) {
     return 1;
 }
 
+/* Products of one row of a block with the map under `count` moves along it, added to `sums`. */
+INLINE void add_moves(const float *mine, const float *other, int pixels, int count, lanes *sums) {
+    for (int x = 0; x < pixels; x++) {
+        const lanes view = load(mine + LANES * x);
+        for (int move = 0; move < count; move++)
+            sums[move] += view * load(other + LANES * (x + move));
+    }
+}
+
+/* Products (B * B, 2 R + 1, 2 R + 1, 4) of each block of a view (H, W, 4) with the map
+ * (H + 2 R, W + 2 R, 4) moved by up to R = `reach` pixels. */
+INLINE void blocks_inline(const float *view, int rows, int cols, const float *map, int reach,
+                          float *out) {
+    const int moves = 2 * reach + 1, together = moves < ASIDE ? moves : ASIDE;
+    const size_t stride = (size_t)LANES * (cols + 2 * reach);
+    for (int block = 0; block < BLOCKS * BLOCKS; block++) {
+        const int i = block / BLOCKS, j = block % BLOCKS;
+        const int top = i * rows / BLOCKS, bottom = (i + 1) * rows / BLOCKS;
+        const int left = j * cols / BLOCKS, pixels = (j + 1) * cols / BLOCKS - left;
+        for (int down = 0; down < moves; down++, out += LANES * moves)
+            for (int first = 0; first < moves; first += together) {
+                const int at = first < moves - together ? first : moves - together;
+                lanes sums[ASIDE] = {{0}};
+                for (int row = top; row < bottom; row++) {
+                    const float *mine = view + LANES * ((size_t)cols * row + left);
+                    const float *other = map + stride * (row + down) + LANES * (left + at);
+                    if (together == ASIDE) add_moves(mine, other, pixels, ASIDE, sums);
+                    else add_moves(mine, other, pixels, together, sums);
+                }
+                memcpy(out + LANES * at, sums, sizeof(lanes) * together);
+            }
+    }
+}
+
+FOR_EVERY_PROCESSOR(blocks,
+                    (const float *view, int rows, int cols, const float *map, int reach, float *out),
+                    (view, rows, cols, map, reach, out))
+
 /* Whether view and slopes are contiguous and of one shape; else an error is set. */
 static int are_alike(const Py_buffer *view, const Py_buffer *slopes) {
     if (is_whole(view) && is_whole(slopes) && view->shape[0] == slopes->shape[0] &&
@@ -621,6 +661,35 @@ static PyObject *py_spread(PyObject *self, PyObject *arguments) {
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }
 
+static PyObject *py_blocks(PyObject *self, PyObject *arguments) {
+    PyObject *from[2], *to;
+    Py_buffer view, map, out;
+    int reach;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OOiO", &from[0], &from[1], &reach, &to)) return NULL;
+    if (borrow(from[0], &view, 3, LANES, 'f', 0) < 0) return NULL;
+    if (borrow(from[1], &map, 3, LANES, 'f', 0) < 0) goto free_view;
+    if (borrow(to, &out, 4, LANES, 'f', PyBUF_WRITABLE) < 0) goto free_map;
+    const Py_ssize_t moves = 2 * (Py_ssize_t)reach + 1;
+    if (reach < 0 || reach > LARGEST || view.shape[0] < 1 || view.shape[1] < 1 ||
+        view.shape[0] > LARGEST || view.shape[1] > LARGEST || !is_whole(&view) || !is_whole(&map) ||
+        !is_whole(&out) || map.shape[0] != view.shape[0] + moves - 1 ||
+        map.shape[1] != view.shape[1] + moves - 1 || out.shape[0] != BLOCKS * BLOCKS ||
+        out.shape[1] != moves || out.shape[2] != moves)
+        PyErr_SetString(PyExc_ValueError, "view, map, reach and products do not match");
+    else {
+        Py_BEGIN_ALLOW_THREADS
+        blocks(view.buf, (int)view.shape[0], (int)view.shape[1], map.buf, reach, out.buf);
+        Py_END_ALLOW_THREADS
+    }
+    PyBuffer_Release(&out);
+free_map:
+    PyBuffer_Release(&map);
+free_view:
+    PyBuffer_Release(&view);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
 static PyMethodDef functions[] = {
     {"refine", py_refine, METH_VARARGS,
      "refine(window, view, slopes, numbers, pose, limits): see orthonav.register.refine."},
@@ -628,6 +697,8 @@ static PyMethodDef functions[] = {
      "spread(window, view, slopes, numbers, pose, limits, out): see orthonav.register.refine."},
     {"derive", py_derive, METH_VARARGS,
      "derive(view, slopes, out): see orthonav.register.template."},
+    {"blocks", py_blocks, METH_VARARGS,
+     "blocks(view, map, reach, out): see orthonav.register.blocks."},
     {"search", py_search, METH_VARARGS,
      "search(spectra, view, weights, poses, first, best, which, expected): see "
      "orthonav.register.search."},

@@ -56,7 +56,9 @@ class Placed:
     `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
     `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
     standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
-    pixels), turn (rad) and log scale, where they were asked for.
+    pixels), turn (rad) and log scale, where they were asked for; `window`: over relief, the pose
+    whose height is counted from the mean ground of the window, that of `pose` from the ground below
+    the camera.
     """
 
     pose: Pose
@@ -69,6 +71,7 @@ class Placed:
     agreement: float = math.nan
     blocks_t: float = math.nan
     covariance: NDArray[np.float64] | None = None
+    window: Pose | None = None
 
     @classmethod
     def unjudged(cls, pose: Pose, level: int) -> "Placed":
@@ -165,21 +168,6 @@ class Refiner:
         """The view beside the map under a pose."""
         planes = sampled_planes(self.template, window, pose)
         return Comparison(self.template, pose, compared(self.template, *planes))
-
-    def pulls(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What moves each block of the view over the map at `pose`: gradient (B * B, 2) of the
-        score's decrease and curvature (B * B, 2, 2), by level-0 pixels of the map."""
-        template = self.template
-        window = MapWindow.of(template, self.reference, pose, SLACK_PX)
-        pixels = _Pixels(template, window, pose)
-        seen = pixels.seen
-        terms = np.einsum("cphw,chw->phw", template.gradients, pixels.residual)
-        slopes = template.block_sums(terms).astype(np.float64).T
-        each = np.tensordot(template.block_hessians, seen.squares, axes=([1], [0]))
-        to_window = np.linalg.inv(pose.linear * 2.0**template.level)
-        curvature = to_window.T @ (seen.shares()[:, None, None] * each[:, :2, :2]) @ to_window
-        # A step of the window moves what it shows the other way.
-        return -slopes @ to_window, curvature
 
     def _hessian(self, seen: "Comparison") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
