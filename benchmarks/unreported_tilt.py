@@ -1,12 +1,13 @@
 """Single views whose pitch and roll are not reported: how far off they are placed.
 
 `python -m benchmarks.unreported_tilt --work DIR [--views 100] [--tilt 0 2 4] [--width 256 128]
-[--seed 1] [--only TEXT ..] [--workers 1] [--out FILE.md]` flies over the later date of each pair of
-`benchmarks.trust_views` (optional real imagery, and generated ground) at random places, and places
-the views on a map of the earlier date as `orthonav build` makes it. True pitch and roll are drawn
-with a standard deviation of `--tilt` deg each; the telemetry reports 0 for both and no standard
-deviation. `--width` is the root of the area that a view covers, in pixels of the map. Maps and
-flights stay in DIR: use another one after the code that makes them has changed.
+[--seed 1] [--only TEXT ..] [--workers 1] [--pictures] [--out FILE.md]` flies over the later date of
+each pair of `benchmarks.trust_views` (optional real imagery, and generated ground) at random
+places, and places the views on a map of the earlier date as `orthonav build` makes it. True pitch
+and roll are drawn with a standard deviation of `--tilt` deg each; the telemetry reports 0 for both
+and no standard deviation. `--width` is the root of the area that a view covers, in pixels of the map. Maps and
+flights stay in DIR: use another one after the code that makes them has changed. `--pictures` writes
+the worst confident view of each row to DIR, see `benchmarks.tilt_pictures`.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from benchmarks.inputs import DATA, file_of, map_of
 from benchmarks.record import Table, number, provenance
+from benchmarks.tilt_pictures import Exterior, attitude_of, write_picture
 from benchmarks.trust_views import Pair, is_covered, pairs, views_in
 from orthonav.geo.camera import axis_on_ground_en_m
 from orthonav.geo.frames import LocalFrame
@@ -117,6 +119,12 @@ def name_of(pair: Pair) -> str:
     return f"{past_path.parent.name} {past_path.stem} > {present_path.stem}"
 
 
+def stem_of(case: Case) -> str:
+    """Beginning of the names of files of a case."""
+    plain = name_of(case.pair).replace(" > ", "-").replace(" ", "-")
+    return f"{plain}-{case.width_px}-{case.tilt_std_deg:g}"
+
+
 def height_m(width_px: float, gsd_m: float) -> float:
     """Height from which the root of the area of a level view is so many pixels of the map."""
     return width_px * gsd_m / math.sqrt(math.prod(DEFAULT_CAMERA.extent))
@@ -129,8 +137,7 @@ def tilted_views(
     assert localizer.registration is not None
     grid, frame = localizer.registration.grid, localizer.sheet.frame
     agl_m = height_m(case.width_px, grid.gsd_m)
-    plain = name_of(case.pair).replace(" > ", "-").replace(" ", "-")
-    folder = work / f"{plain}-{case.width_px}-{case.tilt_std_deg:g}-{views}-{seed}.flight"
+    folder = work / f"{stem_of(case)}-{views}-{seed}.flight"
     if not folder.is_dir():
         errors = Errors(attitude_std_deg=case.tilt_std_deg)
         ortho = file_of(case.pair.views, work)
@@ -161,12 +168,6 @@ def level_telemetry(true: Telemetry, rng: np.random.Generator) -> Telemetry:
         agl_std_m=AGL_STD * true.agl_m,
         tilt_std_deg=None,
     )
-
-
-def attitude_of(fix: Fix, reported: Telemetry) -> tuple[float, float, float]:
-    """Heading, pitch and roll of the camera that a fix states, as reported where it states none."""
-    pitch_deg, roll_deg = (fix.evidence.get(f"{axis}_bias_deg", 0.0) for axis in ("pitch", "roll"))
-    return fix.heading_deg, reported.pitch_deg + pitch_deg, reported.roll_deg + roll_deg
 
 
 def compared(fix: Fix, each: Flown, frame: LocalFrame) -> Placed:
@@ -205,7 +206,25 @@ def measured(task: tuple[Case, argparse.Namespace]) -> Result:
         times_ms.append(took_ms)
         if not isinstance(outcome, NoFix):
             placed.append(compared(outcome, each, localizer.sheet.frame))
-    return Result(case, tuple(placed), np.array(times_ms))
+    result = Result(case, tuple(placed), np.array(times_ms))
+    if options.pictures and result.confident:
+        _write_worst(result, alone, options)
+    return result
+
+
+def _write_worst(result: Result, alone: SingleViews, options: argparse.Namespace) -> None:
+    """The picture of the confident view with the largest error."""
+    case, localizer = result.case, alone.localizer
+    worst = max(result.confident, key=lambda each: each.error_m)
+    flown = tilted_views(case, localizer, options.views, options.seed, options.work)
+    each = next(each for each in flown if each.frame == worst.frame)
+    fix, true = alone.locate(each.view), each.true
+    assert isinstance(fix, Fix)
+    attitude_deg = true.yaw_deg, true.pitch_deg, true.roll_deg
+    camera = Exterior(each.camera_en_m, attitude_deg, true.agl_m)
+    title = f"{worst.frame}, camera {worst.error_m:.1f} m off, middle {worst.middle_m:.1f} m"
+    path = options.work / f"{stem_of(case)}-worst.png"
+    write_picture(path, each.view, fix, camera, localizer, title)
 
 
 def row_of(result: Result) -> list[str]:
@@ -311,6 +330,9 @@ def _parser() -> argparse.ArgumentParser:
         "--only", nargs="+", metavar="TEXT", help="pairs whose name contains one of these"
     )
     parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--pictures", action="store_true", help="write the worst confident view of each row"
+    )
     parser.add_argument("--out", type=Path, help="Markdown file to write too")
     return parser
 
