@@ -5,9 +5,9 @@
 each pair of `benchmarks.trust_views` (optional real imagery, and generated ground) at random
 places, and places the views on a map of the earlier date as `orthonav build` makes it. True pitch
 and roll are drawn with a standard deviation of `--tilt` deg each; the telemetry reports 0 for both
-and no standard deviation. `--width` is the root of the area that a view covers, in pixels of the map. Maps and
-flights stay in DIR: use another one after the code that makes them has changed. `--pictures` writes
-the worst confident view of each row to DIR, see `benchmarks.tilt_pictures`.
+and no standard deviation. `--width` is the root of the area that a view covers, in pixels of the
+map. Maps and flights stay in DIR: use another one after the code that makes them has changed.
+`--pictures` writes the worst confident view of each row to DIR, see `benchmarks.tilt_pictures`.
 """
 
 import argparse
