@@ -171,7 +171,7 @@ def _rows(
             if row is not None:
                 about = {**asdict(pair), **asdict(case), "frame": f"{folder.name}/{name}"}
                 about["bounds_deg"] = half_deg if case.kind == "beside" else None
-                if case.kind == "found" and not _is_covered(localizer, truth, case.width_px):
+                if case.kind == "found" and not is_covered(localizer, truth, case.width_px):
                     about["kind"] = "beside"
                 yield {**about, **row}
 
@@ -180,7 +180,7 @@ def _flown_for(
     case: Case, folder: Path, gsd_m: float, middle_deg: float
 ) -> Iterator[tuple[str, View, tuple[float, float]]]:
     """The views of a flight as a case needs them: mirrored, or some left out."""
-    flown = list(_flown(folder))
+    flown = list(views_in(folder))
     if case.kind == "other prior":
         yield from _with_other_priors(flown, case, gsd_m)
         return
@@ -220,7 +220,7 @@ def _placed(
     }
 
 
-def _is_covered(
+def is_covered(
     localizer: RegistrationLocalizer, truth: tuple[float, float], width_px: float
 ) -> bool:
     """Whether the map has imagery at the middle of a view and half way to its corners."""
@@ -236,7 +236,7 @@ def _is_covered(
     return all(inside)
 
 
-def _flown(folder: Path) -> Iterator[tuple[str, View, tuple[float, float]]]:
+def views_in(folder: Path) -> Iterator[tuple[str, View, tuple[float, float]]]:
     """Name, view and true latitude and longitude of the views of a flight."""
     flight, truth = open_flight(folder), read_truth(folder / "truth.csv")
     for each in flight.views:

@@ -112,7 +112,7 @@ def test_reported_velocity_drifts(fly, frame, tmp_path):
     ratio = np.linalg.norm(drifting, axis=1) / np.linalg.norm(true, axis=1) - 1
     assert 0.001 < np.abs(ratio).mean() < 0.3 and np.abs(np.diff(ratio)).max() < 0.05
     header = (tmp_path / "erring/telemetry.csv").read_text().splitlines()[0]
-    assert header.endswith("vel_east_mps,vel_north_mps")
+    assert "vel_east_mps,vel_north_mps" in header
 
 
 def test_turns_are_arcs(fly, frame):

@@ -199,7 +199,7 @@ def test_the_folder(area, tmp_path, names_in):
     assert area.past.name in flight.note and json.loads((tmp_path / "f/flight.json").read_text())
     assert read_image(flight.views[0].path).shape == (240, 320)
     header = (tmp_path / "f/telemetry.csv").read_text().splitlines()[0]
-    assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m"
+    assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,tilt_std_deg"
 
 
 def test_the_usual_height_covers_a_tile(area, tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import Progress, print_json, progress
+from orthonav.cli.simulate import HORIZON_STD_DEG, MOUNT_STD_DEG
 
 if TYPE_CHECKING:
     from orthonav.evaluate.metrics import Metrics
@@ -137,7 +138,8 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     checked = _checked(folder, map_path, route, shown)
     _say(
         options,
-        f"4/5 simulating a flight over {present.name}, heading error 5 deg, height error 5 %",
+        f"4/5 simulating a flight over {present.name}, heading error 5 deg, height error 5 %, "
+        "unreported tilt of mount and horizon 1 deg each",
     )
     request = SimulateRequest(
         [present],
@@ -145,7 +147,12 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
         route=read_route(route),
         agl_m=HEIGHT_M,
         spacing_m=SPACING_M,
-        errors=Errors(yaw_std_deg=5.0, agl_std=0.05),
+        errors=Errors(
+            yaw_std_deg=5.0,
+            agl_std=0.05,
+            mount_std_deg=MOUNT_STD_DEG,
+            horizon_std_deg=HORIZON_STD_DEG,
+        ),
         seed=options.seed,
     )
     simulate_flight(request, lambda share: shown("simulate", share))

@@ -8,8 +8,12 @@ from orthonav.cli.heights import dem_of
 
 EVERYDAY = (
     *("--route", "--random", "--agl-m", "--spacing-m", "--airspeed-mps", "--camera"),
-    *("--yaw-std-deg", "--agl-std", "--prior-std-m", "--seed", "--json"),
+    *("--yaw-std-deg", "--agl-std", "--mount-std-deg", "--horizon-std-deg", "--prior-std-m"),
+    *("--seed", "--json"),
 )
+MOUNT_STD_DEG = HORIZON_STD_DEG = 1.0
+"""Usual unreported tilt. Real mounts lean by 1 to 5 deg, and horizons of autopilots err by 0.5 to
+6 deg."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +94,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--tilt-std-deg",
         type=float,
         default=0.0,
-        help="standard deviation of the error of the reported pitch and roll (default 0)",
+        help="standard deviation of the error of the reported pitch and roll from view to view, "
+        "which the telemetry states (default 0)",
     )
     errors.add_argument(
         "--attitude-std-deg",
@@ -110,6 +115,21 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the scale error (a share) and the direction error (rad) of the "
         "reported velocity (default: no velocity is reported)",
     )
+    tilt = parser.add_argument_group("unreported tilt")
+    tilt.add_argument(
+        "--mount-std-deg",
+        type=float,
+        default=MOUNT_STD_DEG,
+        help="standard deviation of pitch and roll of the camera mount, constant in a flight "
+        f"(default {MOUNT_STD_DEG:g})",
+    )
+    tilt.add_argument(
+        "--horizon-std-deg",
+        type=float,
+        default=HORIZON_STD_DEG,
+        help="standard deviation of the error of the autopilot's horizon, pitch and roll; on a "
+        f"route it changes within 15 s (default {HORIZON_STD_DEG:g})",
+    )
     biases = parser.add_argument_group("constant telemetry biases")
     biases.add_argument(
         "--yaw-bias-deg", type=float, default=0.0, help="reported heading minus true heading"
@@ -122,10 +142,16 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="reported height minus true height, as a share of it: 0.05 is 5 %%",
     )
     biases.add_argument(
-        "--pitch-bias-deg", type=float, default=0.0, help="unreported pitch of the camera mount"
+        "--pitch-bias-deg",
+        type=float,
+        default=0.0,
+        help="unreported pitch of the camera mount, to which --mount-std-deg adds",
     )
     biases.add_argument(
-        "--roll-bias-deg", type=float, default=0.0, help="unreported roll of the camera mount"
+        "--roll-bias-deg",
+        type=float,
+        default=0.0,
+        help="unreported roll of the camera mount, to which --mount-std-deg adds",
     )
     parser.add_argument(
         "--receiver",
@@ -207,6 +233,8 @@ def run(options: argparse.Namespace) -> None:
             pitch_bias_deg=options.pitch_bias_deg,
             roll_bias_deg=options.roll_bias_deg,
             velocity_drift=options.velocity_drift,
+            mount_std_deg=options.mount_std_deg,
+            horizon_std_deg=options.horizon_std_deg,
         ),
         effects=ViewEffects(
             options.exposure_std, options.blur_px, options.noise_std, options.jpeg_quality

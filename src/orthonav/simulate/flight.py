@@ -24,13 +24,13 @@ from orthonav.geo.route import Route
 from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.records import Prior, Telemetry
+from orthonav.simulate.attitude import camera_attitude, horizon_errors
 from orthonav.simulate.clouds import Clouds
 from orthonav.simulate.imagery import Coverage, GroundImagery
 from orthonav.simulate.motion import (
     FlownPath,
     Wind,
     drifting,
-    mounted,
     rounded,
     steady_path,
     windy_path,
@@ -76,6 +76,12 @@ class Errors:
     - `agl_bias`: reported minus true height, as a share of it, -0.5..0.5.
     - `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
 
+    Standard deviations of unreported tilt, pitch and roll each, degrees, 0..20:
+
+    - `mount_std_deg`: of the camera mount, drawn once a flight and added to its bias.
+    - `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
+      (`attitude.HORIZON_TIME_S`), at random positions it is independent.
+
     `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
     velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
     """
@@ -90,6 +96,8 @@ class Errors:
     pitch_bias_deg: float = 0.0
     roll_bias_deg: float = 0.0
     velocity_drift: float | None = None
+    mount_std_deg: float = 0.0
+    horizon_std_deg: float = 0.0
 
     def __post_init__(self) -> None:
         limits = {
@@ -99,6 +107,8 @@ class Errors:
             "attitude_std_deg": 20.0,
             "prior_std_m": 1e6,
             "velocity_drift": 0.5,
+            "mount_std_deg": 20.0,
+            "horizon_std_deg": 20.0,
         }
         biases = {
             "yaw_bias_deg": 180.0,
@@ -113,10 +123,19 @@ class Errors:
                 hint = f" (a share of {share}: 0.05 is 5 %)" if share else ""
                 raise FlightError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
 
+    def mount_deg(self, seed: int) -> Array:
+        """Unreported pitch and roll (2,) of the camera in the aircraft."""
+        drawn = np.random.default_rng([seed, 6]).normal(0, 1, 2) * self.mount_std_deg
+        return np.array([self.pitch_bias_deg, self.roll_bias_deg]) + drawn
+
     @property
-    def mount_deg(self) -> tuple[float, float]:
-        """Unreported pitch and roll of the camera in the aircraft."""
-        return self.pitch_bias_deg, self.roll_bias_deg
+    def reported_tilt_std_deg(self) -> float | None:
+        """`tilt_std_deg` as the telemetry states it: None, unknown, where all tilt error is
+        unreported; 0, exact, where there is none."""
+        biases = self.pitch_bias_deg, self.roll_bias_deg
+        if self.tilt_std_deg == 0 and any((self.mount_std_deg, self.horizon_std_deg, *biases)):
+            return None
+        return self.tilt_std_deg
 
 
 NO_ERRORS = Errors()
@@ -178,7 +197,7 @@ class SimulateRequest:
 class _Pose:
     """True pose of the camera at one view.
 
-    `reported_deg`: heading, pitch and roll of the aircraft as reported without errors.
+    `reported_deg`: heading, pitch and roll as reported, but for noise and bias of the telemetry.
     `reported_en_mps`: reported velocity over ground, None if not reported.
     `home_m`, `amsl_m`: height above take-off and above sea level, None if not reported.
     """
@@ -348,11 +367,16 @@ def _poses(
         yield from _route_poses(request, request.route, area, agl_m, coverage)
         return
     west, south, east, north = area.extent_en_m
-    for number in range(request.random or 0):
+    count, seed, errors = request.random or 0, request.seed, request.errors
+    mount_deg = errors.mount_deg(seed)
+    horizon = np.random.default_rng([seed, 7]).normal(0, 1, (count, 2)) * errors.horizon_std_deg
+    for number in range(count):
+        tilt_deg = horizon[number], mount_deg
         rng = np.random.default_rng([request.seed, 0, number])
         for _ in range(TRIES_PER_VIEW):
             place = rng.uniform([west, south], [east, north])
-            pose = _tilted(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
+            yaw_deg = rng.uniform(0, 360)
+            pose = _tilted(request, rng, place, yaw_deg, agl_m, number * 1.0, tilt_deg)
             if _sees_ground(coverage, request, pose):
                 yield _above_sea(request, area, pose)
                 break
@@ -377,6 +401,9 @@ def _route_poses(
 ) -> Iterator[_Pose]:
     path = _path(request, route.points_en_m(area.frame))
     velocities = _reported_velocities(request, path)
+    mount_deg = request.errors.mount_deg(request.seed)
+    tilt_rng = np.random.default_rng([request.seed, 7])
+    horizon = horizon_errors(request.errors.horizon_std_deg, path.times_s, tilt_rng)
     views = zip(path.places_en_m, path.headings_deg, strict=True)
     ground_m = None
     if request.terrain is not None:
@@ -384,6 +411,7 @@ def _route_poses(
     for number, (place, heading) in enumerate(views):
         rng = np.random.default_rng([request.seed, 0, number])
         time_s, velocity = float(path.times_s[number]), velocities[number]
+        tilt_deg = horizon[number], mount_deg
         above_m = agl_m
         if ground_m is not None:
             above_m += float(ground_m[0] - ground_m[number])
@@ -392,7 +420,7 @@ def _route_poses(
                 f"view {number + 1} of the route is {above_m:.0f} m above the terrain; fly higher "
                 "(--agl-m)"
             )
-        pose = _tilted(request, rng, place, float(heading), above_m, time_s, velocity)
+        pose = _tilted(request, rng, place, float(heading), above_m, time_s, tilt_deg, velocity)
         if ground_m is not None:
             pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
         if not request.beyond and not _sees_ground(coverage, request, pose):
@@ -454,13 +482,14 @@ def _tilted(
     yaw_deg: float,
     agl_m: float,
     time_s: float,
+    unreported_deg: tuple[Array, Array],
     reported_en_mps: tuple[float, float] | None = None,
 ) -> _Pose:
-    errors = request.errors
-    tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * errors.attitude_std_deg
+    """A pose at a place; `unreported_deg`: pitch and roll (2,) of horizon and of mount."""
+    tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * request.errors.attitude_std_deg
     pitch_deg = request.camera_pitch_deg + float(tilt[0])
     reported = (float(yaw_deg), pitch_deg, float(tilt[1]))
-    true = mounted(reported, *errors.mount_deg) if any(errors.mount_deg) else reported
+    true = camera_attitude(reported, *unreported_deg)
     return _Pose(place, *true, agl_m, time_s, reported, reported_en_mps)
 
 
@@ -516,7 +545,7 @@ def _telemetry(
         agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
         yaw_std_deg=errors.yaw_std_deg or None,
         agl_std_m=errors.agl_std * pose.agl_m or None,
-        tilt_std_deg=errors.tilt_std_deg or None,
+        tilt_std_deg=errors.reported_tilt_std_deg,
         prior=prior,
         vel_en_mps=pose.reported_en_mps,
     )

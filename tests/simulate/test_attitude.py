@@ -1,0 +1,174 @@
+"""Tilt that the telemetry does not report: of the camera mount and of the autopilot's horizon."""
+
+import math
+
+import numpy as np
+import pytest
+
+from helpers import textured
+from orthonav.errors import FlightError
+from orthonav.flight import open_flight
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera, axis_on_ground_en_m
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.simulate import flight as flight_module
+from orthonav.simulate.attitude import HORIZON_TIME_S, camera_attitude, horizon_errors
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+LEVEL = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """1.2 x 1.2 km of blots."""
+    return make_ortho(tmp_path_factory.mktemp("blots") / "blots.tif", textured((1200, 1200)))
+
+
+@pytest.fixture
+def tilts(ortho, tmp_path, monkeypatch):
+    """Flies, and gives true pitch and roll of the camera (N, 2) and the telemetry."""
+
+    def flown(name, **request):
+        true = []
+
+        def picture(*arguments):
+            true.append(arguments[5].attitude[1:3])
+            return np.full((48, 64), 99, np.uint8)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(flight_module, "_picture", picture)
+            request = {"agl_m": 100.0, "camera": SMALL, **request}
+            simulate_flight(SimulateRequest([ortho], tmp_path / name, **request))
+        return np.array(true), [v.telemetry for v in open_flight(tmp_path / name).views]
+
+    return flown
+
+
+@pytest.fixture(scope="module")
+def route(ortho):
+    """Back and forth for 8 km."""
+    outline = Mosaic.open([ortho]).outline_latlon_deg
+    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
+    corners = [((-1) ** (n // 2) * 400.0, -400.0 + 80.0 * ((n + 1) // 2)) for n in range(18)]
+    lat, lon = frame.latlon_from_en(np.array(corners))
+    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
+
+
+def test_the_mount_is_constant_and_of_the_stated_size(tilts):
+    errors = Errors(mount_std_deg=2.0)
+    for seed in range(3):
+        true, reported = tilts(f"f{seed}", random=2, seed=seed, errors=errors)
+        assert true == pytest.approx(np.tile(errors.mount_deg(seed), (2, 1)), abs=1e-9)
+        assert all((t.pitch_deg, t.roll_deg, t.tilt_std_deg) == (0, 0, None) for t in reported)
+    mounts = np.array([errors.mount_deg(seed) for seed in range(400)])
+    assert mounts.std(axis=0) == pytest.approx([2.0, 2.0], rel=0.15)
+    assert np.abs(mounts.mean(axis=0)).max() < 4 * 2.0 / math.sqrt(400)
+
+
+def test_the_mount_is_added_to_its_bias(tilts):
+    bias = {"pitch_bias_deg": 3.0, "roll_bias_deg": -4.0}
+    drawn, _ = tilts("drawn", random=1, errors=Errors(mount_std_deg=1.0))
+    both, _ = tilts("both", random=1, errors=Errors(mount_std_deg=1.0, **bias))
+    assert both - drawn == pytest.approx(np.array([[3.0, -4.0]]), abs=1e-6)
+
+
+def test_the_horizon_errs_independently_at_random_positions(tilts):
+    true, reported = tilts("f", random=200, errors=Errors(horizon_std_deg=1.5))
+    assert true.std(axis=0) == pytest.approx([1.5, 1.5], rel=0.2)
+    assert abs(np.corrcoef(true[1:, 0], true[:-1, 0])[0, 1]) < 0.25
+    assert all((t.pitch_deg, t.roll_deg, t.tilt_std_deg) == (0, 0, None) for t in reported)
+
+
+def test_the_horizon_wanders_along_a_route(tilts, route):
+    true, reported = tilts("f", route=route, spacing_m=40.0, errors=Errors(horizon_std_deg=1.5))
+    assert len(true) > 150
+    assert 0.7 < true.std() < 2.3
+    step_s = (reported[1].time_ns - reported[0].time_ns) / 1e9
+    changes = np.diff(true, axis=0)
+    expected = 1.5 * math.sqrt(2 * (1 - math.exp(-step_s / HORIZON_TIME_S)))
+    assert changes.std() == pytest.approx(expected, rel=0.2)
+    assert {(t.pitch_deg, t.roll_deg, t.tilt_std_deg) for t in reported} == {(0.0, 0.0, None)}
+
+
+def test_the_horizon_is_forgotten_within_its_correlation_time():
+    times_s = np.arange(40_000) * 1.5
+    errors = horizon_errors(2.0, times_s, np.random.default_rng(1))
+    assert errors.std(axis=0) == pytest.approx([2.0, 2.0], rel=0.05)
+    lag = round(HORIZON_TIME_S / 1.5)
+    for axis in errors.T:
+        after = np.corrcoef(axis[lag:], axis[:-lag])[0, 1]
+        assert after == pytest.approx(math.exp(-1), abs=0.06)
+    assert abs(np.corrcoef(errors.T)[0, 1]) < 0.1
+
+
+def test_mount_and_horizon_add_up():
+    none = np.zeros(2)
+    assert camera_attitude((30.0, 1.0, 2.0), none, none) == (30.0, 1.0, 2.0)
+    assert camera_attitude((30.0, 1.0, 2.0), np.array([0.5, -1.0]), none) == (30.0, 1.5, 1.0)
+    both = camera_attitude(LEVEL, np.array([1.0, 0.0]), np.array([2.0, 0.0]))
+    assert both[1:] == pytest.approx((3.0, 0.0))
+
+
+def test_what_the_telemetry_states(tilts):
+    stated = {
+        0.0: Errors(),
+        None: Errors(mount_std_deg=1.0, horizon_std_deg=1.0),
+        0.5: Errors(tilt_std_deg=0.5, mount_std_deg=1.0, horizon_std_deg=1.0),
+    }
+    for number, (std, errors) in enumerate(stated.items()):
+        _, reported = tilts(f"f{number}", random=2, errors=errors)
+        assert {t.tilt_std_deg for t in reported} == {std}
+    assert Errors(pitch_bias_deg=1.0).reported_tilt_std_deg is None
+    assert Errors(attitude_std_deg=3.0).reported_tilt_std_deg == 0
+
+
+def test_reported_tilt_is_still_that_of_the_aircraft(tilts):
+    errors = Errors(attitude_std_deg=2.0, horizon_std_deg=1.0)
+    true, reported = tilts("f", random=100, errors=errors)
+    exact, _ = tilts("exact", random=100, errors=Errors(attitude_std_deg=2.0))
+    reported = np.array([(t.pitch_deg, t.roll_deg) for t in reported])
+    assert (true - reported).std() == pytest.approx(1.0, rel=0.2)
+    assert reported.std() == pytest.approx(exact.std(), rel=0.2)
+
+
+def test_the_seed_decides(tilts):
+    errors = Errors(mount_std_deg=1.0, horizon_std_deg=1.0)
+    first, again, other = (
+        tilts(name, random=3, seed=seed, errors=errors)[0]
+        for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert (first == again).all() and (first != other).all()
+    longer, _ = tilts("d", random=5, seed=1, errors=errors)
+    assert (longer[:3] == first).all()
+
+
+@pytest.mark.parametrize("name", ["mount_std_deg", "horizon_std_deg"])
+@pytest.mark.parametrize("value", [-1.0, 21.0, math.nan])
+def test_impossible_deviations_are_refused(name, value):
+    with pytest.raises(FlightError, match=f"{name} must be 0 to 20"):
+        Errors(**{name: value})
+
+
+def test_the_command_tilts_by_default(run, ortho, tmp_path, monkeypatch):
+    true = []
+    whole = flight_module._picture
+
+    def picture(*arguments):
+        true.append(arguments[5].attitude)
+        return whole(*arguments)
+
+    monkeypatch.setattr(flight_module, "_picture", picture)
+    fly = ["simulate", "--ortho", ortho, "--random", "3", "--agl-m", "100"]
+    assert run(*fly, "--out", tmp_path / "usual").code == 0
+    off_m = [math.hypot(*axis_on_ground_en_m(*attitude)) for attitude in true]
+    assert 0.1 < max(off_m) < 15  # 1.4 deg per axis at 100 m: 2.5 m
+    reported = [view.telemetry for view in open_flight(tmp_path / "usual").views]
+    assert {(t.pitch_deg, t.roll_deg, t.tilt_std_deg) for t in reported} == {(0.0, 0.0, None)}
+    true.clear()
+    exact = ["--mount-std-deg", "0", "--horizon-std-deg", "0"]
+    assert run(*fly, *exact, "--out", tmp_path / "exact").code == 0
+    assert {attitude[1:3] for attitude in true} == {(0.0, 0.0)}
+    telemetry = [view.telemetry for view in open_flight(tmp_path / "exact").views]
+    assert {each.tilt_std_deg for each in telemetry} == {0.0}
