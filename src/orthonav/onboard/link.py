@@ -159,20 +159,19 @@ class AutopilotLink:
     def covered_ns(self) -> int | None:
         """Time of our clock up to which the attitude is known; None without any."""
         with self._lock:
-            newest, offset = self.buffer.covered_ns, self.sync.offset_ns
-            return None if newest is None or offset is None else newest - offset
+            newest = self.buffer.covered_ns
+            return None if newest is None else self.sync.mono_ns(newest)
 
     def state_at(self, exposed_ns: int) -> VehicleState:
         """State that the autopilot reported for a time of our clock."""
         with self._lock:
-            if self.sync.offset_ns is None:
-                return VehicleState(None)
-            return self.buffer.at(exposed_ns + self.sync.offset_ns)
+            boot_ns = self.sync.boot_ns(exposed_ns)
+            return VehicleState(None) if boot_ns is None else self.buffer.at(boot_ns)
 
     def boot_ns(self, mono_ns: int) -> int | None:
         """Convert a time of our clock to the autopilot's; None while the offset is unknown."""
         with self._lock:
-            return None if self.sync.offset_ns is None else mono_ns + self.sync.offset_ns
+            return self.sync.boot_ns(mono_ns)
 
     def status(self) -> LinkStatus:
         """Status of the link."""
@@ -295,7 +294,7 @@ class AutopilotLink:
         return boot_ns
 
     def _arrived(self, now_ns: int) -> int | None:
-        return None if self.sync.offset_ns is None else now_ns + self.sync.offset_ns
+        return self.sync.boot_ns(now_ns)
 
     def _heartbeat(self, message: Message, now_ns: int) -> None:
         self.kind = _KINDS.get(message.autopilot, self.kind)
