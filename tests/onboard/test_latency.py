@@ -65,10 +65,11 @@ class LateFlight:
             link=self.link,
             latency=self.monitor,
         )
-        self.hear(self.autopilot.heartbeat())
         self.sent = []  # time since the start, error in metres, age
         self.results = []
         self.stamps, self.stalled = False, False
+        self.requests = []  # of TIMESYNC, not yet answered
+        self.hear(self.autopilot.heartbeat())
 
     @property
     def now_s(self):
@@ -89,7 +90,8 @@ class LateFlight:
         ahead_ns = AHEAD_NS + round(self.clock_rate * (self.time.now_ns - BEGIN_NS))
         boot_ns = self.time.now_ns + ahead_ns
         (yaw, pitch, roll), (north, east), _ = self.flown.at(self.now_s)
-        answers = self.autopilot.answers(self.port.sent("TIMESYNC"), self.time.now_ns, ahead_ns)
+        requests, self.requests = self.requests + self.port.sent("TIMESYNC"), []
+        answers = self.autopilot.answers(requests, self.time.now_ns, ahead_ns)
         self.hear(
             self.autopilot.attitude(boot_ns, yaw, pitch, roll),
             self.autopilot.home(boot_ns, self.flown.agl_m),
@@ -115,7 +117,7 @@ class LateFlight:
         self.stream.exposed_s = self.now_s - self.delay_s(self.now_s)
         if self.stamps:
             self.stream.stamp_s = 1000 + self.stream.exposed_s
-        self.port.gone.clear()
+        self.requests += self.port.sent("TIMESYNC")
         self.newest.put(self.source.read())
         result = self.runner.step(0)
         self.results.append((self.now_s, result))

@@ -421,18 +421,17 @@ class ClockSync:
 
     def _fit(self) -> None:
         """Fit offset and rate: the rate by the median slope (Theil and Sen) of the quicker half."""
-        quicker = sorted(self._exact)[: max(self.AGREE, len(self._exact) // 2)]
-        times = [each.at_ns for each in quicker]
-        slopes = [
-            (b.offset_ns - a.offset_ns) / (b.at_ns - a.at_ns)
-            for a, b in combinations(quicker, 2)
-            if a.at_ns != b.at_ns
-        ]
-        rate = median(slopes) if len(quicker) >= self.AGREE and slopes else 0.0
-        # A smaller rate may be due to unequal delays there and back.
-        drift_ns = abs(rate) * (max(times) - min(times))
-        self._rate = rate if drift_ns > quicker[-1].trip_ns else 0.0
-        quick_ns = 1.5 * quicker[0].trip_ns + _MS / 5
+        trips = sorted(each.trip_ns for each in self._exact)
+        self._rate = 0.0
+        if len(trips) >= self.AGREE:
+            longest_ns = trips[max(self.AGREE, len(trips) // 2) - 1]
+            quicker = [each for each in self._exact if each.trip_ns <= longest_ns]
+            pairs = combinations(quicker, 2)
+            rate = median((b.offset_ns - a.offset_ns) / (b.at_ns - a.at_ns) for a, b in pairs)
+            # A smaller rate may be due to unequal delays there and back.
+            if abs(rate) * (quicker[-1].at_ns - quicker[0].at_ns) > longest_ns:
+                self._rate = rate
+        quick_ns = 1.5 * trips[0] + _MS / 5
         self._at_ns = self._exact[-1].at_ns
         self._offset_ns = round(
             median(
