@@ -228,6 +228,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         signing=_signing(options, clocks),
         silent=options.dry_run,
         stamp=Clock(options.stamp),
+        own_receiver=options.gps_id if "gps-input" in (options.send or ()) else None,
     )
 
 

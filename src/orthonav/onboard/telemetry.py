@@ -98,6 +98,7 @@ class VehicleState:
     `down_m`: distance below the origin of the autopilot's local frame.
     `home_m`, `amsl_m`: height above the place of take-off, and above mean sea level.
     `travelled`: displacement by the velocity; None where that is not known.
+    `vel_std_mps`, `tilt_std_deg`: standard deviations of velocity and attitude; NaN: as usual.
     """
 
     ned_from_body: Array | None
@@ -107,6 +108,8 @@ class VehicleState:
     home_m: float = math.nan
     amsl_m: float = math.nan
     travelled: Travelled | None = None
+    vel_std_mps: float = math.nan
+    tilt_std_deg: float = math.nan
 
     def attitude_rad(self) -> Triple:
         """Roll, pitch and yaw of the body in radians; NaN where not known."""
@@ -129,8 +132,10 @@ class VehicleState:
             roll,
             self.height_m,
             vel_en_mps=(east, north) if known else None,
-            home_m=self.home_m if math.isfinite(self.home_m) else None,
-            amsl_m=self.amsl_m if math.isfinite(self.amsl_m) else None,
+            tilt_std_deg=_known(self.tilt_std_deg),
+            vel_std_mps=_known(self.vel_std_mps),
+            home_m=_known(self.home_m),
+            amsl_m=_known(self.amsl_m),
         )
 
 
@@ -310,6 +315,10 @@ class TelemetryBuffer:
         return round(self.limits.keep_s * 1e9)
 
 
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def wxyz_of_angles(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
     """Quaternion w, x, y, z of an autopilot's Euler angles (rotations in the order ZYX)."""
     xyzw = Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_quat()
@@ -332,11 +341,11 @@ def _matrix(wxyz: Array) -> Array:
 class ClockSync:
     """Converts times of our clock to the autopilot's and back.
 
-    Offset and rate are those of the last `WINDOW` TIMESYNC exchanges: the rate of the clocks differs
-    in simulators that run slower than real time, and is fitted where the exchanges show it. Without
-    exchanges the offset comes from the timestamps of messages: the one with the least delay counts.
-    An outlier is ignored unless others agree with it; then a clock was set or the autopilot
-    restarted, and the estimate starts again (`jumps`). Mutable.
+    Offset and rate are those of the last `WINDOW` TIMESYNC exchanges: simulators run slower than
+    real time, so the rate is fitted where the exchanges show it. Without exchanges the offset comes
+    from the timestamps of messages: the one with the least delay counts. An outlier is ignored
+    unless others agree with it; then a clock was set or the autopilot restarted, and the estimate
+    starts again (`jumps`). Mutable.
     """
 
     WINDOW = 32
