@@ -100,6 +100,7 @@ class FlyOptions:
     `heights`: turns reported heights into heights above ground; None: the map has no terrain.
     `heading_known`: whether the reported heading is used.
     `deadline_s`: images older than this are dropped.
+    `min_agl_m`: height above ground below which views are not located.
     `telemetry_wait_s`: longest wait for telemetry after the exposure.
     `recorded`: telemetry comes with the image, from a recording or from ROS.
     `accept`: criterion in addition to those of the gate.
@@ -115,6 +116,7 @@ class FlyOptions:
     heights: FlownHeights | None = None
     heading_known: bool = True
     deadline_s: float = 0.5
+    min_agl_m: float = 0.0
     telemetry_wait_s: float = 0.15  # three attitudes at 20 Hz, the least rate asked for
     recorded: bool = False
     accept: Acceptance | None = None
@@ -233,7 +235,7 @@ class Runner:
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._missing(telemetry) or self._before_the_last(image)
+            refused = self._unusable(telemetry) or self._before_the_last(image)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
@@ -473,17 +475,22 @@ class Runner:
         if said is not None:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
-    def _missing(self, telemetry: Telemetry) -> NoFix | None:
+    def _unusable(self, telemetry: Telemetry) -> NoFix | None:
+        """Reason not to locate a view by its telemetry."""
         known = self._above_ground(telemetry)
         if isinstance(known, NoFix):
             return known
         missing = [
             name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
         ]
-        if not missing:
-            return None
-        detail = f"not reported at the exposure: {', '.join(missing)}"
-        return self._refusal("no_telemetry", "no_telemetry", detail)
+        if missing:
+            detail = f"not reported at the exposure: {', '.join(missing)}"
+            return self._refusal("no_telemetry", "no_telemetry", detail)
+        least_m = self.options.min_agl_m
+        if known.agl_m < least_m:  # on the ground, and in the take-off
+            detail = f"{known.agl_m:.0f} m above ground; views are located from {least_m:.0f} m"
+            return self._refusal("too_low", "too_low", detail)
+        return None
 
     def _refusal(self, count: str, reason: str, detail: str) -> NoFix:
         self._count(count)
