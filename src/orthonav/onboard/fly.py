@@ -169,7 +169,7 @@ class Runner:
         self._saved_ns = 0
         self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
-        self._seen = dict.fromkeys(("jumps", "outages", "failed", "lost", "slow", "incomplete"), 0)
+        self._seen: dict[str, int] = {}
         self._texts = 0
         self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
@@ -544,23 +544,15 @@ class Runner:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
         messenger = self._publisher.messenger
         now = {
-            "jumps": 0 if self._link is None else self._link.sync.jumps,
-            "outages": self._newest.outages,
-            "failed": self._publisher.failed,
-            "lost": 0 if self._sink is None else sum(self._sink.lost.values()),
-            "slow": 0 if messenger is None else messenger.too_slow,
+            "clock_jump": 0 if self._link is None else self._link.sync.jumps,
+            "camera_lost": self._newest.outages,
+            "output_failed": self._publisher.failed,
+            "log_failed": 0 if self._sink is None else sum(self._sink.lost.values()),
+            "slow_vision": 0 if messenger is None else messenger.too_slow,
             "incomplete": 0 if messenger is None else messenger.incomplete,
         }
-        names = {
-            "jumps": "clock_jump",
-            "outages": "camera_lost",
-            "failed": "output_failed",
-            "lost": "log_failed",
-            "slow": "slow_vision",
-            "incomplete": "incomplete",
-        }
-        for key, name in names.items():
-            if now[key] > self._seen[key]:
+        for name, value in now.items():
+            if value > self._seen.get(name, 0):
                 self._count(name)
         self._seen = now
         ahead_ns = self._clocks.utc_ns() - self._clocks.mono_ns()
