@@ -653,6 +653,17 @@ def test_a_map_with_terrain_gives_heights_above_ground(begin):
         assert view[3] == seen  # a replay of the log has the height that was flown with
 
 
+def test_gps_input_has_the_altitude_by_the_terrain_where_the_autopilot_knows_none(begin):
+    def terrain(lat_deg, lon_deg):
+        return np.full(np.shape(lat_deg), 300.0)
+
+    heights = FlownHeights(terrain, (np.zeros(2), np.zeros(2)), take_off=(48.0, 2.0, 5.0))
+    flight = begin(heights=heights)
+    flight.views(3)  # 100 m above the place of take-off
+    (message,) = flight.port.sent("GPS_INPUT")
+    assert message["alt"] == pytest.approx(400.0) and not message["ignore_flags"] & 1
+
+
 @pytest.mark.parametrize(
     "error, reason",
     [(MapFileError("damaged"), "map_damaged"), (MapChangedError("cut"), "map_file_changed")],
@@ -766,6 +777,17 @@ def autopilot():
     fake_autopilot.start()
     yield fake_autopilot
     fake_autopilot.stop()
+
+
+def test_the_lowest_height_can_be_given(flown, tmp_path):
+    path, folder, _, _ = flown
+    for height, reasons in ((f"{AGL_M + 1}", {"too_low"}), (f"{AGL_M - 1}", set())):
+        lines = tmp_path / f"{height}.jsonl"
+        options = ("--recorded-telemetry", "--pace", "1000", "--jsonl", str(lines))
+        assert main(["fly", str(path), str(folder), *options, "--min-agl-m", height]) == 0
+        _, results = views_in(lines)
+        found = {each.outcome.reason for each in results if isinstance(each.outcome, NoFix)}
+        assert found & {"too_low"} == reasons
 
 
 def views_in(path):
