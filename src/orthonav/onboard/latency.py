@@ -15,7 +15,7 @@ import numpy as np
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.arrival import GAP_S, Arrival
-from orthonav.onboard.delay import UNEXPLAINED, DelayEstimate, DelayEstimator
+from orthonav.onboard.delay import EXPLAINED, UNEXPLAINED, DelayEstimate, DelayEstimator
 from orthonav.onboard.delay_check import DelayCheck
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import Grey, PictureOdometry
@@ -330,7 +330,8 @@ class LatencyMonitor:
         """Dispute the delay in use where the last seconds do not fit it."""
         share = self._check.share()
         if share >= UNEXPLAINED:
-            self._compared, self._contradictions = True, 0
+            self._contradictions = 0
+            self._compared |= share >= EXPLAINED  # a delay that is a little off explains some
         if share < UNEXPLAINED:
             self._unlike_ns = arrived_ns
             if not self._suspicion:
