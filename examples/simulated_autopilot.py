@@ -50,7 +50,7 @@ class Autopilot:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         self.address, self.begin_s = address, None
-        self.received = []
+        self.received, self.text = [], ""
         self.gnss = []
         if (folder / "gnss.csv").is_file():
             with (folder / "gnss.csv").open(encoding="utf-8", newline="") as stream:
@@ -125,7 +125,10 @@ class Autopilot:
             boot_ns = round(self.boot_s() * 1e9)
             self.send(mavlink.MAVLink_timesync_message(boot_ns, message.ts1))
         elif kind == "STATUSTEXT":
-            print(f"{self.boot_s():8.2f} s  {message.text}", flush=True)
+            # A long text comes in chunks; the last one is not full.
+            self.text = self.text + message.text if message.chunk_seq else message.text
+            if message.id == 0 or len(message.text) < 50:
+                print(f"{self.boot_s():8.2f} s  {self.text}", flush=True)
         elif kind in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
             age_s = getattr(message, "processing_time", 0) / 1e6
             exposed_s = (self.boot_s() - age_s) * self.pace

@@ -51,6 +51,12 @@ TABLES = {
         41,
         "B:target_system i:latitude i:longitude i:altitude | Q:time_usec",
     ),
+    76: (
+        "COMMAND_LONG",
+        152,
+        "B:target_system B:target_component H:command B:confirmation f:param1 f:param2 f:param3 "
+        "f:param4 f:param5 f:param6 f:param7 |",
+    ),
     75: (
         "COMMAND_INT",
         158,

@@ -48,9 +48,19 @@ def test_all_that_is_missing_is_named():
     assert "yaw" not in check_telemetry(telemetry, CAMERA, GSD_M, False).detail
 
 
-@pytest.mark.parametrize("agl_m, expected", [(-5, "bad_height"), (0, "bad_height"), (0.1, None)])
+@pytest.mark.parametrize(
+    "agl_m, expected",
+    [(-5, "bad_height"), (0, "bad_height"), (0.1, "too_small"), (21.5, "too_small"), (21.8, None)],
+)
 def test_height(agl_m, expected):
+    """From 21.65 m the view covers 24 pixels across."""
     assert of_telemetry(agl_m=float(agl_m)) == expected
+    assert of_telemetry(agl_m=float(agl_m) / 2, gsd_m=GSD_M / 2) == expected
+
+
+def test_the_detail_names_the_height_on_the_ground():
+    detail = check_telemetry(replace(LEVEL, agl_m=0.3), CAMERA, GSD_M, True).detail
+    assert detail.startswith("0 m above ground, view covers 0 pixels of the map across, 24 needed")
 
 
 @pytest.mark.parametrize(
@@ -79,7 +89,8 @@ def test_tilt(pitch_deg, roll_deg, expected):
 @pytest.mark.parametrize("width, height, expected", [(32, 32, None), (31, 900, "too_small")])
 def test_small_cameras(width, height, expected):
     for size in ((width, height), (height, width)):
-        assert of_telemetry(camera=Camera(*size, 250.0, 250.0, 16.0, 16.0)) == expected
+        camera = Camera(*size, 250.0, 250.0, 16.0, 16.0)
+        assert of_telemetry(camera=camera, agl_m=200.0) == expected
 
 
 @pytest.mark.parametrize("agl_m, expected", [(999.0, None), (1001.0, "too_coarse")])
@@ -87,7 +98,7 @@ def test_coarse_views(agl_m, expected):
     """From 1000 m a pixel covers 4 m."""
     assert of_telemetry(agl_m=agl_m) == expected
     assert of_telemetry(agl_m=agl_m * 2, gsd_m=2 * GSD_M) == expected
-    assert of_telemetry(agl_m=agl_m / 1000) is None  # fine views are thinned
+    assert of_telemetry(agl_m=agl_m / 40) is None  # fine views are thinned
 
 
 def checks_of(low, high, share=0.5):

@@ -50,7 +50,7 @@ def test_a_stall_is_over_seconds_after_the_images_return():
     flight = ComputedFlight(Flown(70, seed=1), 0.12, lambda at_s: 0.12)
     flight.fly(STALL_S)
     images = flight.fly(36, arrives=lambda at_s: at_s > STALL_S + 8)
-    assert images[0][1] == "latency_unsteady"
+    assert images[0][1] == "latency_unknown"
     assert sent(images)[0][0] < STALL_S + 8 + 6
 
 

@@ -103,6 +103,29 @@ def test_heights_above_sea_level(flying):
     assert flying.link.state_at(flying.time.now_ns).amsl_m == 655.0
 
 
+def heights_of(kind, alt_m, relative_m):
+    """Heights above home and sea level by an autopilot of a kind."""
+    flying = Flying()
+    flying.hear(flying.autopilot.heartbeat(kind))
+    now, mm = flying.boot_ns(), (round(alt_m * 1000), round(relative_m * 1000))
+    flying.hear(flying.autopilot.attitude(now))
+    flying.hear(flying.autopilot.say("global_position_int", now // MS, 0, 0, *mm, 0, 0, 0, 0))
+    state = flying.link.state_at(flying.time.now_ns)
+    known = (state.home_m, state.amsl_m)
+    return tuple(None if math.isnan(each) else round(each, 3) for each in known)
+
+
+def test_one_height_that_is_sent_twice_is_not_taken_for_two():
+    px4, ardupilot = 12, 3
+    for kind in (px4, ardupilot):
+        assert heights_of(kind, 160.0, 120.0) == (120.0, 160.0)
+    # PX4 without a home position: both are heights above the sea.
+    assert heights_of(px4, 39.971, 39.971) == (None, 39.971)
+    # ArduPilot without an altitude by GNSS: both are heights above the start.
+    assert heights_of(ardupilot, -0.14, -0.14) == (-0.14, None)
+    assert heights_of(ardupilot, 120.0, 119.99) == (119.99, None)
+
+
 def test_heights_of_every_message(flying):
     now = flying.boot_ns()
     flying.hear(flying.autopilot.attitude(now, roll_deg=10.0))
@@ -268,9 +291,95 @@ def test_a_signed_link_ignores_unsigned_messages():
     assert flying.link.signing_now() >= stamps[-1]
 
 
-def test_the_origin_of_the_autopilot_is_stored(flying):
+def test_the_origin_of_the_autopilot_is_stored_until_it_restarts(flying):
     flying.hear(flying.autopilot.say("gps_global_origin", 481000000, 20000000, 120_000))
+    flying.hear(flying.autopilot.attitude(flying.boot_ns()))
     assert flying.link.origin == Origin(48.1, 2.0, 120.0)
+    for number in range(40):
+        flying.time.go(0.05)
+        flying.hear(flying.autopilot.attitude((number + 1) * 50 * MS))
+    assert flying.link.status().jumps == 1 and flying.link.origin is None
+
+
+def test_whether_the_autopilot_is_armed():
+    flying = Flying()
+    assert flying.link.armed is None
+    for base_mode in (128 | 1, 1, 209):
+        flying.hear(flying.autopilot.say("heartbeat", 1, 12, base_mode, 0, 4, 3))
+        assert flying.link.armed == bool(base_mode & 128)
+
+
+def stds(flying):
+    telemetry = flying.link.state_at(flying.time.now_ns).telemetry(0)
+    return telemetry.vel_std_mps, telemetry.tilt_std_deg
+
+
+ABSOLUTE, DEAD_RECKONING = 831, 303
+GNSS_AIDED, UNAIDED = (None, 1.5), (5.0, 3.0)
+
+
+class Reporting(Flying):
+    """An autopilot that reports its filter and its receivers."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.hear(self.autopilot.heartbeat(), self.autopilot.attitude(self.boot_ns()))
+
+    def report(self, flags=ABSOLUTE, receivers=(3,), vel_std_mps=None, ardupilot=False):
+        say, us = self.autopilot.say, self.boot_ns() // 1000
+        if ardupilot:
+            self.hear(say("ekf_status_report", flags, 0, 0, 0, 0, 0))
+        elif flags is not None:
+            self.hear(say("estimator_status", us, flags, 0, 0, 0, 0, 0, 0, 0, 0))
+        for number, fix_type in enumerate(receivers):
+            name = ("gps_raw_int", "gps2_raw")[number]
+            more = () if number == 0 else (0, 0)
+            self.hear(say(name, us, fix_type, 0, 0, 0, 0, 0, 0, 0, 9, *more))
+        if vel_std_mps is not None:
+            covariance = [0.0] * 21
+            covariance[0], covariance[6] = vel_std_mps**2, 0.01
+            place = us, 1, 12, 0, 0, 0, (1.0, 0, 0, 0), 0, 0, 0, 0, 0, 0
+            self.hear(say("odometry", *place, [0.0] * 21, covariance, 0, 8, 0))
+        return stds(self)
+
+
+@pytest.mark.parametrize("ardupilot", [False, True])
+def test_velocity_and_horizon_are_accurate_only_while_gnss_holds_the_filter(ardupilot):
+    flying = Reporting()
+    assert stds(flying) == UNAIDED  # nothing is known
+    assert flying.report(ardupilot=ardupilot) == GNSS_AIDED
+    assert flying.report(DEAD_RECKONING, ardupilot=ardupilot) == UNAIDED
+    assert flying.report(ABSOLUTE | 1024, ardupilot=ardupilot) == UNAIDED  # glitch, uninitialized
+    assert flying.report(ABSOLUTE | 128, ardupilot=ardupilot) == UNAIDED  # constant position
+    assert flying.report(ardupilot=ardupilot) == GNSS_AIDED
+
+
+def test_without_a_fix_of_a_receiver_the_filter_may_rest_on_orthonav():
+    flying = Reporting()
+    assert flying.report(receivers=()) == UNAIDED
+    assert flying.report(receivers=(1,)) == UNAIDED
+    assert flying.report(receivers=(1, 3)) == GNSS_AIDED
+    flying.time.go(4.0)
+    assert flying.report(receivers=()) == UNAIDED  # the receiver fell silent
+    ours = Reporting(own_receiver=0)  # what it reports as its first receiver is GPS_INPUT
+    assert ours.report(receivers=(3,)) == UNAIDED
+    assert ours.report(receivers=(3, 3)) == GNSS_AIDED
+
+
+def test_a_fix_without_the_state_of_the_filter_is_not_enough():
+    flying = Reporting()
+    assert flying.report(flags=None) == UNAIDED
+    flying.report()
+    flying.time.go(6.0)
+    assert flying.report(flags=None) == UNAIDED
+
+
+def test_a_large_covariance_of_the_velocity_is_taken_over():
+    flying = Reporting()
+    assert flying.report(vel_std_mps=0.3) == GNSS_AIDED
+    assert flying.report(vel_std_mps=2.0) == UNAIDED  # GNSS is received, but not fused
+    assert flying.report(vel_std_mps=7.0) == (pytest.approx(7.0), 3.0)
+    assert flying.report(vel_std_mps=math.nan) == GNSS_AIDED
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_dead_reckoning_is_sent_by_the_message_that_can_mark_it_only():
     (sensor,) = sending.frames
     assert sensor["flags"] == 1 and (sensor["lat"], sensor["lon"]) == (480100000, 20100000)
     assert sensor["eph"] == pytest.approx(3.0)
-    assert not sending.messenger.not_made
+    assert sending.messenger.incomplete == 0
 
 
 def test_times_are_those_of_exposure_and_sending():
@@ -99,34 +99,77 @@ def test_times_are_those_of_exposure_and_sending():
     assert boot.frames[0]["time_usec"] == 61_000_000 and boot.frames[0]["time_week"] > 2000
 
 
-def test_no_stamp_by_an_unknown_clock_of_the_autopilot():
+def test_no_stamp_by_an_unknown_clock_of_the_autopilot(caplog):
     boot = Sending(clock=Clock.BOOT)
-    assert boot.publish(boot_ns=None) == () and boot.frames == []
-    assert [*boot.messenger.not_made] and "boot" in next(iter(boot.messenger.not_made))
+    for _ in range(2):
+        assert boot.publish(boot_ns=None) == () and boot.frames == []
+    assert boot.messenger.incomplete == 2 and len(caplog.messages) == 1
+    assert "boot" in caplog.text
 
 
 def test_local_messages_wait_for_the_origin_and_the_height():
     sending = Sending("odometry", "global-position")
     assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
     assert sending.publish(telemetry=VehicleState(None)) == ("GLOBAL_POSITION_SENSOR",)
-    assert sum(sending.messenger.not_made.values()) == 2
+    assert sending.messenger.incomplete == 2
+    assert sending.gate.withheld == {"not_made:ODOMETRY": 2}
     assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
         KINDS[kind] for kind in ("odometry", "global-position")
     )
     assert sending.frames[-2]["frame_id"] == 20  # as ArduPilot reads it
 
 
-def test_the_origin_is_sent_until_the_autopilot_reports_one():
-    sending = Sending("vision", origin=ORIGIN)
-    for _ in range(50):
-        sending.messenger.send_origin(None, Target(3, 1))
+def find_origin(sending, seconds, known=None, *, armed=False):
+    """What is sent while an autopilot is asked; `known`: the origin that it reports."""
+    sending.frames.clear()
+    for _ in range(10 * seconds):
+        sending.messenger.find_origin(known, Target(3, 1), armed=armed)
         sending.time.go(0.1)
-    assert [each["latitude"] for each in sending.frames] == [480000000] * 3
-    assert sending.frames[0]["target_system"] == 3
-    sending.messenger.send_origin(ORIGIN, Target(3, 1))
-    other = Sending("gps-input", origin=ORIGIN)
-    other.messenger.send_origin(None, None)
-    assert len(sending.frames) == 3 and other.frames == []
+    return [each["name"] for each in sending.frames]
+
+
+def test_the_autopilot_is_asked_for_its_origin_at_a_modest_interval():
+    for kind in ("odometry", "vision"):
+        sending = Sending(kind)
+        assert find_origin(sending, 10) == ["COMMAND_LONG"] * 5
+        asked = sending.frames[0]
+        assert (asked["command"], asked["param1"]) == (512, 49.0)
+        assert (asked["target_system"], asked["target_component"]) == (3, 1)
+    assert find_origin(sending, 5, ORIGIN) == []
+    assert find_origin(Sending("gps-input", "global-position", origin=ORIGIN), 10) == []
+
+
+def test_an_origin_is_set_on_the_ground_where_the_autopilot_has_none():
+    sending = Sending("vision", origin=ORIGIN)
+    assert find_origin(sending, 6) == ["COMMAND_LONG"] * 3
+    assert find_origin(sending, 2) == ["SET_GPS_GLOBAL_ORIGIN", "COMMAND_LONG"]
+    assert (sending.frames[0]["latitude"], sending.frames[0]["target_system"]) == (480000000, 3)
+    assert find_origin(sending, 6, ORIGIN) == []
+    # After a restart of the autopilot it is asked again first.
+    assert find_origin(sending, 2) == ["COMMAND_LONG"]
+
+
+@pytest.mark.parametrize("armed", [True, None])
+def test_an_origin_is_never_set_in_flight(armed):
+    names = find_origin(Sending("odometry", origin=ORIGIN), 60, armed=armed)
+    assert set(names) == {"COMMAND_LONG"}
+
+
+def test_an_origin_is_not_set_by_a_link_that_does_not_send():
+    sending = Sending("odometry", origin=ORIGIN)
+    sending.open = False
+    assert set(find_origin(sending, 60)) == {"COMMAND_LONG"}  # none of them was heard
+
+
+def test_gps_input_carries_the_altitude_where_it_is_known():
+    sending = Sending("gps-input", "global-position")
+    sending.publish()
+    sending.publish(telemetry=replace(VEHICLE, amsl_m=640.0))
+    unknown, _, known, sensor = sending.frames
+    assert unknown["ignore_flags"] & 129 == 129
+    assert not known["ignore_flags"] & 129
+    assert (known["alt"], known["vert_accuracy"]) == (640.0, 3.0)
+    assert math.isnan(sensor["alt"])
 
 
 def test_a_rate_limit_is_kept():

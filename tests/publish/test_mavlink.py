@@ -27,7 +27,9 @@ from orthonav.publish.mavlink import (
     external_position_estimate,
     global_position_sensor,
     gps_input,
+    request_message,
     signing_timestamp,
+    status_texts,
 )
 from orthonav.publish.mavlink_local import (
     LocalPose,
@@ -37,7 +39,7 @@ from orthonav.publish.mavlink_local import (
 )
 from wire import SIZES, TABLES, decode, layout
 
-INT32_MAX, UINT16_MAX = 2**31 - 1, 2**16 - 1
+UINT16_MAX = 2**16 - 1
 UTC_NS = 1_789_000_000_123_456_789
 ESTIMATE = NavigationEstimate(
     48.1234567,
@@ -162,13 +164,11 @@ def test_a_global_position_has_all_known_values() -> None:
     assert high["time_usec"] == 61_580_000
 
 
-@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
-def test_a_global_position_of_low_confidence_has_no_position(estimate: NavigationEstimate) -> None:
-    """PX4 reads no flag, but takes nothing whose `eph` is not above 0."""
-    read = sent(global_position_sensor(estimate))
-    assert read["flags"] == 1
-    assert (read["lat"], read["lon"]) == (INT32_MAX, INT32_MAX)
-    assert math.isnan(read["eph"]) and not read["eph"] > 0
+def test_a_dead_reckoned_position_is_marked_and_needs_an_accuracy() -> None:
+    coasting = replace(ESTIMATE, state="coasting", confidence=0.3, dead_reckoned=True)
+    assert sent(global_position_sensor(coasting))["flags"] == 1
+    with pytest.raises(EstimateError, match="accuracy"):
+        global_position_sensor(replace(coasting, cov_en_m2=np.full((2, 2), math.nan)))
 
 
 def test_a_gps_input_marks_what_is_not_known() -> None:
@@ -231,12 +231,32 @@ def test_messages_that_cannot_mark_low_confidence_are_not_made(
     estimate: NavigationEstimate,
 ) -> None:
     for make in (
+        # PX4 reads no flag, and would take unknown coordinates for a place.
+        lambda: global_position_sensor(estimate),
         lambda: external_position_estimate(estimate),
         lambda: odometry(estimate, POSE, Autopilot.PX4),
         lambda: vision_position_estimate(estimate, POSE, Autopilot.PX4),
     ):
         with pytest.raises(EstimateError, match="cannot mark"):
             make()
+
+
+@pytest.mark.parametrize("length", [0, 12, 50, 51, 99, 100, 130])
+def test_texts_of_any_length_arrive_whole(length: int) -> None:
+    text = ("0123456789" * 13)[:length]
+    read = [sent(each) for each in status_texts(4, text, 65534)]
+    assert b"".join(each["text"].rstrip(b"\0") for each in read) == text.encode()
+    assert [each["chunk_seq"] for each in read] == [*range(len(read))]
+    assert len({each["id"] for each in read}) == 1 and {each["severity"] for each in read} == {4}
+    single = length <= 50
+    assert (read[0]["id"] == 0) == single and (len(read) == 1) == single
+    assert single or len(read[-1]["text"].rstrip(b"\0")) < 50  # this ends the text
+
+
+def test_a_message_is_requested() -> None:
+    read = sent(request_message(49, Target(3, 1)))
+    assert (read["target_system"], read["target_component"]) == (3, 1)
+    assert (read["command"], read["param1"], read["param7"]) == (512, 49.0, 0.0)
 
 
 def test_odometry_for_px4_is_north_east_down() -> None:
@@ -309,7 +329,7 @@ def test_the_origin_is_set_in_millimetres() -> None:
     read = sent(set_gps_global_origin(Origin(48.1, -4.3, -1.2345), target_system=3, time_ns=5_000))
     assert (read["latitude"], read["longitude"], read["altitude"]) == (481000000, -43000000, -1234)
     assert (read["target_system"], read["time_usec"]) == (3, 5)
-    assert sent(set_gps_global_origin(Origin(0, 0, 1e9)))["altitude"] == INT32_MAX
+    assert sent(set_gps_global_origin(Origin(0, 0, 1e9)))["altitude"] == 2**31 - 1
     with pytest.raises(EstimateError, match="altitude"):
         Origin(48.0, 0.0, math.nan)
     with pytest.raises(EstimateError, match="latitude and longitude seem to be swapped"):

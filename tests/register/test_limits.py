@@ -3,6 +3,7 @@
 import math
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from test_registrar import VIEW_PX
 
 from orthonav.register.evidence import FINE
 from orthonav.register.pose import Pose
+from orthonav.register.reference import Reference
 from orthonav.register.refine import Refiner
 from orthonav.register.registrar import Registrar
 from orthonav.register.search import search
@@ -51,6 +53,25 @@ def test_a_part_of_the_map_is_converged_upon_as_fast_and_known_less_exactly(hole
     )
     assert np.hypot(*errors(part, pose)[:2]) < 0.12
     assert np.trace(part.covariance[:2, :2]) > np.trace(whole.covariance[:2, :2])
+
+
+@pytest.mark.parametrize("log_scale", [2.0, 7.0, 700.0])
+def test_an_absurd_scale_takes_no_memory(log_scale, monkeypatch):
+    """As computed from a bank at a low height: a window of 129 GiB was asked for."""
+    pose = Pose(222.0, 181.0, 0.1, 0.0)
+    view = noisy(GROUND, pose, np.random.default_rng(1), noise=10.0).at(0)
+    reference = reference_of(GROUND, SHAPE)
+    monkeypatch.setattr(Reference, "caches", lambda self, level: False)
+    sizes, window = [], Reference.window
+
+    def counted(self, level, row, col, height, width, *more):
+        sizes.append(height * width)
+        return window(self, level, row, col, height, width, *more)
+
+    monkeypatch.setattr(Reference, "window", counted)
+    usual = Refiner(view, reference).place(pose)
+    absurd = Refiner(view, reference).place(replace(pose, log_scale=log_scale))
+    assert sizes[-1] < 10 * sizes[0] and not absurd.score > 0.5 * usual.score
 
 
 @pytest.mark.parametrize("spread_rad", [0.12, 0.6])

@@ -126,6 +126,12 @@ def test_normalized_errors_are_those_of_its_covariance():
     assert 1.48 < np.mean(values) < 2.55
 
 
+def test_a_view_without_any_place_leaves_the_track_searching():
+    mixture = Mixture(MODEL, EXTENT)
+    mixture.update(ReportedAttitude(0.0, 0.0, 0.0), [])
+    assert mixture.hypotheses == [] and mixture.estimate(RADIUS_M) is None
+
+
 def test_one_lucky_view_is_no_track():
     flight, mixture = Flight(1), Mixture(MODEL, EXTENT)
     mixture.update(flight.reported(), [flight.sighting(30.0)])

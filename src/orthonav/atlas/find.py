@@ -22,8 +22,8 @@ from orthonav.atlas.matches import ViewMatches
 from orthonav.atlas.sheet_registration import SearchRegion, SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
 from orthonav.geo.frames import LocalFrame
-from orthonav.localizer.checks import check_footprint, check_view
-from orthonav.localizer.prepared import MIN_VIEW_PX, pose_prior
+from orthonav.localizer.checks import MIN_VIEW_PX, check_footprint, check_view
+from orthonav.localizer.prepared import pose_prior
 from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
 from orthonav.records import CONFIDENT, NoFix, View
 

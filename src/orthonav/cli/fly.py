@@ -332,6 +332,13 @@ def _add_flight(group: argparse._ActionsContainer) -> None:
         help="largest age of a view when its processing starts; older views are dropped "
         "(default 500)",
     )
+    group.add_argument(
+        "--min-agl-m",
+        type=float,
+        metavar="M",
+        help="height above ground from which views are located (default: where a view covers 60 "
+        "pixels of the map)",
+    )
     add_search(group)
     add_signature(group)
 

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import logging
+import math
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -57,6 +58,9 @@ from orthonav.records import CONFIDENT, Prior
 from orthonav.sources.cameras import read_camera_file
 
 log = logging.getLogger(__name__)
+LEAST_VIEW_PX = 60.0
+"""Narrower views (pixels of the map across) are seldom confident and take the longest, which makes
+the next ones late. An aircraft climbs through them."""
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
@@ -100,6 +104,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         heights=heights,
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
+        min_agl_m=_min_agl_m(options, camera, localizer),
         telemetry_wait_s=options.telemetry_wait_ms / 1e3,
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
@@ -124,6 +129,14 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
     )
+
+
+def _min_agl_m(options: argparse.Namespace, camera: Camera, localizer: Localizer) -> float:
+    """Height from which views are located: as given, else where they cover enough of the map."""
+    if options.min_agl_m is not None:
+        return float(options.min_agl_m)
+    across, along = camera.extent
+    return LEAST_VIEW_PX * localizer.grid.gsd_m / math.sqrt(across * along)
 
 
 def _opened(options: argparse.Namespace) -> MapFile:
@@ -228,6 +241,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         signing=_signing(options, clocks),
         silent=options.dry_run,
         stamp=Clock(options.stamp),
+        own_receiver=options.gps_id if "gps-input" in (options.send or ()) else None,
     )
 
 

@@ -44,13 +44,19 @@ class Mount:
     """Number of views that the estimate is based on."""
 
     def corrected(self, telemetry: Telemetry) -> Telemetry:
-        """Telemetry without these errors; unknown values stay unknown."""
+        """Telemetry without these errors; unknown values stay unknown.
+
+        What is not known of the mount adds to the stated deviation of pitch and roll.
+        """
+        tilt = telemetry.tilt_std_deg
+        mount = max(self.pitch_deg.std, self.roll_deg.std)
         return replace(
             telemetry,
             yaw_deg=telemetry.yaw_deg + self.heading_deg.value,
             agl_m=telemetry.agl_m * math.exp(self.log_scale.value),
             pitch_deg=telemetry.pitch_deg + self.pitch_deg.value,
             roll_deg=telemetry.roll_deg + self.roll_deg.value,
+            tilt_std_deg=None if tilt is None else math.hypot(tilt, mount),
         )
 
 

@@ -13,6 +13,11 @@ from orthonav.records import NoFix, Telemetry, View
 
 MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
+MIN_VIEW_PX = 24.0
+"""Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
+that views are finished at (docs/decisions/registration.md, 2)."""
+MIN_TILT_COS = 0.5
+"""Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
 MAX_COARSER = 4.0
 DARK_LEVEL = 16.0
 BRIGHT_LEVEL = 250.0
@@ -52,10 +57,21 @@ def check_telemetry(
         )
     if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
+    side_px = footprint_side_m(telemetry, camera) / gsd_m
+    if side_px < MIN_VIEW_PX:
+        return _too_small(side_px, MIN_VIEW_PX, f"{telemetry.agl_m:.0f} m above ground, ")
     coarser = camera.gsd_m(telemetry.agl_m) / gsd_m
     if coarser > MAX_COARSER:
         return NoFix("too_coarse", f"a pixel of the view covers {coarser:.3g} pixels of the map")
     return None
+
+
+def footprint_side_m(telemetry: Telemetry, camera: Camera) -> float:
+    """Root of the area of flat ground that a view shows, as it is expected from the telemetry."""
+    tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(math.radians(telemetry.roll_deg))
+    # The area seen grows with the inverse cube of the cosine of the tilt.
+    across, along = camera.extent
+    return telemetry.agl_m * math.sqrt(across * along / max(tilt, MIN_TILT_COS) ** 3)
 
 
 def check_picture(grey: NDArray[np.uint8]) -> NoFix | None:
@@ -102,13 +118,15 @@ def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> No
     """
     side = math.sqrt(cv2.countNonZero(view.valid.view(np.uint8))) * pixel
     if side < min_side_px:
-        return NoFix(
-            "too_small",
-            f"view covers {side:.0f} pixels of the map across, {min_side_px:.0f} needed",
-        )
+        return _too_small(side, min_side_px)
     if _is_uniform(view):
         return NoFix("blank", "the part of the view that would be compared is uniform")
     return None
+
+
+def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
+    detail = f"{where}view covers {side_px:.0f} pixels of the map across, {least_px:.0f} needed"
+    return NoFix("too_small", detail)
 
 
 def _is_uniform(view: RectifiedView) -> bool:

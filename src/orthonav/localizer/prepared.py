@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.localizer.checks import check_footprint
+from orthonav.localizer.checks import MIN_VIEW_PX, check_footprint, footprint_side_m
 from orthonav.localizer.rectify import (
     RectifiedView,
     downsampled,
@@ -32,15 +32,10 @@ MIN_AGL_STD = 0.03
 MAX_AGL_STD = 0.15
 """Largest one: three of them are scales of 0.64 to 1.57, about as far as scores of chance were
 measured to be alike (docs/decisions/registration.md, 1)."""
-MIN_VIEW_PX = 24.0
-"""Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
-that views are finished at (docs/decisions/registration.md, 2)."""
 NEAR_SHARE = 0.6
 """The part of a view far off nadir is judged as one so many times smaller, thus mostly one level
 finer: it is no square, and on its coarse levels too little is left of it
 (docs/decisions/terrain.md)."""
-MIN_TILT_COS = 0.5
-"""Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +65,7 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     `gsd_m` is the ground resolution of level 0 of the map, `map_levels` the number of its levels.
     """
     camera, telemetry = view.camera, view.telemetry
-    tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(math.radians(telemetry.roll_deg))
-    # The area seen grows with the inverse cube of the cosine of the tilt.
-    nominal_m = (telemetry.agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
-        camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
-    )
+    nominal_m = footprint_side_m(telemetry, camera)
     if is_oblique(view):
         near = near_part(view, gsd_m)
         if near is None:

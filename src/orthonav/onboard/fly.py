@@ -41,7 +41,7 @@ from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
 from orthonav.publish.estimate import error_ellipse
-from orthonav.publish.mavlink import dialect
+from orthonav.publish.mavlink import dialect, status_texts
 from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources.attitude import LOOKS_DOWN, Angles
 from orthonav.sources.recording import LONG_GAP_NS, fitted
@@ -100,6 +100,7 @@ class FlyOptions:
     `heights`: turns reported heights into heights above ground; None: the map has no terrain.
     `heading_known`: whether the reported heading is used.
     `deadline_s`: images older than this are dropped.
+    `min_agl_m`: height above ground below which views are not located.
     `telemetry_wait_s`: longest wait for telemetry after the exposure.
     `recorded`: telemetry comes with the image, from a recording or from ROS.
     `accept`: criterion in addition to those of the gate.
@@ -115,6 +116,7 @@ class FlyOptions:
     heights: FlownHeights | None = None
     heading_known: bool = True
     deadline_s: float = 0.5
+    min_agl_m: float = 0.0
     telemetry_wait_s: float = 0.15  # three attitudes at 20 Hz, the least rate asked for
     recorded: bool = False
     accept: Acceptance | None = None
@@ -167,7 +169,8 @@ class Runner:
         self._saved_ns = 0
         self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
-        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0, "slow": 0}
+        self._seen: dict[str, int] = {}
+        self._texts = 0
         self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
 
@@ -232,7 +235,7 @@ class Runner:
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._missing(telemetry) or self._before_the_last(image)
+            refused = self._unusable(telemetry) or self._before_the_last(image)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
@@ -301,6 +304,8 @@ class Runner:
         known = self._above_ground(view.telemetry)
         if isinstance(known, NoFix):
             return self._refused(image, known, vehicle)
+        if known.below is not None and math.isnan(vehicle.amsl_m):
+            vehicle = replace(vehicle, amsl_m=known.below.height_m + known.agl_m)
         reported, telemetry = known, self._over_gap(known, image, vehicle)
         view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
@@ -470,17 +475,22 @@ class Runner:
         if said is not None:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
-    def _missing(self, telemetry: Telemetry) -> NoFix | None:
+    def _unusable(self, telemetry: Telemetry) -> NoFix | None:
+        """Reason not to locate a view by its telemetry."""
         known = self._above_ground(telemetry)
         if isinstance(known, NoFix):
             return known
         missing = [
             name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
         ]
-        if not missing:
-            return None
-        detail = f"not reported at the exposure: {', '.join(missing)}"
-        return self._refusal("no_telemetry", "no_telemetry", detail)
+        if missing:
+            detail = f"not reported at the exposure: {', '.join(missing)}"
+            return self._refusal("no_telemetry", "no_telemetry", detail)
+        least_m = self.options.min_agl_m
+        if known.agl_m < least_m:  # on the ground, and in the take-off
+            detail = f"{known.agl_m:.0f} m above ground; views are located from {least_m:.0f} m"
+            return self._refusal("too_low", "too_low", detail)
+        return None
 
     def _refusal(self, count: str, reason: str, detail: str) -> NoFix:
         self._count(count)
@@ -515,33 +525,34 @@ class Runner:
         self._link.system_status = health.level.value
         if self._link.target is not None:
             if self._reporter.due(health, now_ns):
-                _send_text(self._link, health.level.severity, health.text())
+                self._send_text(health.level.severity, health.text())
             for each in texts:
-                _send_text(self._link, each.severity, each.text)
+                self._send_text(each.severity, each.text)
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
-            self._publisher.messenger.send_origin(self._link.origin, self._link.target)
+            link = self._link
+            self._publisher.messenger.find_origin(link.origin, link.target, armed=link.armed)
+
+    def _send_text(self, severity: int, text: str) -> None:
+        self._texts += 1
+        for each in status_texts(severity, text, self._texts):
+            if self._link is not None:
+                self._link.send(each)
 
     def _count_changes(self) -> None:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
         messenger = self._publisher.messenger
         now = {
-            "jumps": 0 if self._link is None else self._link.sync.jumps,
-            "outages": self._newest.outages,
-            "failed": self._publisher.failed,
-            "lost": 0 if self._sink is None else sum(self._sink.lost.values()),
-            "slow": 0 if messenger is None else messenger.too_slow,
+            "clock_jump": 0 if self._link is None else self._link.sync.jumps,
+            "camera_lost": self._newest.outages,
+            "output_failed": self._publisher.failed,
+            "log_failed": 0 if self._sink is None else sum(self._sink.lost.values()),
+            "slow_vision": 0 if messenger is None else messenger.too_slow,
+            "incomplete": 0 if messenger is None else messenger.incomplete,
         }
-        names = {
-            "jumps": "clock_jump",
-            "outages": "camera_lost",
-            "failed": "output_failed",
-            "lost": "log_failed",
-            "slow": "slow_vision",
-        }
-        for key, name in names.items():
-            if now[key] > self._seen[key]:
+        for name, value in now.items():
+            if value > self._seen.get(name, 0):
                 self._count(name)
         self._seen = now
         ahead_ns = self._clocks.utc_ns() - self._clocks.mono_ns()
@@ -551,9 +562,11 @@ class Runner:
 
     def _snapshot(self, now_ns: int) -> Snapshot:
         counts = self.counter.counts(now_ns)
-        link = None
+        link, has_origin = None, True
         if self._link is not None:
-            link = self._link.status()
+            link, messenger = self._link.status(), self._publisher.messenger
+            needed = messenger is not None and messenger.needs_origin
+            has_origin = not needed or self._link.origin is not None
         uses_link = link is not None and not self.options.recorded
         image_ns = self._begun_ns if self._image_taken_ns is None else self._image_taken_ns
         found = (0.0, 0.0) if self._diagnosis is None else self._diagnosis.mismatch(now_ns)
@@ -576,6 +589,7 @@ class Runner:
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
             gnss=() if self._gnss is None else self._gnss.reasons,
+            has_origin=has_origin,
             latency=self._latency_reason(),
         )
 
@@ -653,10 +667,6 @@ def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
     if not np.isfinite(velocity).all():
         return fix
     return replace(fix, cov_en_m2=fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
-
-
-def _send_text(link: AutopilotLink, severity: int, text: str) -> None:
-    link.send(dialect().MAVLink_statustext_message(severity, text.encode("ascii", "replace")))
 
 
 def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:

@@ -24,8 +24,6 @@ from orthonav.records import Fix, Telemetry, View
 log = logging.getLogger(__name__)
 WINDOW_S = 10.0
 """Counts cover so many seconds."""
-STATUSTEXT_MAX = 50
-"""Characters of a STATUSTEXT (MAVLink common.xml)."""
 STATUSTEXT_INTERVAL_NS = 5 * 10**9
 DIAGNOSIS_INTERVAL_S = 5.0
 DIAGNOSIS_VALID_S = 30.0
@@ -53,11 +51,9 @@ class Health:
     reasons: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """Text for a ground station, truncated to the length of a STATUSTEXT."""
+        """Text for a ground station."""
         text = f"orthonav {self.level.name}"
-        if self.reasons:
-            text += ": " + ", ".join(self.reasons)
-        return text if len(text) <= STATUSTEXT_MAX else text[: STATUSTEXT_MAX - 2] + ".."
+        return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
 
 
 @dataclass(frozen=True)
@@ -93,8 +89,8 @@ class Snapshot:
     `running_s`: time since the start.
     `counts`: events within the window by name: `taken` (by the runner), `processed`, `late`,
     `frozen`, `bad_image`, `no_telemetry`, `internal_error`, `wrong_camera`, `camera_lost`,
-    `clock_jump`, `output_failed`, `log_failed`, `state_failed`; `slow_vision`, seconds in which a
-    local message came too late for PX4.
+    `clock_jump`, `output_failed`, `log_failed`, `state_failed`; seconds in which a local message
+    came too late for PX4 (`slow_vision`) or a message could not be built (`incomplete`).
     `image_age_s`, `telemetry_age_s`, `link_age_s`: time since the last image, attitude, message.
     `low_confidence_s`: time since the last confident position.
     `latency_s`: 95th percentile of the time from exposure to message.
@@ -104,6 +100,7 @@ class Snapshot:
     `map_intact`: whether the open map file was neither truncated nor rewritten.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
     `gnss`: reasons of the GNSS monitor.
+    `has_origin`: whether the origin of the local frame is known, where messages need it.
     `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
     """
 
@@ -121,6 +118,7 @@ class Snapshot:
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
     gnss: tuple[str, ...] = ()
+    has_origin: bool = True
     latency: str | None = None
 
 
@@ -151,6 +149,8 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
         "slow": seen.latency_s > limits.latency_s or count["late"] > many,
         "slow_vision": count["slow_vision"] > limits.share * WINDOW_S,
+        "no_origin": settled and not seen.has_origin,
+        "incomplete_message": count["incomplete"] > limits.share * WINDOW_S and seen.has_origin,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not seen.synced and not failed["link_down"],

@@ -15,7 +15,7 @@ import numpy as np
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.arrival import GAP_S, Arrival
-from orthonav.onboard.delay import UNEXPLAINED, DelayEstimate, DelayEstimator
+from orthonav.onboard.delay import EXPLAINED, UNEXPLAINED, DelayEstimate, DelayEstimator
 from orthonav.onboard.delay_check import DelayCheck
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import Grey, PictureOdometry
@@ -253,11 +253,11 @@ class LatencyMonitor:
             self._changes = arrival.changes
         if arrival.changes != self._changes:
             self._changes, self._anchor, self._grown = arrival.changes, None, False
-            self._suspect(arrival.why, arrival.arrived_ns)
+            self._interrupted(arrival.why, arrival.arrived_ns)
         if self._frozen_ns is not None:
             stalled_s = (arrival.arrived_ns - self._frozen_ns) / 1e9
             if stalled_s > GAP_S:
-                self._suspect(f"the image was frozen for {stalled_s:.1f} s", arrival.arrived_ns)
+                self._interrupted(f"the image was frozen for {stalled_s:.1f} s", arrival.arrived_ns)
         if math.isnan(arrival.grown_s):
             return
         if self._anchor is None:
@@ -273,16 +273,28 @@ class LatencyMonitor:
             self._start_again(arrival.arrived_ns)
         self._grown = grown
 
+    def _interrupted(self, why: str, arrived_ns: int) -> None:
+        """Note that images stopped for a while. A stated delay holds; it is compared with the
+        images again, as at the start. Positions from before the gap show whether it grew."""
+        if self._known is not self._stated:
+            self._suspect(why, arrived_ns)
+            return
+        self._compared, self._first_ns = False, None
+        self._forget_images(arrived_ns)
+
     def _suspect(self, why: str, arrived_ns: int) -> None:
         self._suspicion, self._disputed = why, False
         self._start_again(arrived_ns)
 
     def _start_again(self, arrived_ns: int) -> None:
-        """Forget pictures from before a change."""
+        """Forget what is from before a change."""
+        self._positions.clear()
+        self._forget_images(arrived_ns)
+
+    def _forget_images(self, arrived_ns: int) -> None:
         self._estimator.forget_before(arrived_ns)
         self._odometry.reset()
         self._check.clear()
-        self._positions.clear()
         self._pending, self._contradictions = None, 0
 
     def _judge(self, found: DelayEstimate) -> None:
@@ -318,7 +330,8 @@ class LatencyMonitor:
         """Dispute the delay in use where the last seconds do not fit it."""
         share = self._check.share()
         if share >= UNEXPLAINED:
-            self._compared, self._contradictions = True, 0
+            self._contradictions = 0
+            self._compared |= share >= EXPLAINED  # a delay that is a little off explains some
         if share < UNEXPLAINED:
             self._unlike_ns = arrived_ns
             if not self._suspicion:

@@ -15,6 +15,7 @@ from typing import Any
 
 from orthonav.extras import needed
 from orthonav.flight.gnss import GnssSample
+from orthonav.onboard.aiding import Aiding
 from orthonav.onboard.gnss.mavlink import gnss_sample
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import (
@@ -48,6 +49,10 @@ _BOARD, _NO_AUTOPILOT, _AUTOPILOT_COMPONENT = 18, 8, 1
 _KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
 _DOWNWARD = 25
 _FAR_NS = 60 * 10**9
+_ARMED = 128
+_SAME_M = 0.05
+"""Heights above home and above sea level that are the same within this are one height, twice: home
+is not within this of sea level."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +91,12 @@ class AutopilotLink:
         signing: Signing | None = None,
         silent: bool = False,
         stamp: Clock = Clock.UTC,
+        own_receiver: int | None = None,
     ) -> None:
         """`system_id`: that of the autopilot, by default of the first one heard. `signing`: sign
         outgoing messages and require incoming ones to be signed with the same key. `silent`: send
         nothing. `stamp`: clock of the timestamps of messages, with which TIMESYNC is answered.
+        `own_receiver`: number of the GNSS receiver that orthonav stands for, if any.
 
         Raises `MissingExtraError` where pymavlink is missing or too old.
         """
@@ -97,6 +104,7 @@ class AutopilotLink:
         self._opener, self._clocks = opener, clocks
         self.buffer, self.sync = buffer, ClockSync()
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
+        self.aiding = Aiding(own_receiver)
         self._lock = threading.RLock()
         self._wanted, self._component_id, self._silent = system_id, component_id, silent
         self._signing, self._stamp = signing, stamp
@@ -106,6 +114,7 @@ class AutopilotLink:
         self.target: Target | None = None
         self.kind: Autopilot | None = None
         self.origin: Origin | None = None
+        self.armed: bool | None = None
         self.system_status = 1  # MAV_STATE_BOOT
         self.counts: Counter[str] = Counter()
         self._heard_ns: int | None = None
@@ -159,20 +168,23 @@ class AutopilotLink:
     def covered_ns(self) -> int | None:
         """Time of our clock up to which the attitude is known; None without any."""
         with self._lock:
-            newest, offset = self.buffer.covered_ns, self.sync.offset_ns
-            return None if newest is None or offset is None else newest - offset
+            newest = self.buffer.covered_ns
+            return None if newest is None else self.sync.mono_ns(newest)
 
     def state_at(self, exposed_ns: int) -> VehicleState:
         """State that the autopilot reported for a time of our clock."""
         with self._lock:
-            if self.sync.offset_ns is None:
+            boot_ns = self.sync.boot_ns(exposed_ns)
+            if boot_ns is None:
                 return VehicleState(None)
-            return self.buffer.at(exposed_ns + self.sync.offset_ns)
+            vel_std_mps, tilt_std_deg = self.aiding.stds(self._clocks.mono_ns())
+            state = self.buffer.at(boot_ns)
+            return replace(state, vel_std_mps=vel_std_mps, tilt_std_deg=tilt_std_deg)
 
     def boot_ns(self, mono_ns: int) -> int | None:
         """Convert a time of our clock to the autopilot's; None while the offset is unknown."""
         with self._lock:
-            return None if self.sync.offset_ns is None else mono_ns + self.sync.offset_ns
+            return self.sync.boot_ns(mono_ns)
 
     def status(self) -> LinkStatus:
         """Status of the link."""
@@ -291,14 +303,20 @@ class AutopilotLink:
         """Time of a message in ns; updates the clock offset."""
         boot_ns = int(boot_ms) * 1_000_000
         if self.sync.heard(now_ns, boot_ns):
-            self.buffer.clear()
+            self._restarted()
         return boot_ns
 
+    def _restarted(self) -> None:
+        """Discard what the autopilot reported before its clock jumped: it may have restarted."""
+        self.buffer.clear()
+        self.origin = None
+
     def _arrived(self, now_ns: int) -> int | None:
-        return None if self.sync.offset_ns is None else now_ns + self.sync.offset_ns
+        return self.sync.boot_ns(now_ns)
 
     def _heartbeat(self, message: Message, now_ns: int) -> None:
         self.kind = _KINDS.get(message.autopilot, self.kind)
+        self.armed = bool(message.base_mode & _ARMED)
 
     def _attitude(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
@@ -314,9 +332,15 @@ class AutopilotLink:
 
     def _global_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
-        self.buffer.add_height("home", time_ns, message.relative_alt * 1e-3)
-        if message.alt != 0:  # 0 where the autopilot has no position
-            self.buffer.add_height("amsl", time_ns, message.alt * 1e-3)
+        home_m, amsl_m = message.relative_alt * 1e-3, message.alt * 1e-3
+        # PX4 without a home repeats the height above the sea, and ArduPilot without an altitude by
+        # GNSS counts that from its start.
+        same = abs(home_m - amsl_m) <= _SAME_M
+        if not same or self.kind is Autopilot.ARDUPILOT:
+            self.buffer.add_height("home", time_ns, home_m)
+        # 0 where the autopilot has no position
+        if message.alt != 0 and (not same or self.kind is Autopilot.PX4):
+            self.buffer.add_height("amsl", time_ns, amsl_m)
 
     def _local_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
@@ -361,7 +385,17 @@ class AutopilotLink:
         except EstimateError:
             self.counts["damaged"] += 1
 
+    def _filter_status(self, message: Message, now_ns: int) -> None:
+        self.aiding.status(message.flags, now_ns)
+
+    def _odometry(self, message: Message, now_ns: int) -> None:
+        """The accuracy of the velocity, along the first two axes of the message."""
+        variance = max(message.velocity_covariance[0], message.velocity_covariance[6])
+        self.aiding.velocity(math.sqrt(variance) if variance >= 0 else math.nan, now_ns)
+
     def _gnss(self, message: Message, now_ns: int) -> None:
+        number = 0 if message.get_type() == "GPS_RAW_INT" else 1
+        self.aiding.receiver(number, message.fix_type, now_ns)
         self.gnss.append(gnss_sample(message, now_ns, self._arrived(now_ns)))
 
     def _timesync(self, message: Message, now_ns: int) -> None:
@@ -373,7 +407,7 @@ class AutopilotLink:
         elif message.ts1 in self._asked:
             self._asked.remove(message.ts1)
             if self.sync.exchange(message.ts1, now_ns, message.tc1):
-                self.buffer.clear()
+                self._restarted()
 
     def _send_due(self) -> None:
         now_ns = self._clocks.mono_ns()
@@ -403,6 +437,9 @@ _HANDLERS: dict[str, Callable[[AutopilotLink, Message, int], None]] = {
     "SYSTEM_TIME": AutopilotLink._system_time,
     "GPS_GLOBAL_ORIGIN": AutopilotLink._origin,
     "TIMESYNC": AutopilotLink._timesync,
+    "ESTIMATOR_STATUS": AutopilotLink._filter_status,
+    "EKF_STATUS_REPORT": AutopilotLink._filter_status,
+    "ODOMETRY": AutopilotLink._odometry,
     "GPS_RAW_INT": AutopilotLink._gnss,
     "GPS2_RAW": AutopilotLink._gnss,
 }

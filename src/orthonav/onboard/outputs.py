@@ -2,10 +2,10 @@
 
 import errno
 import json
+import logging
 import math
 import socket
 import sys
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from orthonav.publish.mavlink import (
     external_position_estimate,
     global_position_sensor,
     gps_input,
+    request_message,
 )
 from orthonav.publish.mavlink_local import (
     LocalPose,
@@ -36,6 +37,7 @@ from orthonav.publish.mavlink_local import (
 from orthonav.publish.nmea import Quality, gga, gst, rmc
 from orthonav.records import CONFIDENT, ViewResult
 
+log = logging.getLogger(__name__)
 KINDS = {
     "global-position": "GLOBAL_POSITION_SENSOR",
     "gps-input": "GPS_INPUT",
@@ -51,9 +53,11 @@ DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
 PX4_VISION_S = 0.2
 """PX4 starts to fuse a local message only where it follows the one before sooner than this, and
 stops after twice this time without one (`EV_MAX_INTERVAL`; docs/autopilots.md)."""
-ORIGIN_NS = 2 * 10**9
-"""Interval at which the origin is sent until the autopilot reports one."""
-_MOST_CLIENTS, _CLIENT_BYTES = 8, 8192
+ORIGIN_NS, ORIGIN_REQUESTS = 2 * 10**9, 3
+"""Interval at which the autopilot is asked for its origin until it reports one, and number of
+requests without an answer after which it has none."""
+_GPS_GLOBAL_ORIGIN = 49
+_MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class MessageOptions:
     `min_std_m`: lower bound of the reported standard deviation, metres.
     `min_confidence`: confidence (0 to 1) from which a position is reported as valid.
     `autopilot`: whose conventions local messages follow; None: those of the autopilot heard.
-    `origin`: origin of the local frame to set where the autopilot has none.
+    `origin`: origin of the local frame to set, on the ground, where the autopilot has none.
     """
 
     kinds: tuple[str, ...] = ("global-position",)
@@ -91,8 +95,8 @@ class MessageOptions:
 class Messenger:
     """Builds the messages of a view and sends those that are due. Mutable.
 
-    `not_made`: counts of messages that could not be built, by reason. `too_slow`: number of local
-    messages that followed the one before too late for PX4.
+    `incomplete`: number of messages that could not be built. `too_slow`: number of local messages
+    that followed the one before too late for PX4.
     """
 
     def __init__(
@@ -101,9 +105,9 @@ class Messenger:
         """`gate` limits the rates; `send` returns whether the port was open."""
         self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
         self._covariance = FilterCovariance(options.min_std_m)
-        self.not_made: Counter[str] = Counter()
-        self.too_slow = 0
-        self._origin_due_ns = 0
+        self.incomplete = self.too_slow = 0
+        self._said: set[str] = set()
+        self._origin_due_ns = self._requests = 0
 
     def publish(
         self,
@@ -131,7 +135,7 @@ class Messenger:
             try:
                 made = self._make(name, stated, vehicle, target or AUTOPILOT, kind, origin)
             except EstimateError as error:
-                self.not_made[f"{KINDS[name]}: {error}"[:200]] += 1
+                self._not_made(name, error)
                 continue
             if self._gate.due(KINDS[name], now_ns) and self._send(made):
                 sent.append(KINDS[name])
@@ -149,15 +153,38 @@ class Messenger:
         """Whose conventions local messages follow; `kind` is the autopilot heard."""
         return self.options.autopilot or kind or Autopilot.PX4
 
-    def send_origin(self, known: Origin | None, target: Target | None) -> None:
-        """Send the origin of the local frame until the autopilot reports one (`known`)."""
+    def _not_made(self, name: str, error: EstimateError) -> None:
+        """Count a message that could not be built, and log why, once for each reason."""
+        self.incomplete += 1
+        self._gate.withheld[f"not_made:{KINDS[name]}"] += 1
+        why = f"{KINDS[name]} cannot be made: {error}"
+        if why not in self._said and len(self._said) < _MOST_REASONS:
+            self._said.add(why)
+            log.warning("%s", why)
+
+    @property
+    def needs_origin(self) -> bool:
+        """Whether messages are in the autopilot's local frame."""
+        return any(kind in LOCAL for kind in self.options.kinds)
+
+    def find_origin(
+        self, known: Origin | None, target: Target | None, *, armed: bool | None
+    ) -> None:
+        """Ask the autopilot for the origin of its local frame until it reports one (`known`).
+
+        One that has none gets that of the options, unless it is `armed`: an origin that moves in
+        flight moves the aircraft.
+        """
         now_ns, origin = self._clocks.mono_ns(), self.options.origin
-        wanted = any(kind in LOCAL for kind in self.options.kinds)
-        if not wanted or origin is None or known is not None or now_ns < self._origin_due_ns:
+        if known is not None:
+            self._requests = 0
+            return
+        if not self.needs_origin or target is None or now_ns < self._origin_due_ns:
             return
         self._origin_due_ns = now_ns + ORIGIN_NS
-        system_id = (target or AUTOPILOT).system_id
-        self._send(set_gps_global_origin(origin, target_system=system_id))
+        if origin is not None and armed is False and self._requests >= ORIGIN_REQUESTS:
+            self._send(set_gps_global_origin(origin, target_system=target.system_id))
+        self._requests += self._send(request_message(_GPS_GLOBAL_ORIGIN, target))
 
     def _make(
         self,
@@ -179,6 +206,8 @@ class Messenger:
                 min_confidence=least,
             )
         if name == "gps-input":
+            if math.isfinite(vehicle.amsl_m) and math.isnan(estimate.alt_amsl_m):
+                estimate = replace(estimate, alt_amsl_m=vehicle.amsl_m, alt_std_m=DOWN_STD_M)
             return gps_input(
                 estimate,
                 clock=clock,

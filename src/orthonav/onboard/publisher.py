@@ -70,7 +70,8 @@ class Publisher:
         track is not a measurement. `withheld`: reason why a view was not located, which the gate
         counts.
         """
-        estimate = None
+        estimate: NavigationEstimate | None = None
+        sent: tuple[str, ...] = ()
         if withheld is not None:
             self.gate.withheld[withheld] += 1
         elif judged:
@@ -80,12 +81,11 @@ class Publisher:
             made = estimate_from_result(by_our_clock, clock=Clock.BOOT, utc_minus_boot_ns=ahead_ns)
             before = self.gate.withheld.copy()
             estimate = self.gate.admit(made, now_ns)
-            withheld = next(iter(self.gate.withheld - before), None)
-        sent: tuple[str, ...] = ()
-        if estimate is not None:
-            sent = self._send(estimate, exposed_ns, vehicle)
-            if not estimate.dead_reckoned:  # messages of ROS cannot mark it
-                sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
+            if estimate is not None:
+                sent = self._send(estimate, exposed_ns, vehicle)
+                if not estimate.dead_reckoned:  # messages of ROS cannot mark it
+                    sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
+            withheld = None if sent else next(iter(self.gate.withheld - before), None)
         self._write_nmea(estimate)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))

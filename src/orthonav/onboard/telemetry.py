@@ -11,6 +11,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from statistics import median
 from typing import NamedTuple
 
@@ -97,6 +98,7 @@ class VehicleState:
     `down_m`: distance below the origin of the autopilot's local frame.
     `home_m`, `amsl_m`: height above the place of take-off, and above mean sea level.
     `travelled`: displacement by the velocity; None where that is not known.
+    `vel_std_mps`, `tilt_std_deg`: standard deviations of velocity and attitude; NaN: as usual.
     """
 
     ned_from_body: Array | None
@@ -106,6 +108,8 @@ class VehicleState:
     home_m: float = math.nan
     amsl_m: float = math.nan
     travelled: Travelled | None = None
+    vel_std_mps: float = math.nan
+    tilt_std_deg: float = math.nan
 
     def attitude_rad(self) -> Triple:
         """Roll, pitch and yaw of the body in radians; NaN where not known."""
@@ -128,8 +132,10 @@ class VehicleState:
             roll,
             self.height_m,
             vel_en_mps=(east, north) if known else None,
-            home_m=self.home_m if math.isfinite(self.home_m) else None,
-            amsl_m=self.amsl_m if math.isfinite(self.amsl_m) else None,
+            tilt_std_deg=_known(self.tilt_std_deg),
+            vel_std_mps=_known(self.vel_std_mps),
+            home_m=_known(self.home_m),
+            amsl_m=_known(self.amsl_m),
         )
 
 
@@ -309,6 +315,10 @@ class TelemetryBuffer:
         return round(self.limits.keep_s * 1e9)
 
 
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def wxyz_of_angles(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
     """Quaternion w, x, y, z of an autopilot's Euler angles (rotations in the order ZYX)."""
     xyzw = Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_quat()
@@ -329,12 +339,13 @@ def _matrix(wxyz: Array) -> Array:
 
 
 class ClockSync:
-    """Offset of the autopilot's clock from ours in ns: its time = our time + `offset_ns`.
+    """Converts times of our clock to the autopilot's and back.
 
-    The offset is the median over those of the last `WINDOW` TIMESYNC exchanges that had a short
-    round trip. Without exchanges it comes from the timestamps of messages: the one with the least
-    delay counts. An outlier is ignored unless others agree with it; then a clock was set or the
-    autopilot restarted, and the estimate starts again (`jumps`). Mutable.
+    Offset and rate are those of the last `WINDOW` TIMESYNC exchanges: simulators run slower than
+    real time, so the rate is fitted where the exchanges show it. Without exchanges the offset comes
+    from the timestamps of messages: the one with the least delay counts. An outlier is ignored
+    unless others agree with it; then a clock was set or the autopilot restarted, and the estimate
+    starts again (`jumps`). Mutable.
     """
 
     WINDOW = 32
@@ -348,6 +359,9 @@ class ClockSync:
     """Number of outliers that must agree before the clock is taken to have jumped."""
     AGREE_NS = 500 * _MS
     """Time over which they must agree."""
+    FASTEST, RATE_NS = 0.05, 5000 * _MS
+    """Largest difference of the rates of the clocks, allowed for until exchanges of so long show
+    the true one."""
 
     def __init__(self) -> None:
         self.jumps = 0
@@ -355,8 +369,9 @@ class ClockSync:
 
     def reset(self) -> None:
         """Discard all samples."""
-        self.offset_ns: int | None = None
-        self._exact: deque[tuple[int, int]] = deque(maxlen=self.WINDOW)  # round trip, offset
+        self._offset_ns: int | None = None
+        self._at_ns, self._rate = 0, 0.0
+        self._exact: deque[_Exchange] = deque(maxlen=self.WINDOW)
         self._rough: deque[int] = deque(maxlen=100)
         self._suspects: list[tuple[int, int]] = []  # arrival, offset
 
@@ -364,6 +379,19 @@ class ClockSync:
     def is_exact(self) -> bool:
         """Whether the offset comes from TIMESYNC exchanges, not from times of arrival."""
         return bool(self._exact)
+
+    def boot_ns(self, mono_ns: int) -> int | None:
+        """Time of the autopilot's clock at one of ours; None while it is not known."""
+        if self._offset_ns is None:
+            return None
+        return mono_ns + self._offset_ns + round(self._rate * (mono_ns - self._at_ns))
+
+    def mono_ns(self, boot_ns: int) -> int | None:
+        """Time of our clock at one of the autopilot's; None while it is not known."""
+        if self._offset_ns is None:
+            return None
+        since_ns = boot_ns - self._offset_ns - self._at_ns
+        return self._at_ns + round(since_ns / (1 + self._rate))
 
     def exchange(self, sent_ns: int, received_ns: int, reported_ns: int) -> bool:
         """Add an exchange; whether a clock was found to have jumped.
@@ -373,37 +401,75 @@ class ClockSync:
         trip_ns = received_ns - sent_ns
         if not 0 <= trip_ns <= self.LONGEST_NS:
             return False
-        offset_ns = reported_ns - (sent_ns + received_ns) // 2
-        if self._exact and abs(offset_ns - self._now()) > max(self.OUTLIER_NS, trip_ns):
-            return self._suspect(received_ns, offset_ns, self.OUTLIER_NS)
+        at_ns = (sent_ns + received_ns) // 2
+        if self._exact:
+            span_ns = at_ns - self._exact[0].at_ns
+            rate_ns = self.FASTEST * span_ns if span_ns < self.RATE_NS else 0.0
+            if self._off_ns(at_ns, reported_ns) > max(self.OUTLIER_NS, trip_ns) + rate_ns:
+                return self._suspect(at_ns, reported_ns - at_ns, self.OUTLIER_NS)
         self._suspects.clear()
-        self._exact.append((trip_ns, offset_ns))
-        quick_ns = 1.5 * min(trip for trip, _ in self._exact) + _MS / 5
-        self.offset_ns = round(median(offset for trip, offset in self._exact if trip <= quick_ns))
+        self._exact.append(_Exchange(trip_ns, at_ns, reported_ns - at_ns))
+        self._fit()
         return False
 
     def heard(self, arrived_ns: int, reported_ns: int) -> bool:
         """Add a message that carries its time; whether a clock was found to have jumped."""
         offset_ns = reported_ns - arrived_ns
-        if self.offset_ns is not None and abs(offset_ns - self._now()) > self.JUMP_NS:
+        if self._off_ns(arrived_ns, reported_ns) > self.JUMP_NS:
             return self._suspect(arrived_ns, offset_ns, self.OUTLIER_NS * 5)
         if not self._exact:
             self._rough.append(offset_ns)
-            self.offset_ns = max(self._rough)
+            self._offset_ns = max(self._rough)
             self._suspects.clear()
         return False
 
-    def _now(self) -> int:
-        return self.offset_ns or 0
+    def _off_ns(self, mono_ns: int, reported_ns: int) -> int:
+        """How far a reported time is from the expected one; 0 where none is expected."""
+        expected_ns = self.boot_ns(mono_ns)
+        return 0 if expected_ns is None else abs(reported_ns - expected_ns)
+
+    def _fit(self) -> None:
+        """Fit offset and rate: the rate by the median slope (Theil and Sen) of the quicker half."""
+        trips = sorted(each.trip_ns for each in self._exact)
+        self._rate = 0.0
+        if len(trips) >= self.AGREE:
+            longest_ns = trips[max(self.AGREE, len(trips) // 2) - 1]
+            quicker = [each for each in self._exact if each.trip_ns <= longest_ns]
+            pairs = combinations(quicker, 2)
+            rate = median((b.offset_ns - a.offset_ns) / (b.at_ns - a.at_ns) for a, b in pairs)
+            # A smaller rate may be due to unequal delays there and back.
+            if abs(rate) * (quicker[-1].at_ns - quicker[0].at_ns) > longest_ns:
+                self._rate = rate
+        quick_ns = 1.5 * trips[0] + _MS / 5
+        self._at_ns = self._exact[-1].at_ns
+        self._offset_ns = round(
+            median(
+                each.offset_ns + self._rate * (self._at_ns - each.at_ns)
+                for each in self._exact
+                if each.trip_ns <= quick_ns
+            )
+        )
 
     def _suspect(self, arrived_ns: int, offset_ns: int, agree_ns: int) -> bool:
         """Note an outlier; start again from it where several agree over `AGREE_NS`."""
-        near = [one for one in self._suspects if abs(one[1] - offset_ns) <= agree_ns]
+        near = [
+            (at_ns, offset)
+            for at_ns, offset in self._suspects
+            if abs(offset - offset_ns) <= agree_ns + self.FASTEST * (arrived_ns - at_ns)
+        ]
         self._suspects = [*near[-50:], (arrived_ns, offset_ns)]
         if len(near) + 1 < self.AGREE or arrived_ns - near[0][0] < self.AGREE_NS:
             return False  # a queue that empties delivers many at once, with different delays
         self.reset()
-        self.offset_ns = offset_ns
+        self._offset_ns, self._at_ns = offset_ns, arrived_ns
         self._rough.append(offset_ns)
         self.jumps += 1
         return True
+
+
+class _Exchange(NamedTuple):
+    """Round trip of a TIMESYNC exchange, its time by our clock, and the offset that it shows."""
+
+    trip_ns: int
+    at_ns: int
+    offset_ns: int

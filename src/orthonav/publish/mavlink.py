@@ -30,7 +30,7 @@ COMPONENT_ID = 197
 WRAP_S = 250.0
 """Period of `transmission_time`, by its definition in common.xml."""
 UNKNOWN_DOP = 65535.0
-_INT32_MAX, _UINT16_MAX = 2**31 - 1, 2**16 - 1
+_UINT16_MAX = 2**16 - 1
 _UINT32_MAX, _UINT64_MAX = 2**32 - 1, 2**64 - 1
 _FLOAT32_MAX = (2 - 2**-23) * 2.0**127
 _SIGNING_EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
@@ -42,7 +42,9 @@ _IGNORE_VEL_HORIZ, _IGNORE_VEL_VERT, _IGNORE_SPEED_ACC = 8, 16, 32
 _IGNORE_HORIZ_ACC, _IGNORE_VERT_ACC = 64, 128
 _IGNORE_ALL = 255
 _FRAME_GLOBAL = 0
-_CMD_EXTERNAL_POSITION_ESTIMATE = 43003
+_CMD_EXTERNAL_POSITION_ESTIMATE, _CMD_REQUEST_MESSAGE = 43003, 512
+TEXT_MAX = 50
+"""Characters of one STATUSTEXT."""
 
 
 @dataclass(frozen=True)
@@ -131,14 +133,17 @@ def global_position_sensor(
 ) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
-    An estimate of low confidence is UNHEALTHY and has neither position nor accuracy, because some
-    receivers do not read the flag; a dead-reckoned one is UNHEALTHY and has both. `sensor_id` is 1
-    to 255 (PX4 reads 0 as "off").
+    A dead-reckoned estimate is UNHEALTHY. `sensor_id` is 1 to 255 (PX4 reads 0 as "off"). Raises
+    `EstimateError` for an estimate of low confidence or without accuracy: PX4 reads no flag, takes
+    coordinates that mean "unknown" for a place, and an unknown accuracy for a good one.
     """
     if not 1 <= sensor_id <= 255:
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
-    confident = estimate.is_confident(min_confidence)
-    placed = confident or estimate.dead_reckoned
+    if not estimate.dead_reckoned:
+        require_confident(estimate, min_confidence, "GLOBAL_POSITION_SENSOR")
+    eph_m = estimate.horizontal_std_m(min_std_m)
+    if math.isnan(eph_m):
+        raise EstimateError("GLOBAL_POSITION_SENSOR needs the accuracy of the position")
     return dialect().MAVLink_global_position_sensor_message(
         target_system=target.system_id,
         target_component=target.component_id,
@@ -146,12 +151,12 @@ def global_position_sensor(
         time_usec=microseconds(estimate.sent_ns(clock)),
         processing_time=clamped(estimate.processing_s * 1e6, 0, _UINT32_MAX),
         source=_SOURCE_VISION,
-        flags=0 if confident else _UNHEALTHY,
-        lat=deg_e7(estimate.lat_deg) if placed else _INT32_MAX,
-        lon=deg_e7(estimate.lon_deg) if placed else _INT32_MAX,
+        flags=_UNHEALTHY if estimate.dead_reckoned else 0,
+        lat=deg_e7(estimate.lat_deg),
+        lon=deg_e7(estimate.lon_deg),
         alt_ellipsoid=math.nan,
         alt=float32(estimate.alt_amsl_m),
-        eph=float32(estimate.horizontal_std_m(min_std_m)) if placed else math.nan,
+        eph=float32(eph_m),
         epv=float32(estimate.alt_std_m) if math.isfinite(estimate.alt_amsl_m) else math.nan,
     )
 
@@ -239,6 +244,32 @@ def external_position_estimate(
         y=deg_e7(estimate.lon_deg),
         z=math.nan,
     )
+
+
+def request_message(number: int, target: Target = AUTOPILOT) -> Message:
+    """MAV_CMD_REQUEST_MESSAGE (512) as COMMAND_LONG: send the message `number` once."""
+    return dialect().MAVLink_command_long_message(
+        target.system_id,
+        target.component_id,
+        _CMD_REQUEST_MESSAGE,
+        0,
+        *(float(number), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    )
+
+
+def status_texts(severity: int, text: str, number: int) -> list[Message]:
+    """STATUSTEXT (message 253), in several chunks where the text is longer than one.
+
+    `severity`: MAV_SEVERITY. `number`: differs between texts that follow one another. A chunk that
+    is not full ends a text, so one of 50 characters is followed by an empty chunk.
+    """
+    data = text.encode("ascii", "replace")
+    make = dialect().MAVLink_statustext_message
+    if len(data) <= TEXT_MAX:
+        return [make(severity, data)]
+    starts = range(0, len(data) + 1, TEXT_MAX)
+    identity = number % _UINT16_MAX + 1  # 0 marks a single chunk
+    return [make(severity, data[at : at + TEXT_MAX], identity, at // TEXT_MAX) for at in starts]
 
 
 def require_confident(estimate: NavigationEstimate, min_confidence: float, message: str) -> None:

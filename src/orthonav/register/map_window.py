@@ -12,6 +12,9 @@ from orthonav.register.reference import Reference
 from orthonav.register.template import Template
 
 Array = NDArray[np.float32]
+LARGEST_LOG_SCALE = 1.0
+"""A window reaches no farther than under this log scale: more than twice what is searched. Beyond
+it the map counts as missing, whatever a computed pose asks for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,7 @@ class MapWindow:
         if reference.caches(template.level):
             whole = reference.whole(template.level, template.recipe)
             return cls(whole, 0, 0, unit, (height, width))
-        scale = math.exp(pose.log_scale) / 2
+        scale = math.exp(min(pose.log_scale, LARGEST_LOG_SCALE)) / 2
         cos, sin = abs(scale * math.cos(pose.turn_rad)), abs(scale * math.sin(pose.turn_rad))
         x, half_x = pose.x_px / unit, cos * width + sin * height
         y, half_y = pose.y_px / unit, sin * width + cos * height

@@ -55,6 +55,8 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
     """Hypotheses, most likely first, with similar ones merged and the unlikely ones dropped."""
     likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
     left = likely or ordered[:1]  # the last one stays, however unlikely
+    if not left:
+        return []
     means = np.array([each.mean for each in left])[:, COMPARED]
     covariances = np.array([each.covariance for each in left])[:, ROWS, COLUMNS]
     numbers = np.arange(len(left))
