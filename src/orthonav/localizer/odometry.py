@@ -44,8 +44,8 @@ CANDIDATES = 8
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
 """Refinement of the expected displacement at each level: most steps, and the step that ends it."""
 TILT_SHARE = 0.6
-"""Share of the error by a wrong tilt that remains in the sum of many displacements: the next
-displacement cancels most of it."""
+"""Share of the error by an independent error of the tilt that remains in the sum of many
+displacements: the next displacement cancels most of it."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 """Changes of the biases of heading, log scale, pitch and roll up to which a view need not be
 rectified again. Heading has no limit: views are rectified with their heading up."""
@@ -68,6 +68,14 @@ def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
         pitch_deg=telemetry.pitch_deg + pitch_deg,
         roll_deg=telemetry.roll_deg + roll_deg,
     )
+
+
+def tilt_lever_m(telemetry: Telemetry) -> Array:
+    """Metres east and north (2, 2) by which a camera seems displaced per rad that its pitch and its
+    roll are more than reported."""
+    heading = math.radians(telemetry.yaw_deg)
+    ahead, left = (math.sin(heading), math.cos(heading)), (-math.cos(heading), math.sin(heading))
+    return telemetry.agl_m * np.array([ahead, left]).T
 
 
 class _ViewAsMap(Reference):
@@ -198,10 +206,10 @@ def displacement(
     """The displacement from one view to the next, both with the same `pixel_m`.
 
     None where they do not show enough common ground. The displacement is rotated and scaled by the
-    telemetry reported with the view before. `tilt_noise_rad`: standard deviation of the reported
-    tilt between views. `telemetry_noise` (2,): variances of reported heading (rad) and log scale
-    between views. `expected_en_m` (2,) is tried first: where it fits it saves the search, elsewhere
-    it changes nothing.
+    telemetry reported with the view before. `tilt_noise_rad`: standard deviation of the error of a
+    reported tilt that is independent at every view. `telemetry_noise` (3,): variances of reported
+    heading (rad) and log scale between views; the third is not used. `expected_en_m` (2,) is tried
+    first: where it fits it saves the search, elsewhere it changes nothing.
     """
     reported_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
     if not math.isfinite(reported_turn):
@@ -227,6 +235,8 @@ def displacement(
         reach_m=_reach_px(before, now) * before.pixel_m,
         turned_rad=math.remainder(pose.turn_rad - reported_rad, 2 * math.pi),
         scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
+        levers_m=np.stack([tilt_lever_m(now.telemetry), tilt_lever_m(before.telemetry)]),
+        corrected_rad=np.stack([now.bias[2:], before.bias[2:]]),
     )
     return ViewDisplacement(seen, min(max(placed.overlap, 0.0), 1.0))
 

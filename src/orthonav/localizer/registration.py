@@ -184,8 +184,7 @@ class RegistrationLocalizer:
     def _fix(self, seen: RegisteredView, best: Registered, telemetry: Telemetry) -> Fix:
         assert seen.ground is not None
         camera, viewed = seen.camera(best.placed), seen.ground.viewed(best)
-        # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
-        floor_m = self.floor_px * self.grid.gsd_m * 2.0**seen.prepared.levels.final
+        floor_m = self.floor_m(seen.prepared)
         if camera is None:
             found = self._by_similarity(seen.prepared, best.placed, telemetry, floor_m)
             middle_en_m = None if viewed is None else viewed.middle_en_m
@@ -250,6 +249,11 @@ class RegistrationLocalizer:
                 "log_scale_std": math.sqrt(spread[3, 3]),
             },
         )
+
+    def floor_m(self, view: PreparedView) -> float:
+        """Standard deviation with which maps of two dates agree at the final level of a view, m."""
+        # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
+        return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
         """Metres east and north (2,) of the camera where a view's window lies at `pose`."""

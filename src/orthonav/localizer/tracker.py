@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav.errors import MapFileError
 from orthonav.geo.ground import Ground
+from orthonav.localizer.camera import CameraFound
 from orthonav.localizer.checks import check_view
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import (
@@ -23,15 +24,18 @@ from orthonav.localizer.odometry import (
     corrected_by,
     displacement,
     over_terrain,
+    tilt_lever_m,
 )
 from orthonav.localizer.places import places_of
 from orthonav.localizer.prepared import PreparedView
+from orthonav.localizer.registration import RegisteredView
 from orthonav.localizer.relief import Relief
-from orthonav.localizer.tilt import with_tilt
-from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
+from orthonav.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import rotation
+from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered
 from orthonav.track import (
+    CameraDisplacement,
     Estimate,
     Mixture,
     Model,
@@ -41,7 +45,17 @@ from orthonav.track import (
     State,
 )
 from orthonav.track.hypotheses import within
-from orthonav.track.model import BIASES, HEADING, POSITION, SCALE, TILT, VELOCITY
+from orthonav.track.model import (
+    BIASES,
+    HEADING,
+    HORIZON,
+    POSITION,
+    SCALE,
+    SEEN,
+    TILT,
+    VELOCITY,
+    WHITE_SHARE,
+)
 from orthonav.track.motion import usual_velocity_std_mps
 from orthonav.track.smooth import History, Smoothed
 
@@ -55,9 +69,17 @@ MIN_LOCAL_M = 30.0
 LEAST_NEW = 0.15
 """Least share of a view that counts as new evidence, however much it overlaps the view before:
 noise, light and tilt differ (docs/decisions/tracking.md, 2)."""
-TILT_NEW = 0.3
-"""New ground, in views, after which perspective is examined again: on the same ground it gives the
-same answer, and it costs as much as all the rest (docs/decisions/tracking.md, 3)."""
+LIKELY_NATS = 5.0
+"""Places so much less likely than the best one are not examined for their tilt."""
+UNSEEN_TILT_RAD = math.radians(20.0)
+"""Standard deviation of a tilt that a view does not show."""
+LEAST_TILT_STD_DEG = 0.1
+"""Least deviation of the tilt that a track expects of a view."""
+UNAIDED_STD_MPS, UNAIDED_S = 3.0, 15.0
+"""The error of a reported velocity with at least this deviation changes within so many seconds:
+that of an autopilot which nothing aids."""
+LEARNT_S = 10.0
+"""Time over which the error of a reported velocity is learnt from odometry, s."""
 LONGEST_GAP_S = 600.0
 """Longer gaps between views are predicted as if they had this length: by then the position is
 known to no more than the map."""
@@ -65,8 +87,6 @@ UNKNOWN_STEP_S = 1.0
 """Time step where the clock stands still or jumps back."""
 NEAR_SHARE = 0.05
 """Places closer to each other than this share of the side of a view are one place."""
-RADIUS_SHARE = 0.025
-"""Least radius of the confidence over the height: what an error of 1.4 deg in tilt makes."""
 KNOWN_MPS = 5.0
 """An estimated velocity with less uncertainty than this predicts the next displacement."""
 KNOWN_PLACE_M = 50.0
@@ -108,8 +128,8 @@ class Tracker:
         self._time_ns: int | None = None
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
+        self._velocity_variance = 0.0
         self._seen: list[Sighting] = []
-        self._new_ground = np.full(2, np.inf)
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
@@ -148,7 +168,6 @@ class Tracker:
             scale = math.hypot(Model.log_scale, view.camera.focal_std)
             self.model = self.mixture.model = replace(self.model, log_scale=scale)
         overlap, ground = self._predict(None if refused else view, view.telemetry)
-        self._new_ground += 1 - overlap
         self._seen = []
         if refused is None:
             refused = self._update(view, overlap, ground)
@@ -260,6 +279,8 @@ class Tracker:
         moved = self._displacement(before, now, noise, expected)
         self._before = now
         camera = None if moved is None else moved.displacement
+        if camera is not None:
+            self._learn_velocity(velocity, camera, seconds)
         self.mixture.predict(seconds, velocity, camera, noise)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
@@ -282,12 +303,15 @@ class Tracker:
         return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
 
     def _telemetry_noise(self, telemetry: Telemetry) -> Array:
-        """Variances (2,) of reported heading (rad) and log scale between views, or the usual."""
+        """Variances (3,) of reported heading (rad) and log scale between views and of the horizon
+        (rad), or the usual."""
         noise = self.model.telemetry_noise.copy()
         if telemetry.yaw_std_deg is not None:
             noise[0] = math.radians(telemetry.yaw_std_deg) ** 2
         if telemetry.agl_std_m is not None and telemetry.agl_m > 0:
             noise[1] = (telemetry.agl_std_m / telemetry.agl_m) ** 2
+        if telemetry.tilt_std_deg is not None:
+            noise[2] = math.radians(telemetry.tilt_std_deg) ** 2
         return noise
 
     def _odometry_view(
@@ -310,12 +334,22 @@ class Tracker:
         std = telemetry.vel_std_mps
         if std is None or not std > 0:
             std = usual_velocity_std_mps(float(np.hypot(*now)))
-        return ReportedVelocity(now, before, std)
+        std = max(std, math.sqrt(self._velocity_variance))
+        return ReportedVelocity(now, before, std, UNAIDED_S if std >= UNAIDED_STD_MPS else None)
 
-    def _tilt_noise(self, telemetry: Telemetry) -> float:
-        """Standard deviation of reported pitch and roll between views (rad), or the usual."""
-        reported = telemetry.tilt_std_deg
-        return self.model.tilt_noise_rad if reported is None else math.radians(reported)
+    def _learn_velocity(
+        self, velocity: ReportedVelocity | None, moved: CameraDisplacement, seconds: float
+    ) -> None:
+        """Learn the error of the reported velocity from odometry, as far as that shows one."""
+        if velocity is None or seconds > LEARNT_S:
+            return
+        bias, _ = self.mixture.bias()
+        off = (
+            rotation(-bias[0], math.exp(bias[1])) @ moved.moved_en_m - velocity.now_en_mps * seconds
+        )
+        shown = (float(off @ off) - float(np.trace(moved.covariance))) / (2 * seconds**2)
+        share = 1 - math.exp(-seconds / LEARNT_S)
+        self._velocity_variance += share * (max(shown, 0.0) - self._velocity_variance)
 
     def _expected_displacement(
         self, seconds: float, velocity: ReportedVelocity | None
@@ -338,9 +372,9 @@ class Tracker:
         """The displacement since the last view by the camera, None where it cannot be measured."""
         if before is None or now is None or before.pixel_m != now.pixel_m:
             return None
-        tilt_noise = self._tilt_noise(now.telemetry)
-        made = displacement(before, now, tilt_noise, telemetry_noise, expected_en_m)
-        if made is None or self._registration.relief is None:
+        white = WHITE_SHARE * math.sqrt(telemetry_noise[2])
+        made = displacement(before, now, white, telemetry_noise, expected_en_m)
+        if made is None or self._registration.relief.is_level:
             return made
         heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
         ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
@@ -388,15 +422,12 @@ class Tracker:
         if not isinstance(seen.found, NoFix):
             area = math.inf if searched is None else math.pi * searched[1] ** 2
             share = min(area / self.mixture.area_m2, 1.0)
-            weights = self._tilt_weights(newness, math.isfinite(seen.found.fine_score))
-            sightings = self._sightings(
-                corrected, seen.prepared, seen.found, bias[1], share, weights
-            )
+            sightings = self._sightings(seen, seen.found, known, bias[1], share)
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
-            self._tilt_noise(telemetry),
+            math.sqrt(self._telemetry_noise(telemetry)[2]),
         )
         self._seen = sightings
         self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
@@ -406,8 +437,8 @@ class Tracker:
         """Corrected telemetry, its height above the ground where the aircraft is expected: what it
         was corrected by includes the error of the ground that was assumed before."""
         relief = self._registration.relief
-        height_m = math.nan if relief is None else float(relief.terrain.at_en_m(place_en_m))
-        if not math.isfinite(height_m):
+        height_m = float(relief.terrain.at_en_m(place_en_m))
+        if relief.is_level or not math.isfinite(height_m):
             return replace(telemetry, below=None)
         return replace(telemetry, below=Ground(height_m, 0.0, 1.0))
 
@@ -421,9 +452,9 @@ class Tracker:
         """
         if expected is None or prior is None:
             variances = self.model.initial_bias()
-            variances[:2] += self._telemetry_noise(telemetry)
+            variances += self._telemetry_noise(telemetry)[[0, 1, 2, 2]]
             return np.zeros(4), np.diag(variances)
-        return expected.mean[BIASES], expected.covariance[BIASES, BIASES]
+        return (SEEN @ expected.mean)[2:], (SEEN @ expected.covariance @ SEEN.T)[2:, 2:]
 
     def _must_compete(self, expected: Estimate) -> bool:
         """Whether places near the track have to compete with the whole map to confirm it.
@@ -433,20 +464,6 @@ class Tracker:
         if expected.state is State.SEARCHING:
             return expected.belief < LOCAL_SHARE
         return not (expected.state.is_followed and expected.confirmed)
-
-    def _tilt_weights(self, newness: float, costly: bool) -> Array:
-        """How many times the weight of the view perspective counts, for pitch and roll (2,).
-
-        It counts for all new ground since it was examined last, while the view counts for its new
-        share `newness`; 0 where too little is new. Views that follow closely leave little time: for
-        them one of the two is examined at a time, and later still where the view was `costly`.
-        """
-        due = self._new_ground >= (2 * TILT_NEW if costly else TILT_NEW)
-        if newness < TILT_NEW:
-            due &= np.arange(2) == np.argmax(self._new_ground)
-        new = np.where(due, np.minimum(self._new_ground, 1.0), 0.0)
-        self._new_ground[due] = 0.0
-        return np.where(due, np.maximum(new, newness) / newness, 0.0)
 
     def _search_area(
         self, expected: Estimate | None
@@ -479,29 +496,68 @@ class Tracker:
 
     def _sightings(
         self,
-        view: View,
-        prepared: PreparedView,
+        seen: RegisteredView,
         found: Registered,
+        telemetry: Telemetry,
         log_scale: float,
         searched_share: float,
-        tilt_weights: Array,
     ) -> list[Sighting]:
         """The places where the view may have been taken.
 
-        `log_scale`: what its height was corrected by already. `searched_share`: share of the map
-        that was searched. `tilt_weights` (2,): see `_tilt_weights`.
+        `telemetry`: corrected by the track; `log_scale`: what its height was corrected by.
+        `searched_share`: share of the map that was searched.
         """
+        near_px = NEAR_SHARE * seen.prepared.side_px
+        places = places_of(found, self._confidence, near_px, searched_share)
         made = []
-        for log_odds, alone, placed in places_of(
-            found, self._confidence, NEAR_SHARE * prepared.side_px, searched_share
-        ):
-            seen = with_tilt(self._registration, view, prepared, placed, tilt_weights)
-            if seen is None:
-                continue
-            mean = seen.mean.copy()
+        for log_odds, alone, placed in places:
+            likely = log_odds > places[0][0] - LIKELY_NATS
+            camera = seen.camera(placed) if likely else None
+            if camera is None:
+                mean, covariance = self._by_similarity(seen.prepared, placed, telemetry)
+            else:
+                mean, covariance = self._by_camera(seen.prepared, camera, telemetry)
             mean[3] += log_scale
-            made.append(Sighting(mean, seen.covariance, log_odds, alone))
+            if np.isfinite(covariance).all():
+                made.append(Sighting(mean, covariance, log_odds, alone))
         return made
+
+    def _by_camera(
+        self, prepared: PreparedView, camera: CameraFound, telemetry: Telemetry
+    ) -> tuple[Array, Array]:
+        """Mean (6,) and covariance (6, 6) of a sighting by the view alone."""
+        rad, agl_m = math.pi / 180, camera.agl_m
+        east, north, up_m = camera.alone.position_m.tolist()
+        heading, pitch, roll = np.radians(camera.alone.attitude_deg).tolist()
+        above_m = agl_m + up_m - float(camera.orientation.position_m[2])
+        scale = math.log(max(above_m, agl_m / 2) / telemetry.agl_m)
+        units = np.diag([1.0, 1.0, 1 / agl_m, rad, rad, rad])
+        order = [0, 1, 3, 2, 4, 5]
+        covariance = (units @ camera.alone_covariance @ units)[np.ix_(order, order)]
+        floor_m = self._registration.floor_m(prepared)
+        covariance[:2, :2] += np.eye(2) * floor_m**2
+        return np.array([east, north, heading, scale, pitch, roll]), covariance
+
+    def _by_similarity(
+        self, prepared: PreparedView, placed: Placed, telemetry: Telemetry
+    ) -> tuple[Array, Array]:
+        """The same of a view that does not show its tilt."""
+        if placed.covariance is None:
+            again = self._registration.registrar.with_covariance(
+                prepared.templates, prepared.levels, placed
+            )
+            placed = replace(again, pose=placed.pose)
+        tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
+        mean = np.concatenate([self._registration.seen_from(prepared, placed.pose), tilt_rad])
+        heading_deg = math.degrees(placed.pose.turn_rad)
+        lever = tilt_lever_m(replace(telemetry, yaw_deg=heading_deg))
+        covariance = np.zeros((6, 6))
+        covariance[:4, :4] = self._registration.covariance(prepared, placed)
+        covariance[:2, :2] += UNSEEN_TILT_RAD**2 * lever @ lever.T
+        covariance[:2, 4:] = -(UNSEEN_TILT_RAD**2) * lever
+        covariance[4:, :2] = covariance[:2, 4:].T
+        covariance[4:, 4:] = UNSEEN_TILT_RAD**2 * np.eye(2)
+        return mean, covariance
 
     def _fix(
         self,
@@ -511,11 +567,12 @@ class Tracker:
         telemetry: Telemetry,
         more: dict[str, float],
     ) -> Fix:
-        """A state (8,) and its covariance (8, 8) as a fix; `more` goes into its evidence."""
+        """A state (10,) and its covariance (10, 10) as a fix; `more` goes into its evidence."""
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
         pitch, roll = np.degrees(mean[TILT])
+        whole = mean[TILT] + mean[HORIZON]
         evidence = {
             "heading_bias_deg": math.degrees(mean[HEADING]),
             "log_scale_bias": float(mean[SCALE]),
@@ -536,12 +593,14 @@ class Tracker:
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
             evidence=MappingProxyType(evidence),
+            pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
+            roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
         )
 
 
 def _bias_stds(covariance: Array) -> dict[str, float]:
     """Standard deviations of the estimated biases of heading, scale, pitch and roll."""
-    std = np.sqrt(np.maximum(np.diag(covariance)[4:], 0.0))
+    std = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0))
     names = (
         "heading_bias_std_deg",
         "log_scale_bias_std",
@@ -554,5 +613,10 @@ def _bias_stds(covariance: Array) -> dict[str, float]:
 
 def _known(corrected: Telemetry, spread: Array) -> Telemetry:
     """Corrected telemetry with the uncertainty (4, 4) of the correction: it bounds the search."""
-    heading, scale = np.sqrt(np.diag(spread)[:2]).tolist()
-    return replace(corrected, yaw_std_deg=math.degrees(heading), agl_std_m=scale * corrected.agl_m)
+    heading, scale, pitch, roll = np.sqrt(np.diag(spread)).tolist()
+    return replace(
+        corrected,
+        yaw_std_deg=math.degrees(heading),
+        agl_std_m=scale * corrected.agl_m,
+        tilt_std_deg=max(math.degrees(max(pitch, roll)), LEAST_TILT_STD_DEG),
+    )

@@ -8,7 +8,6 @@ import numpy as np
 
 from orthonav.track.model import (
     SEEN,
-    TILT,
     Array,
     Model,
     ReportedAttitude,
@@ -22,8 +21,6 @@ TRUSTED = (0.1, 0.5)
 """Views with a probability of their own below the first do not count, above the second fully."""
 MOST_OF_ONE = 0.75
 """A single view counts at most so much: less than `CONFIRMED`."""
-ROWS, COLUMNS = np.ix_(SEEN[:4], SEEN[:4])
-"""Rows and columns of position, heading and scale in a covariance of the state."""
 POSE = slice(2, 4)
 """Heading and scale in a measurement."""
 SEARCHED_SIGMAS = 6.0
@@ -36,7 +33,7 @@ MAX_LOG_ODDS = 7.0
 class Measurement:
     """A sighting as a measurement of the state.
 
-    `mean` (6,), `noise` (6, 6): in the components `SEEN`. `log_odds`: log odds over the density of
+    `mean` (6,), `noise` (6, 6): of `model.SEEN`. `log_odds`: log odds over the density of
     places, headings and scales that only look alike. `own_noise` (6, 6): covariance without regard
     to earlier views of the same ground. `alone`: probability by the view alone. `log_chance`: log
     density of places, headings and scales that chance finds in the area searched.
@@ -60,7 +57,7 @@ def tempered(
 ) -> Measurement:
     """A sighting as a measurement, tempered by the share of it that is new.
 
-    `mounts`: probability and covariance (8, 8) of the initial state of each kind of mount.
+    `mounts`: probability and covariance (10, 10) of the initial state of each kind of mount.
     `areas_m2`: of the map, and of the part of it that was searched.
 
     A likelihood raised to the power `newness` has a broader peak, which stands out less from
@@ -76,13 +73,13 @@ def tempered(
     tilts = noise[4:, 4:] + independent[4:, 4:]
     wide -= math.log(
         sum(
-            share * math.exp(log_density(mean[4:], tilts + covariance[TILT, TILT]))
+            share * math.exp(log_density(mean[4:], tilts + (SEEN @ covariance @ SEEN.T)[4:, 4:]))
             for share, covariance in mounts
         )
     )
     _, log_det = np.linalg.slogdet(2 * math.pi * noise)
     odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
-    odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
+    odds += (1 - newness) * float(log_det) / 2 - len(mean) / 2 * math.log(newness)
     return Measurement(
         mean,
         noise / newness + independent,
@@ -98,12 +95,12 @@ def recognition(
 ) -> Array:
     """Probabilities (K,) that a view showed the map, given its place and predictions of that.
 
-    `covariances` (K, 8, 8): of the predictions. `most_agreement`: see `Model`. The odds by the view
+    `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The odds by the view
     alone, times the likelihood ratio of the innovations (K, 6) in position, heading and scale
     between a right place and one that chance finds in the area searched. A place within the gate is
     never less likely for its distance.
     """
-    spreads = covariances[:, ROWS, COLUMNS] + seen.own_noise[:4, :4]
+    spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
     ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
     agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
     odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement

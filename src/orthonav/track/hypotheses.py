@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthonav.geo.frames import LocalFrame
-from orthonav.track.model import HEADING, POSITION, VELOCITY, Array
+from orthonav.track.model import HEADING, POSITION, STATE, VELOCITY, Array
 from orthonav.track.motion import Expected
 
 MAX_HYPOTHESES = 40
@@ -21,16 +21,16 @@ MINOR_OF_GROUP = 0.01
 """Share of a group of hypotheses below which one says nothing about the group."""
 NORTH_STEP_M = 100.0
 """Length over which the convergence of two planes is measured."""
-COMPARED = [0, 1, 2, 3, 6, 7]
-"""Components that decide whether two hypotheses are alike: position, velocity and tilt."""
-ROWS, COLUMNS = np.ix_(COMPARED, COMPARED)
+COMPARED: Array = np.zeros((6, STATE))
+"""What decides whether two hypotheses are alike: position, velocity and the whole tilt."""
+COMPARED[range(6), [0, 1, 2, 3, 6, 7]] = COMPARED[[4, 5], [8, 9]] = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """One hypothesis of the track.
 
-    `share`: its probability. `mean` (8,), `covariance` (8, 8): its state. `sighted`: new ground
+    `share`: its probability. `mean` (10,), `covariance` (10, 10): its state. `sighted`: new ground
     that it recognized, in views. `number`: unique in the flight. `parent`: the number of the
     hypothesis of the last view from which it was predicted, -1 where it was born now. `expected`:
     that prediction, None where it was born now. `recognized`: probability, by the last view alone
@@ -57,8 +57,8 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
     left = likely or ordered[:1]  # the last one stays, however unlikely
     if not left:
         return []
-    means = np.array([each.mean for each in left])[:, COMPARED]
-    covariances = np.array([each.covariance for each in left])[:, ROWS, COLUMNS]
+    means = np.array([each.mean for each in left]) @ COMPARED.T
+    covariances = COMPARED @ np.array([each.covariance for each in left]) @ COMPARED.T
     numbers = np.arange(len(left))
     out: list[Hypothesis] = []
     while len(numbers) and len(out) < MAX_HYPOTHESES:
@@ -100,7 +100,7 @@ def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
 def _divergence(means: Array, covariances: Array) -> Array:
     """Kullback-Leibler divergence (nats) of each of several Gaussians from the first, (N,).
 
-    `means` (N, 6), `covariances` (N, 6, 6): the components `COMPARED`. A well-known place must not
+    `means` (N, 6), `covariances` (N, 6, 6): of `COMPARED`. A well-known place must not
     vanish in a wide hypothesis around it (docs/decisions/tracking.md, 8).
     """
     inverse = np.linalg.inv(covariances[0])
@@ -113,7 +113,7 @@ def _divergence(means: Array, covariances: Array) -> Array:
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """Mean (8,) and covariance (8, 8) of several hypotheses as one Gaussian; not to be changed."""
+    """Mean (10,) and covariance (10, 10) of several hypotheses as one Gaussian; not to be changed."""
     if len(group) == 1:
         return group[0].mean, group[0].covariance
     shares = np.array([each.share for each in group])

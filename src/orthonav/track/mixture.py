@@ -29,11 +29,8 @@ from orthonav.track.hypotheses import (
     within,
 )
 from orthonav.track.model import (
-    BIASES,
     POSITION,
     SEEN,
-    SEEN_COLUMNS,
-    SEEN_ROWS,
     STATE,
     Array,
     Model,
@@ -117,7 +114,7 @@ class State(Enum):
 class Estimate:
     """The estimate of the track: its best cluster of hypotheses. Its arrays are not to be changed.
 
-    `mean` (8,), `covariance` (8, 8): of the cluster. `confidence`: probability that the aircraft is
+    `mean` (10,), `covariance` (10, 10): of the cluster. `confidence`: probability that the aircraft is
     within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
     however wide it is. `recognized`: probability that the last view showed the map there.
     `confirmed`: whether enough of its ground was recognized lately. `followed`: whether it descends
@@ -213,8 +210,8 @@ class Mixture:
     ) -> None:
         """Predict over so many seconds, by the reported velocity and the camera's odometry.
 
-        `telemetry_noise` (2,): variances of reported heading (rad) and log scale from view to view,
-        those of the model where None.
+        `telemetry_noise` (3,): variances of reported heading (rad) and log scale from view to view
+        and of the horizon (rad), those of the model where None.
         """
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays = 1 - self.model.lost
@@ -391,12 +388,13 @@ class Mixture:
         )
 
     def bias(self) -> tuple[Array, Array]:
-        """The estimated biases of heading (rad), log scale, pitch and roll (rad): mean (4,) and
-        covariance (4, 4) over all hypotheses."""
+        """The estimated errors of heading (rad), log scale, pitch and roll (rad) as reported: mean
+        (4,) and covariance (4, 4) over all hypotheses."""
         if not self.hypotheses:
-            return np.zeros(4), np.diag(self.model.initial_bias())
+            _, covariance = self._nowhere()
+            return np.zeros(4), (SEEN @ covariance @ SEEN.T)[2:, 2:]
         mean, covariance = moments(self.hypotheses)
-        return mean[BIASES], covariance[BIASES, BIASES]
+        return (SEEN @ mean)[2:], (SEEN @ covariance @ SEEN.T)[2:, 2:]
 
     def _next_state(self, confidence: float, confirmed: bool, follows: bool) -> State:
         """State after a view.
@@ -449,13 +447,14 @@ class Mixture:
             return
         # All at once: each is small, and calls of NumPy take longer than what they compute.
         before = np.array([each.covariance for each in near])
-        innovations = np.array([seen.mean - each.mean[SEEN] for each in near])
-        spreads = before[:, SEEN_ROWS, SEEN_COLUMNS] + seen.noise
+        innovations = seen.mean - np.array([each.mean for each in near]) @ SEEN.T
+        expected = SEEN @ before @ SEEN.T
+        spreads = expected + seen.noise
         log_weights = (seen.log_odds + log_densities(innovations, spreads)).tolist()
         means, covariances = updated(
             np.array([each.mean for each in near]), before, innovations, spreads
         )
-        shown = recognition(seen, before, innovations, self.model.most_agreement).tolist()
+        shown = recognition(seen, expected, innovations, self.model.most_agreement).tolist()
         for number, each in enumerate(near):
             sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
             if shown[number] >= RECOGNIZED:
@@ -484,9 +483,13 @@ class Mixture:
         return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
-        """Mean (8,) and covariance (8, 8) of a state that may be anywhere on the map."""
+        """Mean (10,) and covariance (10, 10) of a state that may be anywhere on the map."""
         place, speed = self.area_m2, self.model.speed_mps**2
-        variances = [place, place, speed, speed, *self.model.initial_bias(tilt_rad)]
+        horizon = self.model.horizon_rad**2
+        variances = [
+            *(place, place, speed, speed),
+            *(*self.model.initial_bias(tilt_rad), horizon, horizon),
+        ]
         return np.zeros(STATE), np.diag(np.array(variances))
 
     def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
@@ -500,7 +503,7 @@ class Mixture:
         """The hypotheses born from the belief elsewhere, at a measurement. `confirms`: see
         `update`."""
         for share, mean, covariance in self._mounts():
-            spread = covariance[SEEN_ROWS, SEEN_COLUMNS] + seen.noise
+            spread = SEEN @ covariance @ SEEN.T + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
             log_weight += log_density(seen.mean[2:], spread[2:, 2:])
             mean, covariance = updated(mean, covariance, seen.mean, spread)

@@ -1,8 +1,9 @@
 """The state of a track, the model of aircraft and instruments, and the measurement update.
 
-The state of one hypothesis has 8 components: position and velocity (m, m/s; east and north), and
-the biases of the telemetry of the present view: heading (rad, added to the reported one), log scale
-(of true over reported height, focal length included), pitch and roll (rad; their constant part).
+The state of one hypothesis has 10 components: position and velocity (m, m/s; east and north), and
+the errors of the telemetry of the present view: heading (rad, added to the reported one), log scale
+(of true over reported height, focal length included), pitch and roll of the mount (rad, constant),
+and of the autopilot's horizon (rad, changing within seconds).
 """
 
 import math
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, MAP_STD_M
 
 Array = NDArray[np.float64]
-STATE = 8
+STATE = 10
 POSITION, VELOCITY, BIASES = slice(0, 2), slice(2, 4), slice(4, 8)
-HEADING, SCALE, TILT = 4, 5, slice(6, 8)
+HEADING, SCALE, TILT, HORIZON = 4, 5, slice(6, 8), slice(8, 10)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Standard deviations that the heading and log scale of a registered view have at least."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
@@ -25,10 +26,12 @@ MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
 TILT_WALK_SHARE = 1 / 30
 """Drift of a mount per root of a second, over its misalignment: in a quarter of an hour it drifts
 by as much."""
-SEEN = [0, 1, 4, 5, 6, 7]
-"""Components of the state that a sighting measures."""
-SEEN_ROWS, SEEN_COLUMNS = np.ix_(SEEN, SEEN)
-"""Their rows and columns in a covariance."""
+SEEN: Array = np.zeros((6, STATE))
+"""What a sighting measures of the state: position, heading, log scale, and the whole tilt."""
+SEEN[range(6), [0, 1, 4, 5, 6, 7]] = SEEN[[4, 5], [8, 9]] = 1.0
+SEEN.flags.writeable = False
+WHITE_SHARE = 0.2
+"""Share of the error of a reported tilt that is independent at every view."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,11 @@ class Model:
     """Of the misalignment of a bad mount (docs/decisions/tracking.md, 4)."""
     off_mount: float = 0.03
     """Probability that the mount is a bad one (docs/decisions/tracking.md, 4)."""
-    tilt_noise_rad: float = math.radians(0.7)
-    """Of the reported pitch and roll from view to view, where there is no `tilt_std_deg`."""
+    horizon_rad: float = math.radians(1.5)
+    """Of the error of the autopilot's horizon, in pitch and roll, where there is no
+    `tilt_std_deg`."""
+    horizon_s: float = 15.0
+    """Its correlation time, s: those of real autopilots change within 10 to 30 s."""
     tilt_walk: float = math.radians(0.01)
     """Of the drift of the misalignment, rad per root of a second."""
     sighting_noise_m: float = 2.0
@@ -114,8 +120,9 @@ class Model:
 
     @property
     def telemetry_noise(self) -> Array:
-        """Variances (2,) of reported heading (rad) and log scale from view to view."""
-        return np.square([self.heading_noise_rad, self.log_scale_noise])
+        """Variances (3,) of reported heading (rad) and log scale from view to view, and of the
+        horizon (rad)."""
+        return np.square([self.heading_noise_rad, self.log_scale_noise, self.horizon_rad])
 
     def drift(self, seconds: float) -> Array:
         """Process noise (4,) of the biases over so many seconds."""
@@ -127,14 +134,14 @@ class Model:
 class ReportedAttitude:
     """The reported attitude of a view.
 
-    `heading_rad`: None where unknown. `pitch_rad`, `roll_rad`. `tilt_noise_rad`: standard deviation
-    of these two from view to view, that of the model where None.
+    `heading_rad`: None where unknown. `pitch_rad`, `roll_rad`. `horizon_rad`: standard deviation of
+    the changing error of these two, that of the model where None.
     """
 
     heading_rad: float | None
     pitch_rad: float
     roll_rad: float
-    tilt_noise_rad: float | None = None
+    horizon_rad: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +163,7 @@ class Sighting:
 def measurement(
     model: Model, reported: ReportedAttitude, sighting: Sighting
 ) -> tuple[Array, Array, Array]:
-    """A sighting as a measurement of the components `SEEN` of the state (6,), and two covariances
+    """A sighting as a measurement of `SEEN` (6,), and two covariances
     (6, 6): of the errors of map and view, and of the telemetry noise, which is independent at every
     view."""
     noise = sighting.covariance.copy()
@@ -165,10 +172,9 @@ def measurement(
     noise[:2, :2] += (model.sighting_growth - 1) * (noise[:2, :2] - by_tilt)
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)
-    reported_tilt = (
-        model.tilt_noise_rad if reported.tilt_noise_rad is None else reported.tilt_noise_rad
-    )
-    independent = np.diag(np.square([0.0, 0.0, 0.0, 0.0, reported_tilt, reported_tilt]))
+    horizon = model.horizon_rad if reported.horizon_rad is None else reported.horizon_rad
+    white = WHITE_SHARE * horizon
+    independent = np.diag(np.square([0.0, 0.0, 0.0, 0.0, white, white]))
     seen = sighting.mean.copy()
     if reported.heading_rad is None:
         seen[2] = 0.0
@@ -183,12 +189,17 @@ def measurement(
 def updated(
     mean: Array, covariance: Array, innovation: Array, spread: Array
 ) -> tuple[Array, Array]:
-    """Kalman update: posterior mean (.., 8) and covariance (.., 8, 8), by an innovation (.., 6) and
-    its covariance (.., 6, 6)."""
-    gain = np.linalg.solve(spread, covariance[..., SEEN, :]).swapaxes(-1, -2)
+    """Kalman update: posterior mean (.., 10) and covariance (.., 10, 10), by an innovation (.., 6)
+    and its covariance (.., 6, 6)."""
+    gain = np.linalg.solve(spread, SEEN @ covariance).swapaxes(-1, -2)
     after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
     moved = mean + (gain @ innovation[..., None])[..., 0]
     return moved, (after + after.swapaxes(-1, -2)) / 2
+
+
+def seen_of(mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """What a sighting measures of states (.., 10): its mean (.., 6) and covariance (.., 6, 6)."""
+    return mean @ SEEN.T, SEEN @ covariance @ SEEN.T
 
 
 def log_densities(off: Array, spread: Array) -> Array:

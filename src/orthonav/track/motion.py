@@ -1,15 +1,17 @@
 """Prediction of the state: by time, by the reported velocity, and by the camera's odometry."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from orthonav.track.model import (
     HEADING,
+    HORIZON,
     POSITION,
     SCALE,
     STATE,
+    TILT,
     VELOCITY,
     Array,
     Model,
@@ -35,12 +37,13 @@ class ReportedVelocity:
 
     `now_en_mps` (2,): since the last view. `before_en_mps` (2,): the one reported with the last
     view, None where there was none. `std_mps`: standard deviation per axis of its error, which is
-    nearly constant for a while (`Model.reported_velocity_s`).
+    nearly constant for `correlation_s`; None: `Model.reported_velocity_s`.
     """
 
     now_en_mps: Array
     before_en_mps: Array | None
     std_mps: float
+    correlation_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +54,8 @@ class CameraDisplacement:
     reported height of the view before, and so subject to their errors. `covariance` (2, 2).
     `reach_m`: the radius within which it was sought. `turned_rad`, `scaled`: change of heading
     (rad) and log scale beyond the reported change. `turned_std_rad`, `scaled_std`: their standard
-    deviations.
+    deviations. `levers_m` (2, 2, 2): metres east and north by which an error of the pitch and roll
+    (rad) displaces the camera, now and before; `corrected_rad` (2, 2): what these were corrected by.
     """
 
     moved_en_m: Array
@@ -61,14 +65,16 @@ class CameraDisplacement:
     scaled: float = 0.0
     turned_std_rad: float = math.radians(0.4)
     scaled_std: float = 0.004
+    levers_m: Array = field(default_factory=lambda: np.zeros((2, 2, 2)))
+    corrected_rad: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
     """A predicted state, with the state before it.
 
-    `mean` (8,), `covariance` (8, 8): the prediction. `mean_before`, `covariance_before`: the state
-    at the last view, by the odometry in between too. `cross` (8, 8): covariance of the state before
+    `mean` (10,), `covariance` (10, 10): the prediction. `mean_before`, `covariance_before`: the state
+    at the last view, by the odometry in between too. `cross` (10, 10): covariance of the state before
     (rows) and the prediction (columns).
     """
 
@@ -101,8 +107,9 @@ def predicted(
 ) -> Expected:
     """The state predicted over so many seconds, by the reported velocity or else its own.
 
-    `telemetry_noise` (2,): variances of reported heading (rad) and log scale from view to view.
-    They are added to the biases of these, unless the `camera` measured the change. The displacement
+    `telemetry_noise` (3,): variances of reported heading (rad) and log scale from view to view, and
+    of the horizon. The first two are added to the biases of these, unless the `camera` measured the
+    change; the horizon is a Gauss-Markov process (`Model.horizon_s`). The displacement
     by the camera is not included: see `by_camera`. While `coasting`, the error of a reported
     velocity drifts (`Model.coasting_walk`).
     """
@@ -110,11 +117,15 @@ def predicted(
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
     if camera is None:
-        noise[[HEADING, SCALE], [HEADING, SCALE]] += telemetry_noise
+        noise[[HEADING, SCALE], [HEADING, SCALE]] += telemetry_noise[:2]
     else:
         after[[HEADING, SCALE]] += [camera.turned_rad, camera.scaled]
         noise[HEADING, HEADING] += camera.turned_std_rad**2
         noise[SCALE, SCALE] += camera.scaled_std**2
+    left = math.exp(-seconds / model.horizon_s)
+    after[HORIZON] *= left
+    step[HORIZON, HORIZON] = left * np.eye(2)
+    noise[range(8, 10), range(8, 10)] = telemetry_noise[2] * (1 - left**2)
     if velocity is None:
         after[POSITION] += seconds * mean[VELOCITY]
         step[0, 2] = step[1, 3] = seconds
@@ -125,7 +136,7 @@ def predicted(
         after[VELOCITY] = velocity.now_en_mps
         known_mps = model.speed_mps / 2 if coasting else 3 * velocity.std_mps
         if velocity.before_en_mps is not None and covariance[2, 2] < known_mps**2:
-            like_before = math.exp(-seconds / model.reported_velocity_s)
+            like_before = math.exp(-seconds / (velocity.correlation_s or model.reported_velocity_s))
             after[VELOCITY] += like_before * (mean[VELOCITY] - velocity.before_en_mps)
         after[POSITION] += seconds * after[VELOCITY]
         step[VELOCITY, VELOCITY] = like_before * np.eye(2)
@@ -154,7 +165,8 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
     """The prediction updated with a displacement by the camera, and the log density of the latter.
 
     The displacement measures the position now less that before (stochastic cloning, Roumeliotis and
-    Burdick 2002), rotated and scaled by the errors of heading and scale before.
+    Burdick 2002), rotated and scaled by the errors of heading and scale before; what the tilts of
+    both views err by looks like motion.
     """
     mean = np.concatenate([expected.mean, expected.mean_before])
     now, before = slice(0, STATE), slice(STATE, 2 * STATE)
@@ -171,6 +183,12 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
     observes[:, STATE + HEADING] = -turn @ [north, -east]
     observes[:, STATE + SCALE] = -turn @ [east, north]
     innovation = turn @ [east, north] - (mean[POSITION] - mean[STATE : STATE + 2])
+    for sign, lever, known, first in zip(
+        (1, -1), camera.levers_m, camera.corrected_rad, (0, STATE), strict=True
+    ):
+        state = mean[first : first + STATE]
+        innovation -= sign * lever @ (state[TILT] + state[HORIZON] - known)
+        observes[:, first + TILT.start : first + STATE] += sign * np.hstack([lever, lever])
     spread = observes @ joint @ observes.T + turn @ camera.covariance @ turn.T
     gain = np.linalg.solve(spread, observes @ joint).T
     mean = mean + gain @ innovation
@@ -183,7 +201,7 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
 
 
 def velocity_forgotten(model: Model, covariance: Array) -> Array:
-    """The covariance (8, 8) of a state with its velocity reset to unknown."""
+    """The covariance (10, 10) of a state with its velocity reset to unknown."""
     out = covariance.copy()
     out[VELOCITY] = out[:, VELOCITY] = 0.0
     out[VELOCITY, VELOCITY] = np.eye(2) * model.speed_mps**2

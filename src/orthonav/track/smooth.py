@@ -24,7 +24,7 @@ ROWS_OF_BLOCK = 256
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A smoothed state: `mean` (8,), `covariance` (8, 8), and `belief` in its track."""
+    """A smoothed state: `mean` (10,), `covariance` (10, 10), and `belief` in its track."""
 
     mean: Array
     covariance: Array
@@ -68,7 +68,7 @@ class _Rows:
         self._free.append(number)
 
     def state(self, number: int) -> tuple[Array, Array]:
-        """Mean (8,) and covariance (8, 8), the first two parts of a row."""
+        """Mean (10,) and covariance (10, 10), the first two parts of a row."""
         mean, covariance, *_ = np.split(self._row(number), STARTS)
         return mean.copy(), covariance.reshape(STATE, STATE).copy()
 
