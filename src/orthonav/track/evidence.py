@@ -95,8 +95,8 @@ def recognition(
 ) -> Array:
     """Probabilities (K,) that a view showed the map, given its place and predictions of that.
 
-    `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The odds by the view
-    alone, times the likelihood ratio of the innovations (K, 6) in position, heading and scale
+    `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The
+    odds by the view alone, times the likelihood ratio of the innovations (K, 6) in position, heading and scale
     between a right place and one that chance finds in the area searched. A place within the gate is
     never less likely for its distance.
     """

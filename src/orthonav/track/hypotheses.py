@@ -113,7 +113,7 @@ def _divergence(means: Array, covariances: Array) -> Array:
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """Mean (10,) and covariance (10, 10) of several hypotheses as one Gaussian; not to be changed."""
+    """Mean (10,) and covariance (10, 10) of hypotheses as one Gaussian; not to be changed."""
     if len(group) == 1:
         return group[0].mean, group[0].covariance
     shares = np.array([each.share for each in group])

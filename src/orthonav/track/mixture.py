@@ -114,8 +114,8 @@ class State(Enum):
 class Estimate:
     """The estimate of the track: its best cluster of hypotheses. Its arrays are not to be changed.
 
-    `mean` (10,), `covariance` (10, 10): of the cluster. `confidence`: probability that the aircraft is
-    within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
+    `mean` (10,), `covariance` (10, 10): of the cluster. `confidence`: probability that the aircraft
+    is within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
     however wide it is. `recognized`: probability that the last view showed the map there.
     `confirmed`: whether enough of its ground was recognized lately. `followed`: whether it descends
     from a confirmed track or a reported position.

@@ -55,7 +55,7 @@ class CameraDisplacement:
     `reach_m`: the radius within which it was sought. `turned_rad`, `scaled`: change of heading
     (rad) and log scale beyond the reported change. `turned_std_rad`, `scaled_std`: their standard
     deviations. `levers_m` (2, 2, 2): metres east and north by which an error of the pitch and roll
-    (rad) displaces the camera, now and before; `corrected_rad` (2, 2): what these were corrected by.
+    (rad) displaces the camera, now and before; `corrected_rad` (2, 2): what they were corrected by.
     """
 
     moved_en_m: Array
@@ -73,9 +73,9 @@ class CameraDisplacement:
 class Expected:
     """A predicted state, with the state before it.
 
-    `mean` (10,), `covariance` (10, 10): the prediction. `mean_before`, `covariance_before`: the state
-    at the last view, by the odometry in between too. `cross` (10, 10): covariance of the state before
-    (rows) and the prediction (columns).
+    `mean` (10,), `covariance` (10, 10): the prediction. `mean_before`, `covariance_before`: the
+    state at the last view, by the odometry in between too. `cross` (10, 10): covariance of the
+    state before (rows) and the prediction (columns).
     """
 
     mean: Array
