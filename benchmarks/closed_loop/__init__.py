@@ -1,0 +1,1 @@
+"""orthonav with an autopilot that flies on its positions: recorded flights, and a simulated loop."""

@@ -1,0 +1,231 @@
+"""Recorded flights of autopilots located again: their own telemetry, views from the true poses.
+
+The autopilot flew on what orthonav 2bf6196 sent, so its errors of attitude and velocity are those
+of a closed loop; what is located now is not fed back.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.closed_loop.ground import Demo
+from benchmarks.closed_loop.recorded import MIRRORED, OFF, ON, SHIFTED, Exposure, Recorded
+from benchmarks.inputs import DATA
+from benchmarks.record import Section, Table, number
+from orthonav.localizer.tracker import Tracker
+from orthonav.onboard.run import Locator, SingleViews, locate_view
+from orthonav.publish.estimate import Clock, error_ellipse, estimate_from_result
+from orthonav.publish.gate import Gate
+from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
+
+RECORDED = DATA / "closed_loop"
+METHODS = ("single", "single, no prior", "track")
+FAR_M, FAR_STD = 35.0, 3.0
+"""A position is wrong if its error exceeds both, as in `benchmarks.faults`."""
+GNSS_TILT_STD_DEG = 1.5
+ALONE_TILT_STD_DEG, ALONE_VEL_STD_MPS = 3.0, 5.0
+"""Stated deviations of the telemetry while GNSS aids the autopilot, and while it does not."""
+HEADER = (
+    *("flight", "method", "views", "median m", "95 % m", "NEES", "confident", "tracking"),
+    *("velocity m/s", "300 m east", "mirrored"),
+)
+Array = NDArray[np.float64]
+Rule = Callable[[Telemetry, bool], Telemetry]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One view located by one method.
+
+    `error_en_m`, `cov_en_m2`: of the fix, None without one. `confidence`: 0 without a fix.
+    `sent`: the gate admits it. `velocity_off_mps`: error of the track's velocity, NaN without one.
+    `tilt_off_deg`: stated less true pitch and roll.
+    """
+
+    flight: str
+    method: str
+    exposure: Exposure
+    state: str | None
+    error_en_m: Array | None
+    cov_en_m2: Array | None
+    confidence: float
+    sent: bool
+    velocity_off_mps: float
+    tilt_off_deg: tuple[float, float]
+    reason: str | None
+
+    @property
+    def error_m(self) -> float:
+        """Distance from the truth; infinite without a fix."""
+        return np.inf if self.error_en_m is None else float(np.hypot(*self.error_en_m))
+
+    @property
+    def nees(self) -> float:
+        """Normalized error squared: 2 in the mean where the covariance is right."""
+        if self.error_en_m is None or self.cov_en_m2 is None:
+            return np.nan
+        return float(self.error_en_m @ np.linalg.solve(self.cov_en_m2, self.error_en_m))
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether it was sent and is wrong."""
+        if not self.sent or self.cov_en_m2 is None:
+            return False
+        return self.error_m > max(FAR_M, FAR_STD * error_ellipse(self.cov_en_m2)[0])
+
+
+def stated(telemetry: Telemetry, gnss: bool) -> Telemetry:
+    """Telemetry with the deviations of an autopilot with and without GNSS."""
+    if gnss:
+        return replace(telemetry, tilt_std_deg=GNSS_TILT_STD_DEG)
+    return replace(telemetry, tilt_std_deg=ALONE_TILT_STD_DEG, vel_std_mps=ALONE_VEL_STD_MPS)
+
+
+def plain(telemetry: Telemetry, gnss: bool) -> Telemetry:
+    """Telemetry without deviations, as version 0.1 has it."""
+    return telemetry
+
+
+def flights(only: Sequence[str] = ()) -> list[Path]:
+    """Folders of the recorded flights; empty where they are absent."""
+    found = sorted(path.parent for path in RECORDED.glob("*/exposures.csv"))
+    return [path for path in found if not only or path.name in only]
+
+
+def replay(
+    flight: Path,
+    work: Path,
+    *,
+    methods: Sequence[str] = METHODS,
+    rule: Rule = stated,
+    views: int | None = None,
+    disturbed: bool = True,
+) -> list[Row]:
+    """Locate the views of a flight folder by some of `METHODS`; `work` holds demo and pictures.
+
+    `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
+    Without `disturbed` the flight ends before the first disturbance of the camera.
+    """
+    recorded, demo = Recorded(flight), Demo.made(work)
+    locators: dict[str, Locator] = {
+        "single": SingleViews(demo.localizer),
+        "single, no prior": SingleViews(demo.localizer, use_prior=False),
+        "track": Tracker(demo.localizer),
+    }
+    gates = {name: Gate(clock=Clock.BOOT) for name in methods}
+    rows, alone = [], 0
+    for exposure, view in recorded.views(demo, work / "views", rule):
+        alone += exposure.phase == OFF
+        if (views is not None and alone > views) or (
+            not disturbed and exposure.phase not in (ON, OFF)
+        ):
+            break
+        if view.telemetry.missing():
+            continue
+        for name in methods:
+            if name != "track" and exposure.phase == ON:
+                continue  # the track begins with GNSS; single views are judged without it
+            rows.append(_row(recorded, demo, name, locators[name], gates[name], exposure, view))
+    return rows
+
+
+def _row(
+    recorded: Recorded,
+    demo: Demo,
+    method: str,
+    locator: Locator,
+    gate: Gate,
+    exposure: Exposure,
+    view: View,
+) -> Row:
+    outcome, latency_ms = locate_view(locator, view)
+    state = locator.state_name
+    result = ViewResult(str(exposure.number), exposure.time_ns, outcome, latency_ms, state)
+    admitted = gate.admit(estimate_from_result(result, clock=Clock.BOOT), exposure.time_ns)
+    error = cov = None
+    confidence, velocity_off = 0.0, np.nan
+    if isinstance(outcome, Fix):
+        place = demo.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
+        error = place - demo.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
+        cov, confidence = outcome.cov_en_m2, outcome.confidence
+        own = [outcome.evidence.get(f"vel_{axis}_mps", np.nan) for axis in ("east", "north")]
+        velocity_off = float(np.hypot(*(own - recorded.velocity_en_mps(exposure.time_s))))
+    _, pitch_deg, roll_deg = exposure.attitude_deg
+    tilt_off = view.telemetry.pitch_deg - pitch_deg, view.telemetry.roll_deg - roll_deg
+    reason = outcome.reason if isinstance(outcome, NoFix) else None
+    return Row(
+        recorded.folder.name, method, exposure, state, error, cov, confidence,
+        admitted is not None, velocity_off, tilt_off, reason,
+    )  # fmt: skip
+
+
+def judged(rows: Sequence[Row]) -> list[Row]:
+    """Fixes without GNSS and without disturbance: confident single ones, those of a track while
+    it is tracking."""
+    alone = [row for row in rows if row.exposure.phase == OFF and row.error_en_m is not None]
+    return [
+        row
+        for row in alone
+        if (row.confidence >= CONFIDENT if row.state is None else row.state == "tracking")
+    ]
+
+
+def _cells(rows: Sequence[Row]) -> list[str]:
+    """A row of the table from all views of one flight by one method."""
+    alone = [row for row in rows if row.exposure.phase == OFF]
+    good = judged(rows)
+    errors = [row.error_m for row in good] or [np.nan]
+    speeds = [row.velocity_off_mps for row in good] or [np.nan]
+    wrong = []
+    for phase in (SHIFTED, MIRRORED):
+        sent = [row for row in rows if row.exposure.phase == phase]
+        wrong.append(f"{sum(row.is_wrong for row in sent)}/{len(sent)}" if sent else "-")
+    confident = sum(row.confidence >= CONFIDENT for row in alone) / max(len(alone), 1)
+    tracking = sum(row.state == "tracking" for row in alone) / max(len(alone), 1)
+    return [
+        rows[0].flight,
+        rows[0].method,
+        str(len(alone)),
+        number(float(np.median(errors))),
+        number(float(np.percentile(errors, 95))),
+        number(float(np.mean([row.nees for row in good] or [np.nan]))),
+        f"{confident:.0%}",
+        f"{tracking:.0%}" if rows[0].state is not None else "-",
+        number(float(np.median(speeds))),
+        *wrong,
+    ]
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """Errors without GNSS per flight and method."""
+    keys = dict.fromkeys((row.flight, row.method) for row in rows)
+    cells = [_cells([row for row in rows if (row.flight, row.method) == key]) for key in keys]
+    notes = (
+        "errors of confident single views, and of tracked views in the state tracking, while GNSS "
+        "is off and before any disturbance; NEES: mean, 2 is right; velocity: median error",
+        "300 m east, mirrored: wrong positions that the gate admits, of all views while the camera "
+        f"is so disturbed; wrong: more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
+    )
+    return Table("Replays", HEADER, cells, notes)
+
+
+def measure(
+    work: Path,
+    only: Sequence[str] = (),
+    *,
+    methods: Sequence[str] = METHODS,
+    rule: Rule = stated,
+    views: int | None = None,
+    disturbed: bool = True,
+) -> Section:
+    """All flights, or `only` those named."""
+    rows: list[Row] = []
+    for flight in flights(only):
+        found = replay(flight, work, methods=methods, rule=rule, views=views, disturbed=disturbed)
+        print(table(found).markdown(), file=sys.stderr, flush=True)
+        rows += found
+    return Section("Replays of flights with autopilots", [table(rows)] if rows else [])
