@@ -1,1 +1,1 @@
-"""orthonav with an autopilot that flies on its positions: recorded flights, and a simulated loop."""
+"""Autopilots that fly on our positions: recorded flights located again, and a simulated loop."""
