@@ -1,0 +1,358 @@
+"""A flight in the loop: true motion, instruments, filter, guidance, camera, orthonav, and back."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.closed_loop.ground import CAMERA, Demo, Grey
+from benchmarks.closed_loop.inertial import FILTERS, STATES, Filter
+from benchmarks.closed_loop.physics import (
+    STEP_S,
+    VEHICLES,
+    Motion,
+    Vehicle,
+    Wind,
+    about,
+    euler_rad,
+    increments,
+)
+from benchmarks.closed_loop.replays import Rule
+from benchmarks.closed_loop.sensors import CALM, CONSUMER, Grade, Instruments
+from orthonav.geo.frames import LocalFrame
+from orthonav.localizer.tracker import Tracker
+from orthonav.onboard.cameras import FrozenCheck
+from orthonav.onboard.run import locate_view
+from orthonav.publish.correlation import FilterCovariance
+from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
+from orthonav.publish.gate import Gate
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
+
+AGL_M, WIND_MPS = 250.0, 5.0
+ROUTE_EN_M = np.array(
+    [(-550, -550), (-550, 450), (-150, 550), (0, -450), (350, -550), (550, 250), (100, 550)], float
+)
+"""Corners over the demo area, flown round and round."""
+CARROT_M, CORNER_M = 70.0, 60.0
+"""Distance of the point that is steered to; corners count as reached from so far away."""
+VIEW_STEPS, LATENCY_S = 10, 0.1
+"""A view every 0.2 s; what it gives reaches the filter so late."""
+GRADES = {"px4": CONSUMER, "ardupilot": CALM}
+START_STD_M, PRIOR_STD_M = 30.0, 100.0
+"""Error of the position at a start without GNSS, and what the tracker is told of it."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What happens. GNSS is on for `gnss_s`, then off until `seconds`.
+
+    `send`: what the filter gets of orthonav, "position", "position+velocity", or None for nothing;
+    then no views are taken. `fault`: "shifted", "mirrored" or "frozen" pictures, from `fault_s` on
+    for `lasts_s`.
+    """
+
+    name: str
+    seconds: float
+    gnss_s: float = 60.0
+    send: str | None = "position"
+    fault: str | None = None
+    fault_s: float = math.inf
+    lasts_s: float = 0.0
+
+    def faulty(self, time_s: float) -> bool:
+        """Whether the pictures are disturbed."""
+        return self.fault_s <= time_s < self.fault_s + self.lasts_s
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """The autopilot at one exposure: true and estimated motion, and its claimed std, m."""
+
+    time_s: float
+    truth: Motion
+    estimate: Motion
+    claimed_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """A view: what orthonav made of it.
+
+    `tilt_off_m` (2,): displacement, ahead and right, that the error of the stated tilt makes of a
+    fix that trusts it. `error_m` (2,): of the fix, ahead and right. `sent_std_m`: as stated in the
+    message, NaN where none was sent.
+    """
+
+    time_s: float
+    fix: Fix | None
+    state: str
+    reason: str | None
+    error_m: Array
+    tilt_off_m: Array
+    nees: float
+    sent_std_m: float
+
+    @property
+    def sent(self) -> bool:
+        """Whether a message was sent."""
+        return math.isfinite(self.sent_std_m)
+
+
+@dataclass
+class Flown:
+    """What a flight left behind."""
+
+    scenario: Scenario
+    samples: list[Sample] = field(default_factory=list)
+    views: list[Located] = field(default_factory=list)
+    resets: int = 0
+    withheld: dict[str, int] = field(default_factory=dict)
+
+
+class Route:
+    """The point ahead on the route that is steered to."""
+
+    def __init__(self) -> None:
+        self._leg = 0
+
+    def carrot_ne(self, place_ne: Array) -> Array:
+        """North and east (2,) of it, by the estimated position."""
+        count = len(ROUTE_EN_M)
+        begin, end = ROUTE_EN_M[self._leg, ::-1], ROUTE_EN_M[(self._leg + 1) % count, ::-1]
+        length = float(np.hypot(*(end - begin)))
+        along = float((place_ne - begin) @ (end - begin)) / length
+        if along > length - CORNER_M:
+            self._leg = (self._leg + 1) % count
+            return self.carrot_ne(place_ne)
+        return np.asarray(begin + (end - begin) / length * min(max(along, 0.0) + CARROT_M, length))
+
+
+class Sight:
+    """Camera and orthonav of one flight, as `orthonav fly` joins them."""
+
+    def __init__(self, demo: Demo, scenario: Scenario, rule: Rule, seed: int) -> None:
+        self._demo, self._scenario, self._rule, self._seed = demo, scenario, rule, seed
+        self._tracker, self.gate = Tracker(demo.localizer), Gate(clock=Clock.BOOT)
+        self._frozen, self._covariance = FrozenCheck(), FilterCovariance()
+        self._before: Grey | None = None
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The plane of the map."""
+        return self._demo.frame
+
+    def look(
+        self, time_s: float, truth: Motion, estimate: Motion, *, gnss: bool
+    ) -> tuple[Located, NavigationEstimate | None]:
+        """Locate one view, and the estimate to send, None where the gate withholds it."""
+        telemetry = self._telemetry(time_s, estimate, gnss)
+        view = View(self._picture(time_s, truth), CAMERA, telemetry)
+        if self._frozen.is_repeat(view.grey):
+            outcome: Fix | NoFix = NoFix("frozen_image", "")
+            made = None
+        else:
+            outcome, latency_ms = locate_view(self._tracker, view)
+            state = self._tracker.state_name
+            result = ViewResult("", telemetry.time_ns, outcome, latency_ms, state)
+            made = estimate_from_result(result, clock=Clock.BOOT, processing_s=LATENCY_S)
+        admitted = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
+        stated = None
+        if admitted is not None:
+            stated = self._covariance.prepare("", admitted, telemetry.time_ns)
+            self._covariance.sent("", telemetry.time_ns)
+        return self._judged(time_s, truth, estimate, outcome, stated), stated
+
+    def _telemetry(self, time_s: float, estimate: Motion, gnss: bool) -> Telemetry:
+        yaw, pitch, roll = np.degrees(euler_rad(estimate.rotation)).tolist()
+        north, east, down = estimate.position.tolist()
+        lat, lon = self.frame.latlon_from_en(np.array([east, north]))
+        velocity = float(estimate.velocity[1]), float(estimate.velocity[0])
+        prior = Prior(float(lat), float(lon), PRIOR_STD_M)
+        telemetry = Telemetry(
+            round(time_s * 1e9), yaw % 360, pitch, roll, -down, prior=prior, vel_en_mps=velocity
+        )
+        return self._rule(replace(telemetry, home_m=-down), gnss)
+
+    def _picture(self, time_s: float, truth: Motion) -> Grey:
+        fault = self._scenario.fault if self._scenario.faulty(time_s) else None
+        if fault == "frozen" and self._before is not None:
+            return self._before
+        yaw, pitch, roll = np.degrees(euler_rad(truth.rotation)).tolist()
+        place = truth.position[[1, 0]] + [300.0 if fault == "shifted" else 0.0, 0.0]
+        rng = np.random.default_rng([self._seed, round(time_s * 1e3)])
+        height_m = float(-truth.position[2])
+        grey = self._demo.picture(place, (yaw, pitch, roll), height_m, rng)
+        self._before = np.ascontiguousarray(grey[:, ::-1]) if fault == "mirrored" else grey
+        return self._before
+
+    def _judged(
+        self,
+        time_s: float,
+        truth: Motion,
+        estimate: Motion,
+        outcome: Fix | NoFix,
+        stated: NavigationEstimate | None,
+    ) -> Located:
+        error, nees = np.full(2, np.nan), math.nan
+        yaw, _, _ = euler_rad(truth.rotation)
+        ahead_right = about(2, yaw)[:2, :2].T
+        if isinstance(outcome, Fix):
+            place = self.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
+            off = place - truth.position[[1, 0]]
+            nees = float(off @ np.linalg.solve(outcome.cov_en_m2, off))
+            error = ahead_right @ off[::-1]
+        return Located(
+            time_s,
+            outcome if isinstance(outcome, Fix) else None,
+            self._tracker.state_name,
+            outcome.reason if isinstance(outcome, NoFix) else None,
+            error,
+            ahead_right @ _tilt_off_m(truth, estimate),
+            nees,
+            math.nan if stated is None else stated.horizontal_std_m(),
+        )
+
+
+def tilt_off_rad(truth: Motion, estimate: Motion) -> Array:
+    """The error (2,) of an estimated attitude about north and east, its heading left out."""
+    yaw = euler_rad(truth.rotation)[0] - euler_rad(estimate.rotation)[0]
+    wrong = (about(2, yaw) @ estimate.rotation) @ truth.rotation.T
+    return np.array([wrong[2, 1] - wrong[1, 2], wrong[0, 2] - wrong[2, 0]]) / 2
+
+
+def _tilt_off_m(truth: Motion, estimate: Motion) -> Array:
+    """The displacement (2,) north and east of a fix that trusts the estimated tilt."""
+    about_north, about_east = tilt_off_rad(truth, estimate).tolist()
+    # The axis seems to look farther north by a turn about east and farther west by one about
+    # north, so what it sees seems to be seen from the opposite side.
+    height_m = -float(truth.position[2])
+    return height_m * np.array([-math.tan(about_east), math.tan(about_north)])
+
+
+def fly(
+    scenario: Scenario,
+    demo: Demo | None,
+    *,
+    vehicle: str,
+    autopilot: str,
+    seed: int,
+    rule: Rule,
+    grade: Grade | None = None,
+) -> Flown:
+    """Fly a scenario with a vehicle of `VEHICLES` and a filter of `FILTERS`.
+
+    `demo` is needed where orthonav sends. `rule`: deviations of the telemetry (`replays.Rule`).
+    """
+    rng = np.random.default_rng([seed, 3])
+    wind = Wind(rng, np.array([*(WIND_MPS * _direction(rng)), 0.0]))
+    place = np.array([*ROUTE_EN_M[0, ::-1], -AGL_M])
+    aircraft: Vehicle = VEHICLES[vehicle](rng, place, 0.0)
+    aircraft.step(wind.next())
+    instruments = Instruments(rng, grade or GRADES[autopilot])
+    estimator = _started(rng, aircraft, autopilot, scenario.gnss_s > 0)
+    sight = None
+    if scenario.send is not None and demo is not None:
+        sight = Sight(demo, scenario, rule, seed)
+    flown, route = Flown(scenario), Route()
+    for number in range(round(scenario.seconds / STEP_S)):
+        time_s = number * STEP_S
+        gnss = time_s < scenario.gnss_s
+        if number % 2 == 0:
+            estimate = estimator.output()
+            aircraft.steer(estimate, route.carrot_ne(estimate.position[:2]), AGL_M)
+        if number % VIEW_STEPS == 0:
+            truth = aircraft.motion
+            claimed_m = math.sqrt(float(np.diag(estimator.covariance)[6:8].mean()))
+            flown.samples.append(Sample(time_s, truth, estimate, claimed_m))
+            if sight is not None:
+                located, sent = sight.look(time_s, truth, estimate, gnss=gnss)
+                flown.views.append(located)
+                if sent is not None and not gnss:
+                    _give(estimator, sight.frame, sent, scenario.send == "position+velocity")
+        _sense(number, estimator, instruments, aircraft, wind, gnss=gnss)
+        before = aircraft.motion
+        aircraft.step(wind.next())
+        estimator.feel(instruments.imu(increments(before, aircraft.motion)))
+    flown.resets = estimator.resets
+    if sight is not None:
+        flown.withheld = dict(sight.gate.withheld)
+    return flown
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    angle = rng.uniform(0, math.tau)
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def _started(rng: np.random.Generator, aircraft: Vehicle, autopilot: str, gnss: bool) -> Filter:
+    """A filter at the start: with GNSS, it knows position and velocity; without it, roughly."""
+    truth = aircraft.motion
+    place_m, mps = (1.0, 0.3) if gnss else (START_STD_M, 3.0)
+    tuning = FILTERS[autopilot]
+    stds = np.repeat([0.03, mps, 1.0, 0.01, 0.2, 5.0], [3, 3, 3, 3, 3, 2])
+    stds[6:8] = place_m
+    assert len(stds) == STATES
+    off = stds * rng.normal(size=STATES)
+    tilted = about(0, off[0]) @ about(1, off[1]) @ about(2, off[2])
+    # The motions are shared; the filter's is its own.
+    motion = Motion(
+        truth.position + off[6:9] * [1, 1, 0.5],
+        truth.velocity + off[3:6] * [1, 1, 0.1],
+        tilted @ truth.rotation,
+    )
+    return Filter(tuning, motion, stds)
+
+
+def _give(
+    estimator: Filter, frame: LocalFrame, sent: NavigationEstimate, with_velocity: bool
+) -> None:
+    """Give the filter a message; it is fused at its exposure, which the filter has yet to reach."""
+    east, north = frame.en_from_latlon(sent.lat_deg, sent.lon_deg).tolist()
+    tuning, place = estimator.tuning, np.array([north, east])
+    std_m = max(sent.horizontal_std_m(), tuning.least_m)
+    estimator.measure(lambda: estimator.fuse_position(place, std_m))
+    if with_velocity and sent.vel_en_mps is not None and sent.vel_cov_en is not None:
+        velocity = np.array(sent.vel_en_mps[::-1])
+        largest = float(np.linalg.eigvalsh(sent.vel_cov_en)[-1])
+        std_mps = max(math.sqrt(largest), tuning.least_mps)
+        estimator.measure(lambda: estimator.fuse_velocity(velocity, std_mps))
+
+
+def _sense(
+    number: int,
+    estimator: Filter,
+    instruments: Instruments,
+    aircraft: Vehicle,
+    wind: Wind,
+    *,
+    gnss: bool,
+) -> None:
+    """Measure what is due, at 10 Hz and GNSS at 5 Hz."""
+    if number % 5:
+        return
+    motion: Any = aircraft.motion
+    height_m, heading = instruments.height_m(motion, 5 * STEP_S), instruments.heading_rad(motion)
+    estimator.measure(lambda: estimator.fuse_height(height_m))
+    estimator.measure(lambda: estimator.fuse_heading(heading))
+    estimator.measure(estimator.fuse_gravity)
+    if aircraft.has_airspeed:
+        airspeed_mps = instruments.airspeed_mps(motion, wind)
+        estimator.measure(lambda: estimator.fuse_air(airspeed_mps))
+    if gnss and number % 10 == 0:
+        place, velocity = instruments.gnss(motion)
+        tuning = estimator.tuning
+        estimator.measure(lambda: estimator.fuse_position(place, tuning.gnss_m))
+        estimator.measure(lambda: estimator.fuse_velocity(velocity, tuning.gnss_mps))
+
+
+def spans(flown: Flown) -> tuple[Sequence[Sample], Sequence[Located]]:
+    """Samples and views that are judged: without GNSS, from 5 s after it was cut on."""
+    begin_s = flown.scenario.gnss_s + 5.0 if flown.scenario.gnss_s > 0 else 15.0
+    if flown.scenario.gnss_s >= flown.scenario.seconds:
+        begin_s = 30.0
+    samples = [each for each in flown.samples if each.time_s >= begin_s]
+    return samples, [each for each in flown.views if each.time_s >= begin_s]
