@@ -32,7 +32,7 @@ class Grade:
     baro_walk: float = 0.05
     heading_bias: float = math.radians(2.0)
     heading_noise: float = math.radians(1.0)
-    airspeed_scale: float = 0.02
+    airspeed_scale: float = 0.01
     airspeed_mps: float = 0.5
     gnss_m: float = 0.8
     gnss_mps: float = 0.1
@@ -40,7 +40,7 @@ class Grade:
 
 CONSUMER = Grade()
 """Uncalibrated consumer MEMS in an aircraft that vibrates."""
-CALM = Grade(gyro_noise=2e-4, accel_noise=0.01, gyro_bias=math.radians(0.03), accel_bias=0.03)
+CALM = Grade(gyro_noise=1e-4, accel_noise=0.005, gyro_bias=math.radians(0.01), accel_bias=0.015)
 """Calibrated for temperature and well damped, as those of ArduPilot's simulator."""
 PERFECT = Grade(*(0.0,) * 4, 90.0, *(0.0,) * 8)
 
