@@ -58,19 +58,17 @@ def is_wrong(view: Located) -> bool:
     return error_m > max(FAR_M, FAR_STD * error_ellipse(view.fix.cov_en_m2)[0])
 
 
-def by_tilt(views: Sequence[Located]) -> tuple[float, float]:
-    """Correlation of the errors of fixes with those that the stated tilt makes, and their slope;
-    the mean of both axes (ahead, right)."""
-    errors = np.array([view.error_m for view in views])
-    tilts = np.array([view.tilt_off_m for view in views])
-    if len(errors) < 10:
-        return math.nan, math.nan
-    found = []
-    for error, tilt in zip(errors.T, tilts.T, strict=True):
-        spread = np.cov(tilt, error)
-        found.append([np.corrcoef(tilt, error)[0, 1], spread[0, 1] / spread[0, 0]])
-    correlation, slope = np.mean(found, axis=0).tolist()
-    return correlation, slope
+def by_tilt(views: Sequence[Located]) -> list[str]:
+    """Correlations, ahead and right, of the errors of fixes with those that the error of the
+    stated tilt makes, and the slopes."""
+    if len(views) < 10:
+        return ["-", "-"]
+    errors = np.array([view.error_m for view in views]).T
+    tilts = np.array([view.tilt_off_m for view in views]).T
+    spreads = [np.cov(tilt, error) for tilt, error in zip(tilts, errors, strict=True)]
+    alike = [each[0, 1] / math.sqrt(each[0, 0] * each[1, 1]) for each in spreads]
+    slopes = [each[0, 1] / each[0, 0] for each in spreads]
+    return [", ".join(f"{value:.2f}" for value in values) for values in (alike, slopes)]
 
 
 def cells(flown: Flown) -> list[str]:
@@ -83,7 +81,6 @@ def cells(flown: Flown) -> list[str]:
     tilts = np.degrees([tilt_off_rad(each.truth, each.estimate) for each in samples])
     sent = [view for view in views if view.sent]
     errors = np.array([np.hypot(*view.error_m) for view in sent])
-    correlation, slope = by_tilt(sent)
     return [
         flown.scenario.name,
         *_median_95(far_m),
@@ -93,8 +90,7 @@ def cells(flown: Flown) -> list[str]:
         number(math.sqrt(float((tilts**2).sum(1).mean()))),
         *_median_95(errors),
         number(float(np.mean([view.nees for view in sent]))) if sent else "-",
-        number(correlation),
-        number(slope),
+        *by_tilt(sent),
         f"{len(sent) / len(views):.0%}" if views else "-",
         f"{sum(map(is_wrong, views))}" if views else "-",
     ]
@@ -135,7 +131,7 @@ def measure(
         "position, velocity, tilt: errors of the autopilot, tilt as RMS; NEES: mean, 2 is right; "
         "fixes: those sent, NEES by their own covariance",
         "tilt correlation, slope: of the errors of fixes with height times the tangent of the "
-        "autopilot's error of tilt, mean of both axes",
+        "autopilot's error of tilt, ahead and right",
         f"wrong: sent, and more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
     title = f"{vehicle}, filter like {autopilot}'s, sent: {send}"
