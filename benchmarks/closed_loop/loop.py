@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from benchmarks.closed_loop.physics import (
     euler_rad,
     increments,
 )
-from benchmarks.closed_loop.replays import Rule
+from benchmarks.closed_loop.replays import Rule, is_wrong
 from benchmarks.closed_loop.sensors import CALM, CONSUMER, Grade, Instruments
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer.tracker import Tracker
@@ -43,6 +42,7 @@ VIEW_STEPS, LATENCY_S = 10, 0.1
 GRADES = {"px4": CONSUMER, "ardupilot": CALM}
 START_STD_M, PRIOR_STD_M = 30.0, 100.0
 """Error of the position at a start without GNSS, and what the tracker is told of it."""
+SETTLING_S = {True: 5.0, False: 15.0}
 Array = NDArray[np.float64]
 
 
@@ -83,17 +83,17 @@ class Located:
     """A view: what orthonav made of it.
 
     `tilt_off_m` (2,): displacement, ahead and right, that the error of the stated tilt makes of a
-    fix that trusts it. `error_m` (2,): of the fix, ahead and right. `sent_std_m`: as stated in the
-    message, NaN where none was sent.
+    fix that trusts it. `error_m` (2,): of the fix, ahead and right, NaN without one. `nees`: by its
+    covariance. `is_wrong`: see `replays`. `sent_std_m`: as stated in the message, NaN where none
+    was sent.
     """
 
     time_s: float
-    fix: Fix | None
     state: str
-    reason: str | None
     error_m: Array
     tilt_off_m: Array
     nees: float
+    is_wrong: bool
     sent_std_m: float
 
     @property
@@ -197,7 +197,7 @@ class Sight:
         outcome: Fix | NoFix,
         stated: NavigationEstimate | None,
     ) -> Located:
-        error, nees = np.full(2, np.nan), math.nan
+        error, nees, wrong = np.full(2, np.nan), math.nan, False
         yaw, _, _ = euler_rad(truth.rotation)
         ahead_right = about(2, yaw)[:2, :2].T
         if isinstance(outcome, Fix):
@@ -205,14 +205,14 @@ class Sight:
             off = place - truth.position[[1, 0]]
             nees = float(off @ np.linalg.solve(outcome.cov_en_m2, off))
             error = ahead_right @ off[::-1]
+            wrong = is_wrong(float(np.hypot(*off)), outcome.cov_en_m2)
         return Located(
             time_s,
-            outcome if isinstance(outcome, Fix) else None,
             self._tracker.state_name,
-            outcome.reason if isinstance(outcome, NoFix) else None,
             error,
             ahead_right @ _tilt_off_m(truth, estimate),
             nees,
+            wrong,
             math.nan if stated is None else stated.horizontal_std_m(),
         )
 
@@ -334,7 +334,7 @@ def _sense(
     """Measure what is due, at 10 Hz and GNSS at 5 Hz."""
     if number % 5:
         return
-    motion: Any = aircraft.motion
+    motion = aircraft.motion
     height_m, heading = instruments.height_m(motion, 5 * STEP_S), instruments.heading_rad(motion)
     estimator.measure(lambda: estimator.fuse_height(height_m))
     estimator.measure(lambda: estimator.fuse_heading(heading))
@@ -350,9 +350,9 @@ def _sense(
 
 
 def spans(flown: Flown) -> tuple[Sequence[Sample], Sequence[Located]]:
-    """Samples and views that are judged: without GNSS, from 5 s after it was cut on."""
-    begin_s = flown.scenario.gnss_s + 5.0 if flown.scenario.gnss_s > 0 else 15.0
-    if flown.scenario.gnss_s >= flown.scenario.seconds:
-        begin_s = 30.0
+    """Samples and views that are judged: without GNSS, `SETTLING_S` after it was cut or, where it
+    never was on, after the start."""
+    gnss_s, seconds = flown.scenario.gnss_s, flown.scenario.seconds
+    begin_s = 30.0 if gnss_s >= seconds else gnss_s + SETTLING_S[gnss_s > 0]
     samples = [each for each in flown.samples if each.time_s >= begin_s]
     return samples, [each for each in flown.views if each.time_s >= begin_s]

@@ -1,12 +1,13 @@
 """A plane and a quadrotor as points with an attitude, in wind, and what their IMU feels exactly.
 
+A vehicle steers by estimates (`steer`) and moves by `STEP_S` (`step`).
+
 Axes: north, east, down; the body forward, right, down. The motion is smooth, and the IMU is derived
 from it: an integration of its increments gives the motion back.
 """
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,19 +134,6 @@ class Wind:
         return self.now_ned
 
 
-class Vehicle(Protocol):
-    """An aircraft with its controller, which knows estimates only."""
-
-    motion: Motion
-    has_airspeed: bool
-
-    def steer(self, estimate: Motion, carrot_ne: Array, height_m: float) -> None:
-        """Set the controls towards a point (2,) and a height, by an estimate."""
-
-    def step(self, wind_ned: Array) -> None:
-        """Move for `STEP_S`."""
-
-
 def _clip(value: float, most: float) -> float:
     return max(-most, min(most, value))
 
@@ -247,4 +235,5 @@ class Quad:
         self.motion = Motion(before.position + moved, velocity, rotation)
 
 
+Vehicle = Plane | Quad
 VEHICLES: dict[str, type[Plane] | type[Quad]] = {"plane": Plane, "quad": Quad}

@@ -28,6 +28,13 @@ SHIFT_EN_M = (300.0, 0.0)
 """Where the camera looks while it shows a place 300 m east."""
 PRIOR_STD_M = 100.0
 ON, OFF, SHIFTED, MIRRORED, AFTER = "GNSS on", "GNSS off", "300 m east", "mirrored", "after"
+PHASES = {
+    "GNSS OFF": OFF,
+    "300 m east": SHIFTED,
+    "camera mirrored": MIRRORED,
+    "camera right": AFTER,
+}
+"""What begins with an event that is so named."""
 Array = NDArray[np.float64]
 
 
@@ -57,13 +64,15 @@ class Recorded:
 
     @cached_property
     def exposures(self) -> list[Exposure]:
-        """Exposures from the start of orthonav on, in order."""
+        """Exposures from the start of orthonav until GNSS is on again, in order."""
         begin_s = min(time_s for time_s, _ in self._events)
+        again = [time_s for time_s, event in self._events if event.startswith("GNSS ON ")]
+        end_s = min(again, default=math.inf)
         made = []
         for number, row in enumerate(read_rows(self.folder / "exposures.csv")):
             value = {name: float(text) for name, text in row.items()}
             agl_m = value["amsl_m"] - GROUND_AMSL_M
-            if value["time_s"] < begin_s or agl_m < LEAST_AGL_M:
+            if not begin_s <= value["time_s"] < end_s or agl_m < LEAST_AGL_M:
                 continue
             angles = value["yaw_deg"], value["pitch_deg"], value["roll_deg"]
             place = value["lat_deg"], value["lon_deg"]
@@ -82,22 +91,8 @@ class Recorded:
         for begin_s, event in self._events:
             if begin_s > time_s:
                 break
-            named = {
-                "GNSS OFF": OFF,
-                "300 m east": SHIFTED,
-                "camera mirrored": MIRRORED,
-                "camera right": AFTER,
-                "GNSS ON": AFTER,
-            }
-            phase = next((to for text, to in named.items() if text in event), phase)
+            phase = next((to for text, to in PHASES.items() if text in event), phase)
         return phase
-
-    @cached_property
-    def gnss_off_s(self) -> tuple[float, float]:
-        """Begin and end of the time without GNSS."""
-        off = [time_s for time_s, event in self._events if "GNSS OFF" in event]
-        on = [time_s for time_s, event in self._events if "GNSS ON " in event]
-        return min(off, default=math.inf), min(on, default=math.inf)
 
     @cached_property
     def truth(self) -> tuple[Array, Array]:
@@ -132,11 +127,9 @@ class Recorded:
     ) -> Iterator[tuple[Exposure, View]]:
         """Exposures and their views. `rule`: sets the deviations of the telemetry, given whether
         GNSS is on."""
-        begin_s, end_s = self.gnss_off_s
         for exposure, telemetry in self.stated():
-            gnss = not begin_s <= exposure.time_s < end_s
             grey = _shown(demo, exposure, cache / self.folder.name)
-            yield exposure, View(grey, CAMERA, rule(telemetry, gnss))
+            yield exposure, View(grey, CAMERA, rule(telemetry, exposure.phase == ON))
 
 
 def _give(buffer: TelemetryBuffer, time_ns: int, value: dict[str, float]) -> None:

@@ -73,9 +73,12 @@ class Row:
     @property
     def is_wrong(self) -> bool:
         """Whether it was sent and is wrong."""
-        if not self.sent or self.cov_en_m2 is None:
-            return False
-        return self.error_m > max(FAR_M, FAR_STD * error_ellipse(self.cov_en_m2)[0])
+        return self.sent and is_wrong(self.error_m, self.cov_en_m2)
+
+
+def is_wrong(error_m: float, cov_en_m2: Array | None) -> bool:
+    """Whether a position with an error and a covariance (2, 2) is wrong."""
+    return cov_en_m2 is not None and error_m > max(FAR_M, FAR_STD * error_ellipse(cov_en_m2)[0])
 
 
 def stated(telemetry: Telemetry, gnss: bool) -> Telemetry:
@@ -120,9 +123,8 @@ def replay(
     rows, alone = [], 0
     for exposure, view in recorded.views(demo, work / "views", rule):
         alone += exposure.phase == OFF
-        if (views is not None and alone > views) or (
-            not disturbed and exposure.phase not in (ON, OFF)
-        ):
+        too_late = not disturbed and exposure.phase not in (ON, OFF)
+        if too_late or (views is not None and alone > views):
             break
         if view.telemetry.missing():
             continue

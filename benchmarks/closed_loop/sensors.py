@@ -52,7 +52,7 @@ class Instruments:
         self._rng, self.grade = rng, grade
         self._gyro = grade.gyro_bias * rng.normal(size=3)
         self._accel = grade.accel_bias * rng.normal(size=3)
-        self._baro = self._late = 0.0
+        self._baro = 0.0
         self._heading = grade.heading_bias * rng.normal(size=3)
         self._scale = 1 + grade.airspeed_scale * float(rng.normal())
         self._place = np.zeros(2)
