@@ -41,7 +41,9 @@ VIEW_STEPS, LATENCY_S = 10, 0.1
 """A view every 0.2 s; what it gives reaches the filter so late."""
 GRADES = {"px4": CONSUMER, "ardupilot": CALM}
 START_STD_M, PRIOR_STD_M = 30.0, 100.0
-"""Error of the position at a start without GNSS, and what the tracker is told of it."""
+"""Error of the position at a start without GNSS, and the deviation of every prior."""
+START_STD_MPS = {True: 3.0, False: 0.5}
+"""The same of the velocity; a vehicle without an airspeed hovers."""
 SETTLING_S = {True: 5.0, False: 15.0}
 Array = NDArray[np.float64]
 
@@ -291,7 +293,7 @@ def _direction(rng: np.random.Generator) -> Array:
 def _started(rng: np.random.Generator, aircraft: Vehicle, autopilot: str, gnss: bool) -> Filter:
     """A filter at the start: with GNSS, it knows position and velocity; without it, roughly."""
     truth = aircraft.motion
-    place_m, mps = (1.0, 0.3) if gnss else (START_STD_M, 3.0)
+    place_m, mps = (1.0, 0.3) if gnss else (START_STD_M, START_STD_MPS[aircraft.has_airspeed])
     tuning = FILTERS[autopilot]
     stds = np.repeat([0.03, mps, 1.0, 0.01, 0.2, 5.0], [3, 3, 3, 3, 3, 2])
     stds[6:8] = place_m
