@@ -88,6 +88,11 @@ class Filter:
     def _now(self) -> int:
         return self._steps + len(self._imu)
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether no position was accepted for a while."""
+        return (self._steps - self._fused_step) * STEP_S > self.tuning.reset_s
+
     def feel(self, measured: Increments) -> None:
         """Take the increments of one step, and move on by one once there are enough."""
         self._imu.append(measured)
@@ -166,7 +171,7 @@ class Filter:
         off = place_ne - self.motion.position[:2]
         spread = np.diag(self.covariance)[6:8] + std_m**2
         if (off**2 > self.tuning.gate**2 * spread).any():
-            if (self._steps - self._fused_step) * STEP_S > self.tuning.reset_s:
+            if self.is_alone:
                 self._reset(place_ne, std_m)
             return
         self._fused_step = self._steps

@@ -121,7 +121,7 @@ class Route:
     def __init__(self) -> None:
         self._leg = 0
 
-    def carrot_ne(self, place_ne: Array) -> Array:
+    def carrot_ne(self, place_ne: Array) -> Array | None:
         """North and east (2,) of it, by the estimated position."""
         count = len(ROUTE_EN_M)
         begin, end = ROUTE_EN_M[self._leg, ::-1], ROUTE_EN_M[(self._leg + 1) % count, ::-1]
@@ -255,7 +255,7 @@ def fly(
     aircraft: Vehicle = VEHICLES[vehicle](rng, place, 0.0)
     aircraft.step(wind.next())
     instruments = Instruments(rng, grade or GRADES[autopilot])
-    estimator = _started(rng, aircraft, autopilot, scenario.gnss_s > 0)
+    estimator = _started(rng, aircraft, instruments, autopilot, scenario.gnss_s > 0)
     sight = None
     if scenario.send is not None and demo is not None:
         sight = Sight(demo, scenario, rule, seed)
@@ -265,7 +265,10 @@ def fly(
         gnss = time_s < scenario.gnss_s
         if number % 2 == 0:
             estimate = estimator.output()
-            aircraft.steer(estimate, route.carrot_ne(estimate.position[:2]), AGL_M)
+            carrot_ne = route.carrot_ne(estimate.position[:2])
+            if estimator.is_alone and not aircraft.has_airspeed:
+                carrot_ne = None  # the failsafe of a vehicle that does not know its velocity
+            aircraft.steer(estimate, carrot_ne, AGL_M)
         if number % VIEW_STEPS == 0:
             truth = aircraft.motion
             claimed_m = math.sqrt(float(np.diag(estimator.covariance)[6:8].mean()))
@@ -290,13 +293,21 @@ def _direction(rng: np.random.Generator) -> Array:
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def _started(rng: np.random.Generator, aircraft: Vehicle, autopilot: str, gnss: bool) -> Filter:
+def _started(
+    rng: np.random.Generator,
+    aircraft: Vehicle,
+    instruments: Instruments,
+    autopilot: str,
+    gnss: bool,
+) -> Filter:
     """A filter at the start: with GNSS, it knows position and velocity; without it, roughly."""
     truth = aircraft.motion
     place_m, mps = (1.0, 0.3) if gnss else (START_STD_M, START_STD_MPS[aircraft.has_airspeed])
     tuning = FILTERS[autopilot]
     stds = np.repeat([0.03, mps, 1.0, 0.01, 0.2, 5.0], [3, 3, 3, 3, 3, 2])
     stds[6:8] = place_m
+    if not gnss:  # it was aligned while it stood
+        stds[:2], stds[9:12] = 0.015, 0.001
     assert len(stds) == STATES
     off = stds * rng.normal(size=STATES)
     tilted = about(0, off[0]) @ about(1, off[1]) @ about(2, off[2])
@@ -306,7 +317,10 @@ def _started(rng: np.random.Generator, aircraft: Vehicle, autopilot: str, gnss: 
         truth.velocity + off[3:6] * [1, 1, 0.1],
         tilted @ truth.rotation,
     )
-    return Filter(tuning, motion, stds)
+    made = Filter(tuning, motion, stds)
+    if not gnss:
+        made.gyro_bias = instruments.gyro_bias + off[9:12]
+    return made
 
 
 def _give(

@@ -154,8 +154,9 @@ class Plane:
         self._drift: Array | None = None
         self.motion = Motion(place_ned, np.zeros(3), np.eye(3))
 
-    def steer(self, estimate: Motion, carrot_ne: Array, height_m: float) -> None:
+    def steer(self, estimate: Motion, carrot_ne: Array | None, height_m: float) -> None:
         """Turn towards a point as L1 guidance does (Park, Deyst and How 2004)."""
+        assert carrot_ne is not None
         to, speed = carrot_ne - estimate.position[:2], estimate.velocity[:2]
         across = float(speed[0] * to[1] - speed[1] * to[0])
         lateral = 2 * across * float(np.hypot(*speed)) / max(float(to @ to), 1.0)
@@ -202,19 +203,24 @@ class Quad:
         self._shake = Wander(rng, self.SHAKE, 0.6)
         self.motion = Motion(place_ned, np.zeros(3), about(2, yaw))
 
-    def steer(self, estimate: Motion, carrot_ne: Array, height_m: float) -> None:
-        """Fly towards a point with the nose ahead: velocity, then tilt, each by the estimate."""
-        to = carrot_ne - estimate.position[:2]
+    def steer(self, estimate: Motion, carrot_ne: Array | None, height_m: float) -> None:
+        """Fly towards a point with the nose ahead: velocity, then tilt, each by the estimate.
+
+        Without a point it stays level.
+        """
+        level = carrot_ne is None
+        to = np.ones(2) if carrot_ne is None else carrot_ne - estimate.position[:2]
         wanted = to / max(float(np.hypot(*to)), 1.0) * self.SPEED_MPS
         off = wanted - estimate.velocity[:2]
-        self._pull = np.clip(self._pull + 0.02 * off * 2 * STEP_S / 0.04, -2.0, 2.0)
+        if not level:
+            self._pull = np.clip(self._pull + 0.02 * off, -2.0, 2.0)
         push = np.clip(0.8 * off, -3.0, 3.0) + self._pull
         yaw, pitch, roll = euler_rad(estimate.rotation)
         ahead = float(push @ [math.cos(yaw), math.sin(yaw)])
         right = float(push @ [-math.sin(yaw), math.cos(yaw)])
-        most = self.MOST_TILT
+        most = 0.0 if level else self.MOST_TILT
         to_pitch, to_roll = _clip(-ahead / G_MPS2, most), _clip(right / G_MPS2, most)
-        to_yaw = math.remainder(math.atan2(to[1], to[0]) - yaw, math.tau)
+        to_yaw = 0.0 if level else math.remainder(math.atan2(to[1], to[0]) - yaw, math.tau)
         self._wanted_rates = np.array(
             [(to_roll - roll) / 0.25, (to_pitch - pitch) / 0.25, _clip(to_yaw, 0.5)]
         )

@@ -50,7 +50,7 @@ class Instruments:
 
     def __init__(self, rng: np.random.Generator, grade: Grade) -> None:
         self._rng, self.grade = rng, grade
-        self._gyro = grade.gyro_bias * rng.normal(size=3)
+        self.gyro_bias = grade.gyro_bias * rng.normal(size=3)
         self._accel = grade.accel_bias * rng.normal(size=3)
         self._baro = 0.0
         self._heading = grade.heading_bias * rng.normal(size=3)
@@ -61,10 +61,10 @@ class Instruments:
         """Increments as measured."""
         grade, kept = self.grade, math.exp(-STEP_S / self.grade.bias_s)
         fresh = math.sqrt(1 - kept**2)
-        self._gyro = kept * self._gyro + fresh * grade.gyro_bias * self._rng.normal(size=3)
+        self.gyro_bias = kept * self.gyro_bias + fresh * grade.gyro_bias * self._rng.normal(size=3)
         self._accel = kept * self._accel + fresh * grade.accel_bias * self._rng.normal(size=3)
         noise = math.sqrt(STEP_S) * self._rng.normal(size=(2, 3))
-        turn = felt.turn + self._gyro * STEP_S + grade.gyro_noise * noise[0]
+        turn = felt.turn + self.gyro_bias * STEP_S + grade.gyro_noise * noise[0]
         push = felt.push + self._accel * STEP_S + grade.accel_noise * noise[1]
         return Increments(turn, push)
 
