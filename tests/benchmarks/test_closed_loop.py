@@ -12,7 +12,9 @@ from benchmarks.closed_loop.physics import (
     integrated,
 )
 from benchmarks.closed_loop.replays import plain
-from benchmarks.closed_loop.sensors import PERFECT
+from benchmarks.closed_loop.sensors import Grade
+
+PERFECT = Grade(*(0.0,) * 4, 90.0, *(0.0,) * 8)
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
