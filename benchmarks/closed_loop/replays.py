@@ -4,6 +4,7 @@ The autopilot flew on what orthonav 2bf6196 sent, so its errors of attitude and 
 of a closed loop; what is located now is not fed back.
 """
 
+import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +31,17 @@ GNSS_TILT_STD_DEG = 1.5
 ALONE_TILT_STD_DEG, ALONE_VEL_STD_MPS = 3.0, 5.0
 """Stated deviations of the telemetry while GNSS aids the autopilot, and while it does not."""
 HEADER = (
-    *("flight", "method", "views", "median m", "95 % m", "NEES", "confident", "tracking"),
+    *(
+        "flight",
+        "method",
+        "views",
+        "tilt deg",
+        "median m",
+        "95 % m",
+        "NEES",
+        "confident",
+        "tracking",
+    ),
     *("velocity m/s", "300 m east", "mirrored"),
 )
 Array = NDArray[np.float64]
@@ -192,6 +203,7 @@ def _cells(rows: Sequence[Row]) -> list[str]:
         rows[0].flight,
         rows[0].method,
         str(len(alone)),
+        number(math.sqrt(float(np.mean([np.square(row.tilt_off_deg).sum() for row in alone])))),
         number(float(np.median(errors))),
         number(float(np.percentile(errors, 95))),
         number(float(np.mean([row.nees for row in good] or [np.nan]))),
@@ -208,7 +220,8 @@ def table(rows: Sequence[Row]) -> Table:
     cells = [_cells([row for row in rows if (row.flight, row.method) == key]) for key in keys]
     notes = (
         "errors of confident single views, and of tracked views in the state tracking, while GNSS "
-        "is off and before any disturbance; NEES: mean, 2 is right; velocity: median error",
+        "is off and before any disturbance; NEES: mean, 2 is right; velocity: median error; tilt: "
+        "error of the telemetry, RMS",
         "300 m east, mirrored: wrong positions that the gate admits, of all views while the camera "
         f"is so disturbed; wrong: more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )

@@ -42,7 +42,6 @@ CONSUMER = Grade()
 """Uncalibrated consumer MEMS in an aircraft that vibrates."""
 CALM = Grade(gyro_noise=1e-4, accel_noise=0.005, gyro_bias=math.radians(0.01), accel_bias=0.015)
 """Calibrated for temperature and well damped, as those of ArduPilot's simulator."""
-PERFECT = Grade(*(0.0,) * 4, 90.0, *(0.0,) * 8)
 
 
 class Instruments:

@@ -21,8 +21,13 @@ STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 GROUND_STEP_M = 2.0
 """The same of a point along the ground: about the noise of a terrain model over its slope."""
 BLURS_PX = (2.0, 1.0, 0.7, 0.0, 0.0, 0.0)
-"""Gaussian blur of the correlations at each step: wide peaks first, so that a view off by several
-pixels is not caught by chance."""
+"""Gaussian blur of the correlations at each step of an ascent from no correction: wide peaks first,
+so that a view off by several pixels is not caught by chance."""
+SHARP_PX = (0.7, 0.0, 0.0)
+"""The same from a correction by the peaks of `SAMPLE` blocks."""
+SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
+"""So many such corrections are tried, where the blocks' own peaks are known to so many pixels: a
+view can be off by more than an ascent overcomes (RANSAC, Fischler and Bolles 1981)."""
 FINAL_STEPS = 3
 """Steps after the information of the blocks was compared with the scatter of their slopes."""
 LONGEST_STEP_PX = 3.0
@@ -67,9 +72,12 @@ def resected(
     if blocks is None:
         return None
     mean, information = prior
-    correction = np.zeros(6)
-    for blur_px in BLURS_PX:
-        correction = blocks.stepped(correction, blur_px, 1.0, mean, information)
+    sampled = blocks.best(blocks.sampled(prior), prior)
+    ascents = [
+        blocks.climbed(np.zeros(6), BLURS_PX, mean, information),
+        blocks.climbed(sampled, SHARP_PX, mean, information),
+    ]
+    correction = blocks.best(np.stack(ascents), prior)
     curvature, slopes = blocks.system(correction)
     inverse = np.linalg.pinv(curvature, hermitian=True)
     spread = slopes.T @ slopes * (len(slopes) / max(len(slopes) - 6, 1))
@@ -108,6 +116,57 @@ class _Blocks:
         moved = np.where(known[:, None, None], moved, 0.0)
         return cls(len(seen), correlations, pixels, moved)
 
+    def sampled(self, prior: tuple[Array, Array]) -> Array:
+        """Corrections (S, 6) by the peaks of a few blocks each, chosen by how high these are."""
+        mean, information = prior
+        count, side = len(self.pixels), self.correlations.shape[1]
+        flat = self.correlations.reshape(count, -1)
+        highest = flat.argmax(axis=1)
+        peaks_px = np.stack([highest % side, highest // side], axis=-1) - side // 2
+        height = np.maximum(flat.max(axis=1), 0.0)
+        with np.errstate(divide="ignore"):
+            chance = np.log(self._weights(self._usual(height)) * height)
+        drawn = np.random.default_rng(0).gumbel(size=(SAMPLES, count)) + chance
+        chosen = np.argpartition(-drawn, SAMPLE, axis=1)[:, :SAMPLE]
+        moved = self.moved[chosen].reshape(SAMPLES, 2 * SAMPLE, 6)
+        peaks = peaks_px[chosen].reshape(SAMPLES, 2 * SAMPLE)
+        known = moved.swapaxes(1, 2) / SAMPLE_STD_PX**2
+        right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
+        return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
+
+    def climbed(
+        self, start: Array, blurs_px: Sequence[float], mean: Array, information: Array
+    ) -> Array:
+        """A maximum of the posterior near a correction."""
+        correction = start
+        for blur_px in blurs_px:
+            correction = self.stepped(correction, blur_px, 1.0, mean, information)
+        return correction
+
+    def best(self, corrections: Array, prior: tuple[Array, Array]) -> Array:
+        """The one of corrections (S, 6) with the highest posterior."""
+        mean, information = prior
+        moved = np.einsum("nip,sp->sni", self.moved, corrections)
+        surfaces = np.broadcast_to(self.correlations, (len(moved), *self.correlations.shape))
+        here = _values(surfaces, moved)
+        usual = np.max([self._usual(each) for each in here], axis=0)
+        fit = np.logaddexp(0.0, self._weights(usual) * (here - usual / 2)).sum(axis=1) / CORRELATED
+        off = corrections - mean
+        prior_nats = np.einsum("sp,pq,sq->s", off, information, off) / 2
+        return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
+
+    def _usual(self, correlations: Array) -> Array:
+        """Correlation (L * N,) that a right block is expected to have: the mean of its level."""
+        weighted = (correlations * self.pixels).reshape(self.levels, -1).sum(axis=1)
+        pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
+        usual = np.clip(weighted / np.maximum(pixels, 1.0), LEAST_CORRELATION, MOST_CORRELATION)
+        return np.repeat(usual, len(self.pixels) // self.levels)
+
+    def _weights(self, usual: Array) -> Array:
+        """Log likelihood ratio (L * N,) of blocks, per unit of their correlation, between a pair of
+        Gaussians of the `usual` correlation and of none."""
+        return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
+
     def stepped(
         self, correction: Array, blur_px: float, excess: float, mean: Array, information: Array
     ) -> Array:
@@ -124,15 +183,10 @@ class _Blocks:
         here, slope, curvature = _quadratic(
             _blurred(self.correlations, blur_px), self.moved @ correction
         )
-        by_level = (here * self.pixels).reshape(self.levels, -1).sum(axis=1)
-        pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
-        usual = by_level / np.maximum(pixels, 1.0)
-        usual = np.clip(usual, LEAST_CORRELATION, MOST_CORRELATION)
-        usual = np.repeat(usual, len(here) // self.levels)
-        # Log likelihood of a pair of Gaussians of this correlation, per unit of the measured one.
-        weight = usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
+        usual = self._usual(here)
+        weight = self._weights(usual)
         odds = np.clip(weight * (here - usual / 2), -30.0, 30.0)
-        weight /= 1 + np.exp(-odds)
+        weight = weight / (1 + np.exp(-odds))
         terms = np.einsum("nip,ni->np", self.moved, slope * weight[:, None])
         held = curvature * weight[:, None, None]
         total = np.einsum("nip,nij,njq->pq", self.moved, held, self.moved)
@@ -150,10 +204,10 @@ def _blurred(correlations: Array, blur_px: float) -> Array:
 
 
 def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
-    """Surfaces (N, S, S) at displacements (N, 2), x and y: their values (N,) at the nearest pixel,
-    slopes (N, 2) and curvatures (N, 2, 2), not negative.
+    """Surfaces (N, S, S) at displacements (N, 2), x and y: their values (N,), slopes (N, 2) and
+    curvatures (N, 2, 2), not negative.
 
-    By the quadratic through the pixels around; beyond the surface slope and curvature are 0.
+    By the quadratic through the pixels around; beyond the surface all are 0.
     """
     reach = surfaces.shape[1] // 2
     inside = (np.abs(moved_px) <= reach).all(axis=1)
@@ -171,8 +225,20 @@ def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
     down = 2 * here - at(0, 1) - at(0, -1)
     across = (at(1, -1) + at(-1, 1) - at(1, 1) - at(-1, -1)) / 4
     curvature = np.stack([along, across, across, down], axis=-1).reshape(-1, 2, 2)
-    slope = slope - np.einsum("nij,nj->ni", curvature, np.clip(moved_px - nearest, -1.0, 1.0))
-    return here, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
+    off = np.clip(moved_px - nearest, -1.0, 1.0)
+    bent = np.einsum("nij,nj->ni", curvature, off)
+    value = here + np.einsum("ni,ni->n", slope - bent / 2, off)
+    slope = slope - bent
+    return value * inside, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
+
+
+def _values(surfaces: Array, moved_px: Array) -> Array:
+    """Values (..) of surfaces (.., S, S) at the pixel nearest to displacements (.., 2), else 0."""
+    reach = surfaces.shape[-1] // 2
+    nearest = np.rint(np.clip(moved_px, -reach, reach)).astype(int) + reach
+    index = np.indices(surfaces.shape[:-2])
+    values = surfaces[(*index, nearest[..., 1], nearest[..., 0])]
+    return np.asarray(values * (np.abs(moved_px) <= reach).all(axis=-1))
 
 
 def _positive(matrices: Array) -> Array:
