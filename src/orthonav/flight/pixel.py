@@ -1,10 +1,10 @@
 """Where on the ground a pixel of a placed view lies, with its covariance.
 
-A fix that states position, height and attitude with their covariance (`Fix.pose_cov`) moves a pixel
-by all six. Of other fixes errors are taken as independent, and registration places the ground that a
-view shows: errors of heading, height and tilt move a pixel by what they change between the middle of
-the view and the pixel. Fixes of a track, and those that do not say how well the middle of their view
-is known (`middle_std_m`), are positions of the camera: all its errors count.
+Where a fix states the covariance of position, height and attitude together (`Fix.pose_cov`), all six
+move the pixel. Errors of other fixes are taken as independent. Registration places the ground that
+a view shows, so errors of heading, height and tilt move a pixel by what they change between the
+middle of the view and the pixel. Fixes of a track, and those that do not say how well the middle of
+their view is known (`middle_std_m`), are positions of the camera: all its errors count.
 """
 
 import math
@@ -96,14 +96,7 @@ def locate_pixel(
 
 def _camera(telemetry: Telemetry, fix: Fix) -> Array:
     """The camera (6,): metres east, north and up of its fix, heading, pitch and roll in degrees."""
-    tilt = [
-        stated if math.isfinite(stated) else reported + fix.evidence.get(bias, 0.0)
-        for stated, reported, bias in (
-            (fix.pitch_deg, telemetry.pitch_deg, "pitch_bias_deg"),
-            (fix.roll_deg, telemetry.roll_deg, "roll_bias_deg"),
-        )
-    ]
-    return np.array([0.0, 0.0, fix.agl_m, fix.heading_deg, *tilt])
+    return np.array([0.0, 0.0, fix.agl_m, fix.heading_deg, *fix.tilt_deg(telemetry)])
 
 
 def _stds(telemetry: Telemetry, fix: Fix) -> Array:
