@@ -171,9 +171,10 @@ def _pose_values(fix: Fix) -> dict[str, Any]:
     angles = _or_none(fix.pitch_deg), _or_none(fix.roll_deg)
     if fix.pose_cov is None and angles == (None, None):
         return {}
-    upper = None if fix.pose_cov is None else fix.pose_cov[np.triu_indices(6)]
-    known = upper is not None and np.isfinite(upper).all()
-    return dict(zip(POSE_KEYS, (*angles, upper.tolist() if known else None), strict=True))
+    upper = None
+    if fix.pose_cov is not None and np.isfinite(fix.pose_cov).all():
+        upper = fix.pose_cov[np.triu_indices(6)].tolist()
+    return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
 
 
 def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:

@@ -1,7 +1,7 @@
 """Where on the ground a pixel of a placed view lies, with its covariance.
 
-Where a fix states the covariance of position, height and attitude together (`Fix.pose_cov`), all six
-move the pixel. Errors of other fixes are taken as independent. Registration places the ground that
+Where a fix states the covariance of position, height and attitude together (`Fix.pose_cov`), all
+six move the pixel. Errors of other fixes are taken as independent. Registration places the ground that
 a view shows, so errors of heading, height and tilt move a pixel by what they change between the
 middle of the view and the pixel. Fixes of a track, and those that do not say how well the middle of
 their view is known (`middle_std_m`), are positions of the camera: all its errors count.
@@ -57,7 +57,8 @@ def locate_pixel(
 ) -> GroundPoint:
     """The ground at image coordinates `px` (x, y; 0, 0 is the corner) of a view with a fix.
 
-    `telemetry`: of the view; it gives pitch and roll where the fix does not. Without `terrain` the ground is level.
+    `telemetry`: of the view; it gives pitch and roll where the fix does not. Without
+    `terrain` the ground is level.
     Raises `FlightError` where the pixel is outside the picture or shows no ground that is known.
     """
     if not (0 <= px[0] <= camera.width_px and 0 <= px[1] <= camera.height_px):
@@ -128,7 +129,8 @@ def _ground(camera: Camera, px: tuple[float, float], values: Array, relief: Reli
     without any."""
     place, up_m = values[:2], float(values[2])
     # Offset for each metre that the line of sight descends.
-    slope = ground_en_m(camera, np.array([px]), *values[3:].tolist(), 1.0)[0]
+    yaw_deg, pitch_deg, roll_deg = values[3:].tolist()
+    slope = ground_en_m(camera, np.array([px]), yaw_deg, pitch_deg, roll_deg, 1.0)[0]
     if relief is None:
         return np.asarray(place + slope * up_m)
     return np.asarray(place + sight_on_ground(slope, up_m, lambda each: relief(each + place)))
