@@ -38,8 +38,10 @@ def error(localizer, fix, place, attitude, agl_m):
 
 @pytest.fixture(scope="module")
 def tilted(localizer):
-    """Fixes of views tilted by 4 deg to all sides and reported level, and their errors. The views are
-    unevenly lit, and the ground has changed: blots of several pixels were added to it."""
+    """Fixes of views tilted by 4 deg to all sides and reported level, and their errors.
+
+    The views are unevenly lit, and the ground has changed: blots of several pixels were added.
+    """
     rng, found = np.random.default_rng(3), []
     for number in range(VIEWS):
         place, agl_m = rng.uniform(-140, 140, 2), AGL_M * rng.uniform(0.9, 1.1)
@@ -68,8 +70,8 @@ def test_unreported_tilt_is_found(tilted):
 
 
 def test_covariances_are_consistent(tilted):
-    """Squares of normalized errors are below 1 on average: errors of other dates are more alike from
-    block to block than those of blots, and covariances are made for them."""
+    """Squares of normalized errors are below 1 on average: covariances are made for other dates,
+    whose errors are more alike from block to block than those of blots."""
     place = [off[:2] @ np.linalg.solve(fix.cov_en_m2, off[:2]) / 2 for fix, off, _ in tilted]
     whole = [off @ np.linalg.solve(fix.pose_cov, off) / 6 for fix, off, _ in tilted]
     assert 0.25 < np.mean(place) < 3 and 0.25 < np.mean(whole) < 3

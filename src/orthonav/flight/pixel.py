@@ -1,10 +1,10 @@
 """Where on the ground a pixel of a placed view lies, with its covariance.
 
 Where a fix states the covariance of position, height and attitude together (`Fix.pose_cov`), all
-six move the pixel. Errors of other fixes are taken as independent. Registration places the ground that
-a view shows, so errors of heading, height and tilt move a pixel by what they change between the
-middle of the view and the pixel. Fixes of a track, and those that do not say how well the middle of
-their view is known (`middle_std_m`), are positions of the camera: all its errors count.
+six move the pixel. Errors of other fixes are taken as independent. Registration places the ground
+that a view shows, so errors of heading, height and tilt move a pixel by what they change between
+the middle of the view and the pixel. Fixes of a track, and those that do not say how well the
+middle of their view is known (`middle_std_m`), are positions of the camera: all its errors count.
 """
 
 import math
