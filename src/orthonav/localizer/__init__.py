@@ -12,10 +12,10 @@
 4. Candidates are refined from coarse to fine, the best is compared with its strongest rival
    (`orthonav.register.registrar`); the search ends as soon as the best stands out. On a map with a
    terrain the best are orthorectified on it first (`relief`, `orthorectify`).
-5. Position, height, heading, pitch and roll are fitted to the blocks of the view there, the reported
-   ones being a prior (`camera`, `resection`); with them comes their covariance.
-6. The evidence becomes a confidence (`orthonav.confidence`): that the place is right, times that the
-   error of the camera is small.
+5. Position, height, heading, pitch and roll are fitted to the blocks of the view there, with the
+   reported ones as a prior (`camera`, `resection`). That gives their covariance too.
+6. The evidence becomes a confidence (`orthonav.confidence`): that the place is right, times that
+   the error of the camera is small.
 
 Where a map has no registration layer, or with `registration=False`, `tiles.TileLocalizer` takes the
 place of steps 2 to 6: the view is embedded under a few headings and put on the most similar tile.
