@@ -79,9 +79,6 @@ class Model:
     """Of the disagreement of two dates beyond the covariance of a registration, per axis."""
     map_m: float = MAP_STD_M
     """Of a displacement of the map as a whole, per axis: added to the covariance of a fix."""
-    sighting_growth: float = 2.0
-    """Factor on the position covariance of a registration, its part due to tilt excepted
-    (docs/decisions/tracking.md, 10)."""
     bias_jump: float = 0.01
     """Probability, per view, of a bias jump of heading, scale and tilt: a gimbal that moved (by
     `off_tilt_rad`), a compass that was reset."""
@@ -167,9 +164,6 @@ def measurement(
     (6, 6): of the errors of map and view, and of the telemetry noise, which is independent at every
     view."""
     noise = sighting.covariance.copy()
-    tilt = slice(4, 6)
-    by_tilt = noise[:2, tilt] @ np.linalg.solve(noise[tilt, tilt], noise[tilt, :2])
-    noise[:2, :2] += (model.sighting_growth - 1) * (noise[:2, :2] - by_tilt)
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)
     horizon = model.horizon_rad if reported.horizon_rad is None else reported.horizon_rad
