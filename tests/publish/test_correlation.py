@@ -13,7 +13,6 @@ from orthonav.publish.correlation import (
     AVERAGING_S,
     FilterCovariance,
     for_filter,
-    least_std_m,
     messages_averaged,
 )
 from orthonav.publish.estimate import NavigationEstimate, error_ellipse
@@ -59,13 +58,8 @@ def test_the_information_does_not_depend_on_the_rate(steps_s: list[float]) -> No
 
 def test_what_does_not_average_out_is_a_floor() -> None:
     narrow = replace(ESTIMATE, cov_en_m2=np.eye(2) * 0.01)
-    assert least_std_m(narrow) == MAP_STD_M
-    tilted = replace(narrow, agl_m=1000.0, tilt_std_deg=0.5)
-    assert least_std_m(tilted) == pytest.approx(math.hypot(MAP_STD_M, 8.727), rel=1e-3)
-    for estimate in (narrow, tilted):
-        std_m = for_filter(estimate, math.inf).horizontal_std_m()
-        assert std_m == pytest.approx(least_std_m(estimate))
-    assert for_filter(tilted, math.inf, min_std_m=20.0).horizontal_std_m() == pytest.approx(20.0)
+    assert for_filter(narrow, math.inf).horizontal_std_m() == pytest.approx(MAP_STD_M)
+    assert for_filter(narrow, math.inf, min_std_m=20.0).horizontal_std_m() == pytest.approx(20.0)
 
 
 def test_everything_else_stays() -> None:

@@ -21,7 +21,7 @@ Where a map has no registration layer, or with `registration=False`, `tiles.Tile
 place of steps 2 to 6: the view is embedded under a few headings and put on the most similar tile.
 
 `tracker.Tracker` places the views of a flight one after another: `registration` gives it candidate
-places, `tilt` their pitch and roll from perspective, `odometry` the displacement between views, and
+places, `camera` their pitch and roll, `odometry` the displacement between views, and
 `orthonav.track` joins all of it to one track.
 """
 

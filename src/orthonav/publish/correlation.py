@@ -1,7 +1,7 @@
 """Covariance for receivers that fuse positions as if their errors were independent.
 
 The errors of consecutive fixes are nearly the same: the displacement of the map, the tilt of the
-mount and the memory of the track last longer than a receiver averages. A receiver that takes n such
+camera and the memory of the track last longer than a receiver averages. A receiver that takes n such
 fixes as independent claims n times too small a variance. Each message is therefore given the
 variance of the fix times the number of messages that the receiver averages, so that its claim is
 the variance of the fix (docs/decisions/correlated-errors.md).
@@ -32,28 +32,19 @@ def messages_averaged(std_m: float, interval_s: float) -> float:
     return max(AVERAGING_S * math.pow(std_m / AT_STD_M, EXPONENT) / interval_s, 1.0)
 
 
-def least_std_m(estimate: NavigationEstimate) -> float:
-    """Standard deviation of the error that does not average out, m.
-
-    It is that of the map's displacement and of the estimated tilt of the mount over the height, as
-    far as these are known.
-    """
-    tilt_m = estimate.agl_m * math.tan(math.radians(estimate.tilt_std_deg))
-    return math.hypot(MAP_STD_M, tilt_m) if math.isfinite(tilt_m) else MAP_STD_M
-
-
 def for_filter(
     estimate: NavigationEstimate, interval_s: float, min_std_m: float = 0.0
 ) -> NavigationEstimate:
     """The estimate with the covariance that makes the claim of a receiving filter right.
 
     `interval_s`: time since the message before, see `messages_averaged`. `min_std_m`: lower bound
-    of the standard deviation of the fix, in addition to `least_std_m`. An invalid covariance stays
+    of the standard deviation of the fix, at least that of the map's displacement, which does not
+    average out. An invalid covariance stays
     as it is.
     """
     if math.isnan(estimate.horizontal_std_m()):
         return estimate
-    cov = floored(estimate.cov_en_m2, max(least_std_m(estimate), min_std_m))
+    cov = floored(estimate.cov_en_m2, max(MAP_STD_M, min_std_m))
     count = messages_averaged(error_ellipse(cov)[0], interval_s)
     return replace(estimate, cov_en_m2=cov * count)
 

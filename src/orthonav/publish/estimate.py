@@ -42,9 +42,7 @@ class NavigationEstimate:
     `confidence`: probability (0 to 1) that the fix is correct; NaN: not known.
     `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
     `processing_s`: time from exposure until the message is sent.
-    `agl_m`: height above ground; NaN where not known, as the next four.
-    `tilt_std_deg`: standard deviation of the estimated tilt of the camera mount, the larger of
-    pitch and roll.
+    `agl_m`: height above ground; NaN where not known, as the next three.
     `alt_amsl_m`, `alt_std_m`: altitude above mean sea level and its standard deviation.
     `heading_deg`: heading of the top of the image, clockwise from true north.
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
@@ -64,7 +62,6 @@ class NavigationEstimate:
     boot_ns: int | None = None
     processing_s: float = 0.0
     agl_m: float = math.nan
-    tilt_std_deg: float = math.nan
     alt_amsl_m: float = math.nan
     alt_std_m: float = math.nan
     vel_en_mps: tuple[float, float] | None = None
@@ -162,7 +159,6 @@ def estimate_from_result(
         boot_ns=boot_ns,
         processing_s=processing_s,
         agl_m=fix.agl_m,
-        tilt_std_deg=_tilt_std_deg(fix),
         alt_amsl_m=alt_amsl_m,
         alt_std_m=alt_std_m,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
@@ -223,11 +219,6 @@ def _both_clocks(
     if clock is Clock.UTC:
         return time_ns, None if utc_minus_boot_ns is None else time_ns - utc_minus_boot_ns
     return None if utc_minus_boot_ns is None else time_ns + utc_minus_boot_ns, time_ns
-
-
-def _tilt_std_deg(fix: Fix) -> float:
-    names = ("pitch_bias_std_deg", "roll_bias_std_deg")
-    return float(np.max([fix.evidence.get(name, math.nan) for name in names]))
 
 
 def _velocity(fix: Fix) -> tuple[float, float] | None:
