@@ -1,8 +1,8 @@
 """Covariance for receivers that fuse positions as if their errors were independent.
 
 The errors of consecutive fixes are nearly the same: the displacement of the map, the tilt of the
-camera and the memory of the track last longer than a receiver averages. A receiver that takes n such
-fixes as independent claims n times too small a variance. Each message is therefore given the
+camera and the memory of the track last longer than a receiver averages. A receiver that takes n
+such fixes as independent claims n times too small a variance. Each message is therefore given the
 variance of the fix times the number of messages that the receiver averages, so that its claim is
 the variance of the fix (docs/decisions/correlated-errors.md).
 """

@@ -96,9 +96,9 @@ def recognition(
     """Probabilities (K,) that a view showed the map, given its place and predictions of that.
 
     `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The
-    odds by the view alone, times the likelihood ratio of the innovations (K, 6) in position, heading and scale
-    between a right place and one that chance finds in the area searched. A place within the gate is
-    never less likely for its distance.
+    odds by the view alone, times the likelihood ratio of the innovations (K, 6) in position,
+    heading and scale between a right place and one that chance finds in the area searched. A place
+    within the gate is never less likely for its distance.
     """
     spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
     ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
