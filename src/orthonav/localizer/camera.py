@@ -18,12 +18,12 @@ from orthonav.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.register.blocks import block_scores
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
-from orthonav.register.template import ViewTemplates
+from orthonav.register.template import BLOCKS, ViewTemplates
 
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Blocks are moved so far, pixels of each level, by the first fit and by those after it. 7 px of
 the final level are what 10 deg of tilt make at the rim of a view 65 deg wide."""
-FITS = 3
+FITS = 2
 """The view is fitted at most so many times,"""
 SETTLED = 0.2
 """until a correction is below this share of its standard deviations."""
@@ -110,6 +110,8 @@ def _fitted(
     return resected(
         [(each, moved_px / 2.0**level) for each, level in zip(blocks, levels, strict=True)],
         _prior(seen, pose, orientation),
+        block_px=seen.view.side_px / BLOCKS,
+        close=not first,
     )
 
 

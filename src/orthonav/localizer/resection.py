@@ -20,15 +20,15 @@ STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Steps of the numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
 GROUND_STEP_M = 2.0
 """The same of a point along the ground: about the noise of a terrain model over its slope."""
-BLURS_PX = (2.0, 1.0, 0.7, 0.0, 0.0, 0.0)
+BLURS_PX = (2.0, 1.0, 0.0, 0.0)
 """Gaussian blur of the correlations at each step of an ascent from no correction: wide peaks first,
 so that a view off by several pixels is not caught by chance."""
-SHARP_PX = (0.7, 0.0, 0.0)
-"""The same from a correction by the peaks of `SAMPLE` blocks."""
+SHARP_PX = (0.7, 0.0)
+"""The same from a correction by the peaks of `SAMPLE` blocks, or from one close by."""
 SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
 """So many such corrections are tried, where the blocks' own peaks are known to so many pixels: a
 view can be off by more than an ascent overcomes (RANSAC, Fischler and Bolles 1981)."""
-FINAL_STEPS = 3
+FINAL_STEPS = 2
 """Steps after the information of the blocks was compared with the scatter of their slopes."""
 LONGEST_STEP_PX = 3.0
 """A step moves no block farther."""
@@ -36,9 +36,10 @@ PIXELS_PER_NUMBER = 5.0
 """Pixels that hold one independent number. Only the odds of outliers depend on it."""
 LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9
 """Limits of the mean correlation that a right block is expected to have."""
-CORRELATED = 3.5
-"""Errors of neighbouring blocks, of levels and of dates are not independent: the variance is so
-many times what the scatter between blocks implies (docs/decisions/camera.md)."""
+CORRELATED, CORRELATED_PX = 2.0, 60.0
+"""Errors of levels and of dates are not independent: the variance is at least so many times what
+the scatter between blocks implies, and more where blocks are smaller than what their errors reach
+over, in pixels of the map (docs/decisions/camera.md)."""
 MIN_BLOCKS = 8
 """Fewer blocks do not show an attitude."""
 WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
@@ -59,31 +60,36 @@ class Resection:
 
 
 def resected(
-    seen: Sequence[tuple[BlockScores, Array]], prior: tuple[Array, Array]
+    seen: Sequence[tuple[BlockScores, Array]],
+    prior: tuple[Array, Array],
+    *,
+    block_px: float,
+    close: bool = False,
 ) -> Resection | None:
     """The camera under which the blocks of a view fit the map best.
 
     `seen`: for each level of the map, all with the same reach, the blocks, and how far (N, 2, 6)
     what they show moves over the window by metres and degrees of the camera, pixels of the level
-    right and down. `prior`: expected correction (6,) and its information (6, 6). None where too few
-    blocks are seen.
+    right and down. `prior`: expected correction (6,) and its information (6, 6). `block_px`:
+    side of a block, pixels of level 0. `close`: whether the camera is known to a pixel or two. None
+    where too few blocks are seen.
     """
-    blocks = _Blocks.of(seen)
+    correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
+    blocks = _Blocks.of(seen, correlated)
     if blocks is None:
         return None
-    mean, information = prior
-    sampled = blocks.best(blocks.sampled(prior), prior)
-    ascents = [
-        blocks.climbed(np.zeros(6), BLURS_PX, mean, information),
-        blocks.climbed(sampled, SHARP_PX, mean, information),
-    ]
-    correction = blocks.best(np.stack(ascents), prior)
+    correction = blocks.climbed(np.zeros(6), SHARP_PX if close else BLURS_PX, prior)
+    if not close:
+        sampled = blocks.best(blocks.sampled(prior), prior)
+        ascents = [correction, blocks.climbed(sampled, SHARP_PX, prior)]
+        correction = blocks.best(np.stack(ascents), prior)
     curvature, slopes = blocks.system(correction)
     inverse = np.linalg.pinv(curvature, hermitian=True)
     spread = slopes.T @ slopes * (len(slopes) / max(len(slopes) - 6, 1))
-    excess = max(1.0, CORRELATED * float(np.trace(inverse @ spread)) / 6)
+    excess = max(1.0, correlated * float(np.trace(inverse @ spread)) / 6)
     for _ in range(FINAL_STEPS):
-        correction = blocks.stepped(correction, 0.0, excess, mean, information)
+        correction = blocks.stepped(correction, 0.0, excess, prior)
+    mean, information = prior
     curvature = blocks.system(correction)[0] / excess
     covariance = np.linalg.inv(curvature + information)
     # Without the telemetry's share: where the quadratic of the blocks alone has its peak.
@@ -99,15 +105,16 @@ def resected(
 @dataclass(frozen=True, eq=False)
 class _Blocks:
     """Blocks (L * N) of all levels: correlations (L * N, S, S), pixels (L * N,), and their moves
-    (L * N, 2, 6) by the camera."""
+    (L * N, 2, 6) by the camera. `correlated`: see `CORRELATED`."""
 
     levels: int
+    correlated: float
     correlations: Array
     pixels: Array
     moved: Array
 
     @classmethod
-    def of(cls, seen: Sequence[tuple[BlockScores, Array]]) -> "_Blocks | None":
+    def of(cls, seen: Sequence[tuple[BlockScores, Array]], correlated: float) -> "_Blocks | None":
         """None where fewer than `MIN_BLOCKS` count at every level."""
         moved = np.concatenate([each for _, each in seen])
         known = np.isfinite(moved).all(axis=(1, 2))
@@ -116,7 +123,7 @@ class _Blocks:
             return None
         correlations = np.concatenate([scores.correlations for scores, _ in seen])
         moved = np.where(known[:, None, None], moved, 0.0)
-        return cls(len(seen), correlations, pixels, moved)
+        return cls(len(seen), correlated, correlations, pixels, moved)
 
     def sampled(self, prior: tuple[Array, Array]) -> Array:
         """Corrections (S, 6) by the peaks of a few blocks each, chosen by how high these are."""
@@ -136,33 +143,35 @@ class _Blocks:
         right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
         return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
 
-    def climbed(
-        self, start: Array, blurs_px: Sequence[float], mean: Array, information: Array
-    ) -> Array:
+    def climbed(self, start: Array, blurs_px: Sequence[float], prior: tuple[Array, Array]) -> Array:
         """A maximum of the posterior near a correction."""
         correction = start
         for blur_px in blurs_px:
-            correction = self.stepped(correction, blur_px, 1.0, mean, information)
+            correction = self.stepped(correction, blur_px, 1.0, prior)
         return correction
 
     def best(self, corrections: Array, prior: tuple[Array, Array]) -> Array:
         """The one of corrections (S, 6) with the highest posterior."""
         mean, information = prior
-        moved = np.einsum("nip,sp->sni", self.moved, corrections)
-        surfaces = np.broadcast_to(self.correlations, (len(moved), *self.correlations.shape))
-        here = _values(surfaces, moved)
-        usual = np.max([self._usual(each) for each in here], axis=0)
-        fit = np.logaddexp(0.0, self._weights(usual) * (here - usual / 2)).sum(axis=1) / CORRELATED
+        moved = (self.moved.reshape(-1, 6) @ corrections.T).T.reshape(len(corrections), -1, 2)
+        here = _values(self.correlations, moved)
+        usual = self._usual(here).max(axis=0)
+        fit = (
+            np.logaddexp(0.0, self._weights(usual) * (here - usual / 2)).sum(axis=1)
+            / self.correlated
+        )
         off = corrections - mean
         prior_nats = np.einsum("sp,pq,sq->s", off, information, off) / 2
         return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
 
     def _usual(self, correlations: Array) -> Array:
-        """Correlation (L * N,) that a right block is expected to have: the mean of its level."""
-        weighted = (correlations * self.pixels).reshape(self.levels, -1).sum(axis=1)
+        """Correlation (.., L * N) that a right block is expected to have: the mean of its level."""
+        by_level = (*correlations.shape[:-1], self.levels, -1)
+        weighted = (correlations * self.pixels).reshape(by_level).sum(axis=-1)
         pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
-        usual = np.clip(weighted / np.maximum(pixels, 1.0), LEAST_CORRELATION, MOST_CORRELATION)
-        return np.repeat(usual, len(self.pixels) // self.levels)
+        usual = weighted / np.maximum(pixels, 1.0)
+        usual = np.minimum(np.maximum(usual, LEAST_CORRELATION), MOST_CORRELATION)
+        return np.repeat(usual, len(self.pixels) // self.levels, axis=-1)
 
     def _weights(self, usual: Array) -> Array:
         """Log likelihood ratio (L * N,) of blocks, per unit of their correlation, between a pair of
@@ -170,9 +179,10 @@ class _Blocks:
         return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
 
     def stepped(
-        self, correction: Array, blur_px: float, excess: float, mean: Array, information: Array
+        self, correction: Array, blur_px: float, excess: float, prior: tuple[Array, Array]
     ) -> Array:
         """The correction after one step of Newton's method; the blocks say less by `excess`."""
+        mean, information = prior
         curvature, slopes = self.system(correction, blur_px)
         pull = slopes.sum(axis=0) / excess + information @ (mean - correction)
         step = np.linalg.solve(curvature / excess + information, pull)
@@ -189,9 +199,9 @@ class _Blocks:
         weight = self._weights(usual)
         odds = np.clip(weight * (here - usual / 2), -30.0, 30.0)
         weight = weight / (1 + np.exp(-odds))
-        terms = np.einsum("nip,ni->np", self.moved, slope * weight[:, None])
-        held = curvature * weight[:, None, None]
-        total = np.einsum("nip,nij,njq->pq", self.moved, held, self.moved)
+        terms = ((slope * weight[:, None])[:, None] @ self.moved)[:, 0]
+        held = (curvature * weight[:, None, None]) @ self.moved
+        total = self.moved.reshape(-1, 6).T @ held.reshape(-1, 6)
         return total, terms.reshape(self.levels, -1, 6).sum(axis=0)
 
 
@@ -228,25 +238,31 @@ def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
     across = (at(1, -1) + at(-1, 1) - at(1, 1) - at(-1, -1)) / 4
     curvature = np.stack([along, across, across, down], axis=-1).reshape(-1, 2, 2)
     off = np.clip(moved_px - nearest, -1.0, 1.0)
-    bent = np.einsum("nij,nj->ni", curvature, off)
-    value = here + np.einsum("ni,ni->n", slope - bent / 2, off)
+    bent = (curvature @ off[..., None])[..., 0]
+    value = here + ((slope - bent / 2) * off).sum(axis=1)
     slope = slope - bent
     return value * inside, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
 
 
 def _values(surfaces: Array, moved_px: Array) -> Array:
-    """Values (..) of surfaces (.., S, S) at the pixel nearest to displacements (.., 2), else 0."""
+    """Values (.., N) of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else
+    0."""
     reach = surfaces.shape[-1] // 2
-    nearest = np.rint(np.clip(moved_px, -reach, reach)).astype(int) + reach
-    index = np.indices(surfaces.shape[:-2])
-    values = surfaces[(*index, nearest[..., 1], nearest[..., 0])]
+    nearest = np.rint(np.minimum(np.maximum(moved_px, -reach), reach)).astype(int) + reach
+    values = surfaces[np.arange(len(surfaces)), nearest[..., 1], nearest[..., 0]]
     return np.asarray(values * (np.abs(moved_px) <= reach).all(axis=-1))
 
 
 def _positive(matrices: Array) -> Array:
     """Symmetric matrices (N, 2, 2) with negative eigenvalues set to 0."""
-    values, vectors = np.linalg.eigh(matrices)
-    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(1, 2))
+    half = (matrices[:, 0, 0] + matrices[:, 1, 1]) / 2
+    apart = np.hypot((matrices[:, 0, 0] - matrices[:, 1, 1]) / 2, matrices[:, 0, 1])
+    # Between an ellipse and a saddle only the larger one is left: its projection.
+    whole, none = half >= apart, half <= -apart
+    scale = np.where(whole, 1.0, (half + apart) / np.maximum(2 * apart, 1e-30))
+    shift = np.where(whole, 0.0, apart - half)
+    out = scale[:, None, None] * (matrices + shift[:, None, None] * np.eye(2))
+    return np.asarray(np.where(none[:, None, None], 0.0, out))
 
 
 def moved_by_camera(

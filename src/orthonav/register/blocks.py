@@ -54,13 +54,9 @@ def block_scores(
     `reach_px` pixels of the level along both axes."""
     seen = _sampled(template, reference, pose, reach_px)
     rows, cols = template.mask.shape
-    side, count = 2 * reach_px + 1, BLOCKS * BLOCKS
-    products = np.empty((count, side, side, CHANNELS), np.float32)
-    if KERNEL is None:
-        _products_by_numpy(template, seen, products)
-    else:
-        KERNEL.blocks(template.values, seen, reach_px, products)
-    here = seen[reach_px : reach_px + rows, reach_px : reach_px + cols]
+    count = BLOCKS * BLOCKS
+    products = _products(template, template.values, seen, reach_px)
+    here = np.ascontiguousarray(seen[reach_px : reach_px + rows, reach_px : reach_px + cols])
     weights, energies = zip(
         *(_energies(template, each) for each in (template.values, here)), strict=True
     )
@@ -92,17 +88,23 @@ def _sampled(template: Template, reference: Reference, pose: Pose, margin_px: in
 
 def _energies(template: Template, values: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights (4,) of the squares of channels (H, W, 4), and the weighted energy of each block."""
-    squares = np.square(np.moveaxis(values, 2, 0), dtype=np.float64)
-    blocks = template.block_sums(squares)
-    gradients, grey = float(blocks[:2].sum()), float(blocks[2].sum())
+    blocks = _products(template, values, values, 0)[:, 0, 0].astype(np.float64)
+    gradients, grey = float(blocks[:, :2].sum()), float(blocks[:, 2].sum())
     weights = np.array([1.0, 1.0, GREY_SHARE * gradients / grey if grey > 0 else 0.0, 0.0])
-    return weights, weights @ blocks
+    return weights, blocks @ weights
 
 
-def _products_by_numpy(template: Template, seen: Array, products: Array) -> None:
-    """What the kernel does: sums over blocks of the view times the map under all displacements."""
-    rows, cols = template.mask.shape
-    values = np.moveaxis(template.values, 2, 0)
-    for down, right in np.ndindex(products.shape[1:3]):
+def _products(template: Template, values: Array, seen: Array, reach_px: int) -> Array:
+    """Sums (B * B, 2 R + 1, 2 R + 1, 4) over blocks of channels (H, W, 4) times the map
+    (H + 2 R, W + 2 R, 4) under all displacements."""
+    side = 2 * reach_px + 1
+    products = np.empty((BLOCKS * BLOCKS, side, side, CHANNELS), np.float32)
+    if KERNEL is not None:
+        KERNEL.blocks(values, seen, reach_px, products)
+        return products
+    rows, cols = values.shape[:2]
+    planes = np.moveaxis(values, 2, 0)
+    for down, right in np.ndindex(side, side):
         moved = np.moveaxis(seen[down : down + rows, right : right + cols], 2, 0)
-        products[:, down, right] = template.block_sums(values * moved).T
+        products[:, down, right] = template.block_sums(planes * moved).T
+    return products
