@@ -146,6 +146,23 @@ class Fix:
     """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None
     where the six were not estimated together."""
 
+    def tilt_deg(self, telemetry: Telemetry) -> tuple[float, float]:
+        """Pitch and roll of the camera of a view with this telemetry: those of the fix, else the
+        reported ones with the biases that the fix states."""
+        pitch, roll = (
+            stated if math.isfinite(stated) else reported + _finite(self.evidence.get(bias))
+            for stated, reported, bias in (
+                (self.pitch_deg, telemetry.pitch_deg, "pitch_bias_deg"),
+                (self.roll_deg, telemetry.roll_deg, "roll_bias_deg"),
+            )
+        )
+        return pitch, roll
+
+
+def _finite(value: float | None) -> float:
+    """The value; 0 where it is unknown."""
+    return value if value is not None and math.isfinite(value) else 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class NoFix:

@@ -25,7 +25,7 @@ SIZE_PX = 288
 """The ground is this many metres across, at 1 m a pixel."""
 CENTRE_PX, YAW_DEG, VIEW_GSD_M = (131.0, 160.0), 20.0, 0.8
 CAMERA = Camera(160, 160, 200.0, 200.0, 80.0, 80.0)
-TELEMETRY = Telemetry(0, YAW_DEG, 0.0, 0.0, VIEW_GSD_M * 200.0)
+TELEMETRY = Telemetry(0, YAW_DEG, 0.0, 0.0, VIEW_GSD_M * 200.0, tilt_std_deg=0.0)
 
 
 def ground() -> NDArray[np.uint8]:

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from orthonav.errors import FlightError, MissingFileError
 from orthonav.flight.fixes import (
+    GROUND_KEYS,
     KEYS,
+    POSE_KEYS,
     read_results,
     result_from_json,
     result_to_json,
@@ -48,6 +50,10 @@ NO_FIX_LINE = {
 numbers = st.floats(allow_nan=True, allow_infinity=False)
 evidences = st.dictionaries(st.text(max_size=8), numbers, max_size=4)
 covariances = st.lists(numbers, min_size=4, max_size=4).map(lambda v: np.reshape(v, (2, 2)))
+pose_covariances = st.lists(numbers.filter(math.isfinite), min_size=36, max_size=36).map(
+    lambda v: np.triu(np.reshape(v, (6, 6))) + np.triu(np.reshape(v, (6, 6)), 1).T
+)
+grounds = st.tuples(st.floats(-90, 90), st.floats(-180, 180))
 fixes = st.builds(
     Fix,
     lat_deg=st.floats(-90, 90),
@@ -58,7 +64,12 @@ fixes = st.builds(
     heading_deg=numbers,
     agl_m=numbers,
     evidence=evidences,
+    ground_latlon_deg=grounds | st.none(),
+    pitch_deg=numbers,
+    roll_deg=numbers,
+    pose_cov=pose_covariances | st.none(),
 )
+fixes |= st.builds(replace, fixes, ground_latlon_deg=grounds, ground_cov_en_m2=covariances)
 no_fixes = st.builds(NoFix, reason=st.text(), detail=st.text(), evidence=evidences)
 view_results = st.builds(
     ViewResult,
@@ -74,8 +85,9 @@ def fields(result: ViewResult) -> dict:
     outcome = {name: getattr(result.outcome, name) for name in vars(result.outcome)}
     outcome["evidence"] = dict(outcome["evidence"])
     values = [type(result.outcome).__name__, result.frame, result.time_ns, result.latency_ms]
-    if "cov_en_m2" in outcome:
-        outcome["cov_en_m2"] = outcome["cov_en_m2"].tolist()
+    for key in ("cov_en_m2", "ground_cov_en_m2", "pose_cov"):
+        if outcome.get(key) is not None:
+            outcome[key] = outcome[key].tolist()
     return repr([*values, sorted(outcome.items())])
 
 
@@ -93,7 +105,8 @@ def test_a_result_survives_the_round_trip(result: ViewResult) -> None:
 def test_a_line_is_strict_json_with_the_keys_in_order(result: ViewResult) -> None:
     line = result_to_json(result)
     values = json.loads(line, parse_constant=refuse)
-    assert tuple(values) == KEYS
+    more = [keys for keys in (GROUND_KEYS, POSE_KEYS) if keys[0] in values]
+    assert tuple(values) == sum(more, start=KEYS)
     assert "\n" not in line and line.isascii()
     assert values["time_s"] == result.time_ns / 10**9  # rounded once
 
@@ -133,6 +146,37 @@ def test_a_file_is_written_and_read_in_order(tmp_path: Path) -> None:
     assert path.read_bytes().endswith(b"}\n")
     write_results(path, [])
     assert read_results(path) == []
+
+
+def test_a_line_without_a_ground_or_an_attitude_is_read() -> None:
+    """As lines of earlier versions, of tiles and of tracks are."""
+    fix = result_from_json(json.dumps(FIX_LINE)).outcome
+    assert isinstance(fix, Fix) and math.isnan(fix.pitch_deg) and math.isnan(fix.roll_deg)
+    assert fix.ground_latlon_deg is fix.ground_cov_en_m2 is fix.pose_cov is None
+    assert tuple(json.loads(result_to_json(ViewResult("a", 0, fix, 1.0)))) == KEYS
+    ground = {"ground_lat_deg": 48.0, "ground_lon_deg": -4.0}
+    fix = result_from_json(json.dumps({**FIX_LINE, **ground})).outcome
+    assert isinstance(fix, Fix) and fix.ground_latlon_deg == (48.0, -4.0)
+    assert fix.ground_cov_en_m2 is None
+
+
+def test_the_camera_of_a_line_can_be_read_by_anyone() -> None:
+    cov = np.arange(36.0).reshape(6, 6)
+    cov = cov + cov.T
+    fix = Fix(1.0, 2.0, np.eye(2), 0.9, 15.0, 3.0, 100.0, pitch_deg=-2.5, roll_deg=1.0)
+    plain = json.loads(result_to_json(ViewResult("a", 0, fix, 1.0)))
+    assert plain["pitch_deg"] == -2.5 and plain["pose_cov"] is None
+    values = json.loads(result_to_json(ViewResult("a", 0, replace(fix, pose_cov=cov), 1.0)))
+    numbers = iter(values["pose_cov"])
+    for row in range(6):
+        for col in range(row, 6):
+            assert next(numbers) == cov[row, col]
+    assert next(numbers, None) is None
+    read = result_from_json(json.dumps(values)).outcome
+    assert isinstance(read, Fix) and read.pose_cov is not None
+    assert (read.pose_cov == cov).all() and not read.pose_cov.flags.writeable
+    unknown = replace(fix, pose_cov=np.full((6, 6), math.inf))
+    assert json.loads(result_to_json(ViewResult("a", 0, unknown, 1.0)))["pose_cov"] is None
 
 
 def test_extra_keys_and_positions_without_a_fix_are_passed_over(tmp_path: Path) -> None:
@@ -181,6 +225,14 @@ def test_a_missing_reason_of_no_fix_is_named() -> None:
         ("cov_en_m2", [1, 2, 3, 4], "cov_en_m2"),
         ("cov_en_m2", [[1, 2], [3]], "cov_en_m2"),
         ("cov_en_m2", [[1, 2], [3, "4"]], "cov_en_m2"),
+        ("ground_lat_deg", 91, "ground_lat_deg"),
+        ("ground_lat_deg", 48.0, "key ground_lon_deg is missing"),
+        ("ground_cov_en_m2", [[1, 2]], "ground_cov_en_m2: expected two rows of two numbers"),
+        ("pitch_deg", "2", "pitch_deg: expected a number or null, got text"),
+        ("pose_cov", [1.0] * 20, "pose_cov: expected null or 21 numbers"),
+        ("pose_cov", 1.0, "pose_cov: expected null or 21 numbers"),
+        ("pose_cov", [1.0] * 20 + [None], "pose_cov: expected 21 numbers, got null"),
+        ("pose_cov", [1.0] * 20 + ["1"], "pose_cov: expected a number or null, got text"),
         ("confidence", 1.01, "confidence: expected 0 to 1"),
         ("radius_m", [], "radius_m: expected a number or null, got a list"),
         ("evidence", None, "evidence: expected an object, got null"),

@@ -85,7 +85,8 @@ def test_biases_of_a_track_count():
 def test_ellipses_cover_what_they_state(px, tilt_deg):
     """The middle of the view is measured, the camera follows from it."""
     rng = np.random.default_rng(4)
-    tilted, middle = telemetry(tilt_deg), np.array([[320.0, 240.0]])
+    tilted = replace(telemetry(tilt_deg), tilt_std_deg=0.0)
+    middle = np.array([[320.0, 240.0]])
     heading_std, scale_std, count, inside = math.radians(0.8), 0.01, 300, 0
 
     def ground(pixel, heading_deg, agl_m):
@@ -145,3 +146,33 @@ def test_the_middle_is_as_exact_as_registration_where_tilt_is_uncertain(pitch_de
     # A fix that does not say how well the middle is known is one of the camera.
     found = locate_pixel(CAMERA, tilted, replace(seen, evidence=exact), (320, 240))
     assert (np.linalg.eigvalsh(found.cov_en_m2 - seen.cov_en_m2) > 0).all()
+
+
+@pytest.mark.parametrize("px", [(320, 240), (20, 30)])
+def test_a_fix_that_states_its_camera_moves_a_pixel_by_all_six(px):
+    """Errors of position and tilt that belong together leave the ground seen where it is."""
+    camera_std = np.array([4.0, 4.0, 2.0, 0.3, 1.0, 1.0])
+    middle = np.array([[320.0, 240.0]])
+
+    def ground(pixel, camera):
+        east, north, up, heading, pitch, roll = camera
+        seen = ground_en_m(CAMERA, np.atleast_2d(pixel), 30.0 + heading, pitch, roll, AGL_M + up)
+        return seen[0] + [east, north]
+
+    # What the middle shows is known to 0.5 m: the covariance of a camera given that.
+    step = 1e-3
+    slopes = np.stack([ground(middle, e) - ground(middle, -e) for e in np.eye(6) * step], axis=1)
+    slopes /= 2 * step
+    covariance = np.linalg.inv(np.diag(camera_std**-2) + slopes.T @ slopes / 0.5**2)
+    rng, count, inside = np.random.default_rng(5), 300, 0
+    for error in rng.multivariate_normal(np.zeros(6), covariance, count):
+        east, north, up, heading, pitch, roll = error
+        seen = fix(east, north, 30.0 + heading, AGL_M + up)
+        seen = replace(seen, pitch_deg=pitch, roll_deg=roll, pose_cov=covariance)
+        found = locate_pixel(CAMERA, telemetry(9.0, 9.0), seen, px)  # not the reported tilt
+        off = en_of(found) - ground(px, np.zeros(6))
+        inside += off @ np.linalg.solve(found.cov_en_m2, off) < 5.991
+    assert 0.92 < inside / count < 0.975
+    # Less is known of the camera's place than of the ground, most of all in the middle.
+    share = 0.05 if px == (320, 240) else 0.5
+    assert np.trace(found.cov_en_m2) < share * np.trace(covariance[:2, :2])

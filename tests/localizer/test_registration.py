@@ -128,7 +128,6 @@ def test_covariances_are_symmetric_and_positive(localizer, plain):
         np.testing.assert_allclose(fix.cov_en_m2, fix.cov_en_m2.T)
         deviations = np.sqrt(np.linalg.eigvalsh(fix.cov_en_m2))
         assert deviations.min() > 0.59 and deviations.max() < 5  # the floor is not undercut
-    assert np.trace(fixes[1].cov_en_m2) > np.trace(fixes[0].cov_en_m2)
 
 
 def test_another_floor_widens_the_covariance(localizer, map_path, plain):
@@ -146,12 +145,13 @@ def test_another_floor_widens_the_covariance(localizer, map_path, plain):
 def test_motion_blur_widens_the_covariance_along_it(map_path, yaw_deg, along):
     """East and north, with the right sign of what they have in common.
 
-    The blur makes two edges of one: the score is highest 2.5 m to either side along it.
+    The blur makes two edges of one: the score is highest 2.5 m to either side along it. Pitch and
+    roll are exact here; where they are not, their doubt hides this.
     """
     exact = Localizer(open_map(map_path))
     exact.registration.floor_px = 0.0
     grey = cv2.blur(rendered(GROUND, (0.0, 0.0), (yaw_deg, 0.0, 0.0)), (1, 25))
-    fix = exact.locate(View(grey, CAMERA, telemetry(float(yaw_deg))))
+    fix = exact.locate(View(grey, CAMERA, telemetry(float(yaw_deg), tilt_std_deg=0.0)))
     ahead, across = (
         np.array([along, (along[1], -along[0])]) / np.hypot(*along) @ place_of(exact, fix)
     )
@@ -160,6 +160,9 @@ def test_motion_blur_widens_the_covariance_along_it(map_path, yaw_deg, along):
     assert abs(axes[:, 1] @ along) / np.hypot(*along) > 0.95
     variances = np.linalg.eigvalsh(fix.cov_en_m2)
     assert variances[1] > 5 * variances[0]
+    fix = exact.locate(View(grey, CAMERA, telemetry(float(yaw_deg))))
+    off = place_of(exact, fix)
+    assert off @ np.linalg.solve(fix.cov_en_m2, off) < 9
 
 
 @pytest.mark.parametrize("attitude", [(0, 10, -8), (75, 10, -8), (200, -12, 9), (310, 0, 20)])

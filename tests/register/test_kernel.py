@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.register import refine, search, sharpness, template
+from orthonav.register import blocks, refine, search, sharpness, template
 from orthonav.register.evidence import FINE
 from orthonav.register.kernel import KERNEL
 from orthonav.register.map_window import MapWindow
@@ -34,7 +34,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (refine, search, sharpness, template):
+    for module in (blocks, refine, search, sharpness, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -373,3 +373,56 @@ def test_sums_of_an_array_that_is_missing_are_refused(missing):
     given[missing] = None
     with pytest.raises(TypeError):
         KERNEL.spread(*given[:4], (0,) * 4, (0,) * 9, given[4])
+
+
+@needs_kernel
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("reach_px", [2, 7])
+def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, reach_px):
+    """The map has a hole, and views reach beyond its border."""
+    seen = list(views(6, 9, level, valid_but_a_corner(whole)))
+
+    def work():
+        return [blocks.block_scores(made, reference, pose, reach_px) for made, pose in seen]
+
+    for one, other in zip(*both(monkeypatch, work), strict=True):
+        np.testing.assert_array_equal(one.pixels, other.pixels)
+        np.testing.assert_allclose(one.correlations, other.correlations, atol=1e-5)
+        np.testing.assert_array_equal(one.middles_px, other.middles_px)
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    "damage", ["channels", "type", "seen", "reach", "negative", "blocks", "side", "strided"]
+)
+def test_blocks_that_do_not_match_are_refused(damage):
+    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).values
+    rows, cols = view.shape[:2]
+    reach = {"reach": 3, "negative": -1}.get(damage, 2)
+    seen = np.ones((rows + 4 + (damage == "seen"), cols + 4, 4), np.float32)
+    if damage == "channels":
+        seen = np.ones((rows + 4, cols + 4, 3), np.float32)
+    elif damage == "type":
+        seen = seen.astype(np.float64)
+    count = 35 if damage == "blocks" else 36
+    products = np.zeros((count, 5, 6 if damage == "side" else 5, 4), np.float32)
+    if damage == "strided":
+        products = np.zeros((count, 5, 5, 8), np.float32)[..., ::2]
+    with pytest.raises(ValueError, match=r"match|expected|contiguous"):
+        KERNEL.blocks(view, seen, reach, products)
+
+
+@needs_kernel
+@pytest.mark.parametrize("missing", range(3))
+def test_blocks_of_an_array_that_is_missing_are_refused(missing):
+    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).values
+    rows, cols = view.shape[:2]
+    given = [
+        view,
+        np.ones((rows + 4, cols + 4, 4), np.float32),
+        np.zeros((36, 5, 5, 4), np.float32),
+    ]
+    given[missing] = None
+    with pytest.raises(TypeError):
+        KERNEL.blocks(given[0], given[1], 2, given[2])

@@ -1,6 +1,7 @@
 """Angles of other makers, by where the camera looks and where the top of its image points."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from orthonav.geo.camera import attitude_of, enu_from_camera
+from orthonav.onboard.aiding import AIDED_TILT_STD_DEG, UNAIDED_TILT_STD_DEG
+from orthonav.records import DEFAULT_TILT_STD_DEG
 from orthonav.sources.attitude import (
+    ASSUMED_TILT_STD_DEG,
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
     enu_from_body_camera,
     enu_from_gimbal_camera,
     enu_from_ros_camera,
@@ -124,3 +130,17 @@ def test_invalid_rotations_are_rejected():
     assert sound.tolist() == [False, True, False, True]
     np.testing.assert_allclose(turns, [np.eye(3), np.diag([-1, -1, 1])], atol=1e-12)
     assert rotations_of_wxyz(wxyz[:1])[0].shape == (0, 3, 3)
+
+
+def test_the_documentation_states_what_the_reported_tilt_is_worth():
+    text = (Path(__file__).parents[2] / "docs/flights.md").read_text(encoding="utf-8")
+    table = text.partition("| pitch and roll | `tilt_std_deg` |")[2].partition("\n\n")[0]
+    stated = [float(row.split("|")[2]) for row in table.splitlines()[2:]]
+    assert stated == [
+        GIMBAL_TILT_STD_DEG,
+        AUTOPILOT_TILT_STD_DEG,
+        ASSUMED_TILT_STD_DEG,
+        AIDED_TILT_STD_DEG,
+        UNAIDED_TILT_STD_DEG,
+        DEFAULT_TILT_STD_DEG,
+    ]

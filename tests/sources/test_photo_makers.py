@@ -8,7 +8,11 @@ from recorders import DJI, SENSEFLY, START_S, dji, maker_notes, packet, photo, p
 from orthonav.errors import CameraError, FlightError
 from orthonav.flight import open_flight, read_camera
 from orthonav.sources import SourceOptions, import_flight, open_source
-from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
+from orthonav.sources.attitude import (
+    ASSUMED_TILT_STD_DEG,
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
+)
 from orthonav.sources.exif import read_photo
 from orthonav.sources.focal import FocalLength, Optics, focal_length
 from orthonav.sources.makernotes import read_maker_notes
@@ -57,6 +61,7 @@ def test_one_angle_that_is_not_zero_was_recorded(tmp_path, angles):
     first, second = recording.views
     assert first.telemetry.pitch_deg == pytest.approx(90 + angles[1], abs=0.2)
     assert second.telemetry.pitch_deg == pytest.approx(90)
+    assert first.telemetry.tilt_std_deg == second.telemetry.tilt_std_deg == GIMBAL_TILT_STD_DEG
 
 
 def test_a_camera_that_looks_ahead_to_the_north_is_believed(tmp_path):
@@ -164,6 +169,7 @@ def test_sensefly(tmp_path):
         (70.0620575, 2.5, -3.5)
     )
     assert reported.agl_m == reported.home_m == pytest.approx(66.11117554)
+    assert reported.tilt_std_deg == AUTOPILOT_TILT_STD_DEG
     assert (reported.amsl_m, reported.hae_m) == (313.99, 281.69)
     assert view.truth_latlon_deg == (41.0346708, -83.3057253)
 

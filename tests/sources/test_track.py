@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from orthonav.errors import FlightError
 from orthonav.geo.camera import enu_from_camera
 from orthonav.records import Prior
-from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.sources.attitude import (
+    ASSUMED_TILT_STD_DEG,
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
+    enu_from_body_camera,
+    ned_from_angles,
+)
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
     LEVEL_GROUND_IN_GAPS,
@@ -165,12 +171,27 @@ def test_take_off_heights_in_gaps_of_a_distance_sensor_are_said():
     assert warnings_of(track, SourceOptions()) == [LEVEL_GROUND_IN_GAPS]
 
 
+def test_tilt_has_a_standard_deviation_by_the_kind_of_the_source():
+    """Or as reported; never 0, and unknown where pitch and roll are."""
+    attitude, stated = attitudes((0, 10.0, 1.0, -2.0), (2, 10.0, 1.0, -2.0)), Samples(1)
+    assert RecordedTrack(attitude).telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
+    gimbal = RecordedTrack(attitude, tilt_std_deg=GIMBAL_TILT_STD_DEG)
+    assert gimbal.telemetry(S).tilt_std_deg == GIMBAL_TILT_STD_DEG
+    stated.add(0, 0.5), stated.add(S // 2, 0.7)
+    reported = RecordedTrack(attitude, tilt_std=stated.series())
+    assert reported.telemetry(0).tilt_std_deg == 0.5
+    assert reported.telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
+    assert RecordedTrack(None).telemetry(0).tilt_std_deg is None
+    assert 0 < GIMBAL_TILT_STD_DEG < AUTOPILOT_TILT_STD_DEG < ASSUMED_TILT_STD_DEG
+
+
 def test_what_the_options_add():
     telemetry = RecordedTrack(None).telemetry(0)
     options = SourceOptions(prior_std_m=30.0, looks_down=True)
     changed = with_options(telemetry, (46.0, 2.0), options)
     assert changed.prior == Prior(46.0, 2.0, 30.0)
     assert (changed.pitch_deg, changed.roll_deg) == (0, 0) and math.isnan(changed.yaw_deg)
+    assert changed.tilt_std_deg == ASSUMED_TILT_STD_DEG
     assert with_options(telemetry, None, SourceOptions(prior_std_m=30.0)).prior is None
 
 

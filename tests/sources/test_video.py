@@ -9,7 +9,11 @@ from recorders import camera_file, dji_subtitle, picture, subtitles, video
 from orthonav.errors import CameraError, FlightError
 from orthonav.flight import open_flight, read_image
 from orthonav.sources import SourceOptions, import_flight, open_source
-from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
+from orthonav.sources.attitude import (
+    ASSUMED_TILT_STD_DEG,
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
+)
 from orthonav.sources.subtitles import blocks, read_srt
 
 
@@ -82,6 +86,7 @@ def test_a_table_beside_the_video(tmp_path):
     assert telemetry.yaw_std_deg == 3 and telemetry.vel_en_mps == (5.0, 1.0)
     assert views[1].truth_latlon_deg == pytest.approx((46.501, 2.5))
     assert views[2].telemetry.agl_m == 104
+    assert telemetry.tilt_std_deg == AUTOPILOT_TILT_STD_DEG
     (tmp_path / "a.csv").write_text("time_s,pitch_deg,roll_deg\n0,0,0\n1,0,0\nx,0,0\n")
     with pytest.raises(FlightError, match=r"line 4: time_s"):
         open_source(path, options(path))
@@ -205,6 +210,7 @@ def test_one_block_a_second_holds_until_the_next(tmp_path):
     views = list(open_source(path, options(path, rate_hz=2)).views)
     yaws = [view.telemetry.yaw_deg for view in views]
     assert yaws == pytest.approx([0, 5, 10, 15, 20, 20])
+    assert {view.telemetry.tilt_std_deg for view in views} == {GIMBAL_TILT_STD_DEG}
 
 
 def test_without_gimbal_angles_nothing_is_made_up(tmp_path):

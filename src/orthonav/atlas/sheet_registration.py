@@ -255,13 +255,13 @@ class JudgedRegion:
         found = self.sheet.registrar.finished(
             view.templates, view.levels, placed, view.prior, len(placed), finish=ground.finish
         )
-        return self._match(ground.by_camera(found)[0])
+        return self._match(ground.by_camera(found))
 
     def searched(self) -> SheetMatch | None:
         """The best match in all of the region; this takes ten times as long."""
         ground = self.sheet.on_ground(self.view)
         found = self.sheet.best(self.view, self.prior, ground)
-        return None if found is None else self._match(ground.by_camera(found)[0])
+        return None if found is None else self._match(ground.by_camera(found))
 
     def _latlon_deg(self, pose: Pose) -> tuple[float, float]:
         camera_en_m = self.sheet.camera_en_m(self.view, pose)

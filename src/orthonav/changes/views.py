@@ -110,8 +110,11 @@ def beside_map(
     registration: RegistrationLocalizer, grid: ChangeGrid, view: View, fix: Fix
 ) -> SeenCells | None:
     """A view beside the map where its fix puts it; None where it cannot be compared there."""
+    pitch_deg, roll_deg = fix.tilt_deg(view.telemetry)
     telemetry = replace(
         view.telemetry,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
         yaw_deg=fix.heading_deg,
         agl_m=fix.agl_m,
         yaw_std_deg=YAW_STD_DEG,
@@ -120,7 +123,7 @@ def beside_map(
     view = replace(view, telemetry=telemetry)
     if check_view(view, registration.grid.gsd_m, heading_known=True) is not None:
         return None
-    # The tilt as reported may not be that of the fix, which may have been corrected.
+    # Fixes of tiles and of earlier versions may not state the tilt.
     tilt_m = fix.agl_m * math.tan(math.radians(TILT_DEG))
     std_m = math.hypot(math.sqrt(float(np.trace(fix.cov_en_m2)) / 2), tilt_m)
     if not math.isfinite(std_m):

@@ -255,7 +255,8 @@ class Trier:
         if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
             return Trial(here, math.nan, 0.0, expected)
         prepared, best = seen.prepared, seen.found
-        found = registration.camera_en_m(prepared, best.placed.pose)
+        fix = registration.fix(seen, best, view.telemetry)
+        found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
         rivals = [
             (score, placed)
             for score, placed in best.finalists
@@ -266,10 +267,9 @@ class Trier:
             score, placed = max(rivals, key=lambda each: each[0])
             east, north = registration.camera_en_m(prepared, placed.pose)
             rival, share = (float(east), float(north)), score / max(best.score, 1e-6)
-        error_m, confidence = float(np.hypot(*(found - place_en_m))), 0.0
-        if registration.confidence is not None:
-            confidence = registration.confidence(best.evidence())
-        accepted, near = confidence >= plan.request.accept, error_m <= registration.radius_m
+        error_m = float(np.hypot(*(found - place_en_m)))
+        confidence = fix.confidence if math.isfinite(fix.confidence) else 0.0
+        accepted, near = confidence >= plan.request.accept, error_m <= fix.radius_m
         return Trial(
             en_m=here,
             error_m=error_m,

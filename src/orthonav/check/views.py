@@ -225,4 +225,5 @@ def _telemetry(rng: np.random.Generator, plan: TrialPlan, yaw_deg: float) -> Tel
         agl_m=agl_m,
         yaw_std_deg=plan.request.yaw_std_deg,
         agl_std_m=plan.request.agl_std * agl_m,
+        tilt_std_deg=plan.request.tilt_std_deg,
     )

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from orthonav.flight.recording import RecordedView
     from orthonav.onboard.calibrate import MountCalibration
+    from orthonav.records import ViewResult
 
 EVERYDAY = (
     *("--latency", "--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry"),
@@ -61,17 +62,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Track and smooth the flight, then estimate the biases from its confident views."""
+    """Estimate the biases from the confident views of a flight, and write them."""
     from orthonav.errors import FlightError
-    from orthonav.flight import read_truth
     from orthonav.flight.mount import write_mount
-    from orthonav.flight.recording import WithTelemetry
-    from orthonav.localizer import Localizer
-    from orthonav.localizer.tracker import Tracker
-    from orthonav.mapfile import open_map
-    from orthonav.onboard.calibrate import calibrate_mount
-    from orthonav.onboard.run import localize_flight, smoothed_track
-    from orthonav.records import Prior
 
     if options.latency:
         if options.dem is not None:
@@ -80,40 +73,68 @@ def run(options: argparse.Namespace) -> None:
         return
     if not 0 < options.gnss_std_m < 1e5:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
-    dem, opened = dem_of(options), open_map(options.map)
-    over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
-    flight = open_source(options.flight, options, over_terrain=over_terrain)
-    places = read_truth(options.gnss_positions) if options.gnss_positions else {}
-    priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
-    views = (
-        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
-    )
-    tracker = Tracker(
-        Localizer(opened),
-        heading_known=options.heading == "known",
-        use_prior=bool(options.gnss_positions),
-        every_prior=bool(options.gnss_positions),
-        smooth=True,
-    )
-    results = []
-    heights = flight_heights(options, opened, flight, dem)
-    with progress(options) as shown:
-        for result in localize_flight(
-            tracker, flight, skip_bad_images=True, views=views, heights=heights
-        ):
-            results.append(result)
-            if flight.expected:
-                shown("calibrate", min(1.0, len(results) / flight.expected))
-    found = calibrate_mount(smoothed_track(tracker, results, None))
+    found, by_track = _calibrated(options)
     write_mount(options.out, found.mount)
     if options.json:
         print_json(_plain(found))
         return
     print(_table(found))
     print(f"from {found.mount.views} views, {found.first} to {found.last}")
+    if not by_track:
+        print("the views make no track: this is the mean of single views")
     if found.moved:
         print("the camera moved in its mount before these views; earlier views are not used")
     print(f"written to {options.out}")
+
+
+def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
+    """The mount by the smoothed track of the flight, and True; by its single views, and False,
+    where these make no track."""
+    from orthonav.flight import read_truth
+    from orthonav.flight.recording import WithTelemetry
+    from orthonav.localizer import Localizer
+    from orthonav.localizer.tracker import Tracker
+    from orthonav.mapfile import open_map
+    from orthonav.onboard.calibrate import MIN_VIEWS, calibrate_mount, confident_views
+    from orthonav.onboard.calibrate_views import RecordedSingleViews, calibrate_mount_by_views
+    from orthonav.onboard.run import Locator, localize_flight, smoothed_track
+    from orthonav.records import Prior
+
+    dem, opened = dem_of(options), open_map(options.map)
+    over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
+    flight = open_source(options.flight, options, over_terrain=over_terrain)
+    places = read_truth(options.gnss_positions) if options.gnss_positions else {}
+    priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
+    localizer, heading_known = Localizer(opened), options.heading == "known"
+
+    def located(locator: Locator, stage: str) -> "list[ViewResult]":
+        views = (
+            WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
+        )
+        heights = flight_heights(options, opened, flight, dem)
+        results = []
+        with progress(options) as shown:
+            for result in localize_flight(
+                locator, flight, skip_bad_images=True, views=views, heights=heights
+            ):
+                results.append(result)
+                if flight.expected:
+                    shown(stage, min(1.0, len(results) / flight.expected))
+        return results
+
+    tracker = Tracker(
+        localizer,
+        heading_known=heading_known,
+        use_prior=bool(options.gnss_positions),
+        every_prior=bool(options.gnss_positions),
+        smooth=True,
+    )
+    tracked = smoothed_track(tracker, located(tracker, "calibrate"), None)
+    if len(confident_views(tracked)) >= MIN_VIEWS:
+        return calibrate_mount(tracked), True
+    # Photographs far apart, for one.
+    alone = RecordedSingleViews(localizer, bool(priors), heading_known)
+    return calibrate_mount_by_views(located(alone, "single views"), alone.reported), False
 
 
 def _run_latency(options: argparse.Namespace) -> None:

@@ -187,7 +187,7 @@ def _view_cutout(
     Raises `FlightError` with the reason where there is none.
     """
     used = as_fixed(view.telemetry, result)
-    refused = check_telemetry(used, camera, math.inf, heading_known=True)
+    refused = check_telemetry(used, camera, None, heading_known=True)
     if refused is not None:
         raise FlightError(refused.detail)
     grey = view.grey()
@@ -212,14 +212,13 @@ def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
     fix = result.outcome
     if not isinstance(fix, Fix):
         return telemetry
-    tilt = [fix.evidence.get(name, 0.0) for name in ("pitch_bias_deg", "roll_bias_deg")]
-    pitch, roll = (value if math.isfinite(value) else 0.0 for value in tilt)
+    pitch_deg, roll_deg = fix.tilt_deg(telemetry)
     return replace(
         telemetry,
         yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else telemetry.yaw_deg,
         agl_m=fix.agl_m if math.isfinite(fix.agl_m) else telemetry.agl_m,
-        pitch_deg=telemetry.pitch_deg + pitch,
-        roll_deg=telemetry.roll_deg + roll,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
     )
 
 

@@ -1,7 +1,7 @@
 """`fixes.jsonl`, written and read: one JSON object per view, in order of the flight.
 
-The keys of a line and their order are those of `KEYS`; those of a track end with `TRACK_KEYS`,
-those of a view on terrain have `GROUND_KEYS` before.
+The keys of a line and their order are those of `KEYS`, then `GROUND_KEYS` where the ground seen is
+known, `POSE_KEYS` where the attitude is, and `TRACK_KEYS` in a track.
 Unknown numbers (NaN, infinite) are written as null and read as NaN. `time_s` is written with up to
 nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seconds cannot hold.
 """
@@ -39,9 +39,15 @@ KEYS = (
     "latency_ms",
 )
 GROUND_KEYS = (
-    "ground_lat_deg",  # what the middle of the picture shows, where the map has a terrain or the
-    "ground_lon_deg",  # camera looks more than 45 deg off nadir
+    "ground_lat_deg",  # what the middle of the picture shows
+    "ground_lon_deg",
+    "ground_cov_en_m2",  # rows as in cov_en_m2; null where unknown, absent in earlier files
 )
+POSE_KEYS = (
+    "pitch_deg",  # as estimated; 0 looks straight down, positive ahead
+    "roll_deg",  # 0 looks straight down, positive left
+    "pose_cov",  # upper triangle (21) of 6 x 6, row by row: metres east, north, up, degrees of
+)  # heading, pitch, roll; null where they were not estimated together
 TRACK_KEYS = (
     "tracked",  # true: the position is estimated from all views so far
     "state",  # one of `STATES`
@@ -69,8 +75,9 @@ def result_to_json(result: ViewResult) -> str:
     texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
     texts["time_s"] = _seconds(result.time_ns)
     keys: tuple[str, ...] = KEYS
-    if "ground_lat_deg" in values:
-        keys += GROUND_KEYS
+    for more in (GROUND_KEYS, POSE_KEYS):
+        if more[0] in values:
+            keys += more
     if result.state is not None:
         keys += TRACK_KEYS
         texts |= {"tracked": "true", "state": json.dumps(result.state)}
@@ -136,21 +143,42 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
         return {**no_fix, **_NULL_IN_NO_FIX}
-    ground = {}
-    if outcome.ground_latlon_deg is not None:
-        ground = dict(zip(GROUND_KEYS, map(_or_none, outcome.ground_latlon_deg), strict=True))
     return {
         "status": "fix",
         "lat_deg": _or_none(outcome.lat_deg),
         "lon_deg": _or_none(outcome.lon_deg),
-        "cov_en_m2": [[_or_none(value) for value in row] for row in outcome.cov_en_m2],
+        "cov_en_m2": _rows(outcome.cov_en_m2),
         "confidence": _or_none(outcome.confidence),
         "radius_m": _or_none(outcome.radius_m),
         "heading_deg": _or_none(outcome.heading_deg),
         "agl_m": _or_none(outcome.agl_m),
         **_NULL_IN_FIX,
-        **ground,
+        **_ground_values(outcome),
+        **_pose_values(outcome),
     }
+
+
+def _ground_values(fix: Fix) -> dict[str, Any]:
+    if fix.ground_latlon_deg is None:
+        return {}
+    lat, lon = fix.ground_latlon_deg
+    cov = fix.ground_cov_en_m2
+    values = _or_none(lat), _or_none(lon), None if cov is None else _rows(cov)
+    return dict(zip(GROUND_KEYS, values, strict=True))
+
+
+def _pose_values(fix: Fix) -> dict[str, Any]:
+    angles = _or_none(fix.pitch_deg), _or_none(fix.roll_deg)
+    if fix.pose_cov is None and angles == (None, None):
+        return {}
+    upper = None
+    if fix.pose_cov is not None and np.isfinite(fix.pose_cov).all():
+        upper = fix.pose_cov[np.triu_indices(6)].tolist()
+    return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
+
+
+def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
+    return [[_or_none(value) for value in row] for row in cov]
 
 
 def _state(values: Mapping[str, Any]) -> str | None:
@@ -182,13 +210,17 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     return Fix(
         lat_deg=_angle(values, "lat_deg", 90.0),
         lon_deg=_angle(values, "lon_deg", 180.0),
-        cov_en_m2=_covariance(values),
+        cov_en_m2=_covariance(values, "cov_en_m2"),
         confidence=confidence,
         radius_m=_number(values, "radius_m"),
         heading_deg=_number(values, "heading_deg"),
         agl_m=_number(values, "agl_m"),
         evidence=evidence,
         ground_latlon_deg=_ground(values),
+        ground_cov_en_m2=_known_covariance(values, GROUND_KEYS[2]),
+        pitch_deg=_number(values, "pitch_deg") if "pitch_deg" in values else math.nan,
+        roll_deg=_number(values, "roll_deg") if "roll_deg" in values else math.nan,
+        pose_cov=_pose_covariance(values),
     )
 
 
@@ -255,13 +287,36 @@ def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
     return angle
 
 
-def _covariance(values: Mapping[str, Any]) -> NDArray[np.float64]:
-    rows = _value(values, "cov_en_m2")
+def _covariance(values: Mapping[str, Any], key: str) -> NDArray[np.float64]:
+    rows = _value(values, key)
     if rows is None:
         rows = [[None, None], [None, None]]
     if not isinstance(rows, list) or [_length(row) for row in rows] != [2, 2]:
-        raise FlightError("cov_en_m2: expected two rows of two numbers")
-    cov = np.array([[_as_float(value, "cov_en_m2") for value in row] for row in rows])
+        raise FlightError(f"{key}: expected two rows of two numbers")
+    cov = np.array([[_as_float(value, key) for value in row] for row in rows])
+    cov.setflags(write=False)
+    return cov
+
+
+def _known_covariance(values: Mapping[str, Any], key: str) -> NDArray[np.float64] | None:
+    """The same; None where a line does not say."""
+    return None if values.get(key) is None else _covariance(values, key)
+
+
+def _pose_covariance(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """The covariance (6, 6) of the camera; None where a line does not say."""
+    key = POSE_KEYS[2]
+    numbers = values.get(key)
+    if numbers is None:
+        return None
+    if _length(numbers) != 21:
+        raise FlightError(f"{key}: expected null or 21 numbers")
+    upper = np.array([_as_float(value, key) for value in numbers])
+    if np.isnan(upper).any():
+        raise FlightError(f"{key}: expected 21 numbers, got null among them")
+    cov = np.zeros((6, 6))
+    cov[np.triu_indices(6)] = upper
+    cov += np.triu(cov, 1).T
     cov.setflags(write=False)
     return cov
 

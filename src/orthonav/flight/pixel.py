@@ -1,10 +1,10 @@
 """Where on the ground a pixel of a placed view lies, with its covariance.
 
-Registration places the ground that a view shows; where the camera was follows from it. So errors of
-heading, height and tilt move a pixel by what they change between the middle of the view and the
-pixel, not by what they change at the camera. Fixes of a track, and those that do not say how well
-the middle of their view is known (`middle_std_m`), are positions of the camera: all its errors
-count. Errors are taken as independent.
+Where a fix states the covariance of position, height and attitude together (`Fix.pose_cov`), all
+six move the pixel. Errors of other fixes are taken as independent. Registration places the ground
+that a view shows, so errors of heading, height and tilt move a pixel by what they change between
+the middle of the view and the pixel. Fixes of a track, and those that do not say how well the
+middle of their view is known (`middle_std_m`), are positions of the camera: all its errors count.
 """
 
 import math
@@ -18,10 +18,16 @@ from orthonav.errors import FlightError
 from orthonav.geo.camera import Camera, ground_en_m
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.ground import TerrainHeights, sight_on_ground
-from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, Fix, Telemetry
+from orthonav.records import (
+    DEFAULT_AGL_STD,
+    DEFAULT_TILT_STD_DEG,
+    DEFAULT_YAW_STD_DEG,
+    Fix,
+    Telemetry,
+)
 
-STEP = 1e-3
-"""Step of the derivatives: rad, and log scale."""
+STEPS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+"""Steps of the derivatives: metres east, north, up, degrees of heading, pitch, roll."""
 Array = NDArray[np.float64]
 Relief = Callable[[Array], Array]
 """Heights (N,) above the ground under the camera at metres east and north of it (N, 2)."""
@@ -51,7 +57,8 @@ def locate_pixel(
 ) -> GroundPoint:
     """The ground at image coordinates `px` (x, y; 0, 0 is the corner) of a view with a fix.
 
-    `telemetry`: of the view, which gives pitch and roll. Without `terrain` the ground is level.
+    `telemetry`: of the view; it gives pitch and roll where the fix does not. Without
+    `terrain` the ground is level.
     Raises `FlightError` where the pixel is outside the picture or shows no ground that is known.
     """
     if not (0 <= px[0] <= camera.width_px and 0 <= px[1] <= camera.height_px):
@@ -64,7 +71,7 @@ def locate_pixel(
         if not math.isfinite(below_m):
             raise FlightError("the terrain does not reach to the ground under the camera")
         relief = _relief(terrain, frame, below_m)
-    values, stds = _orientation(telemetry, fix)
+    values = _camera(telemetry, fix)
     middle = (camera.width_px / 2, camera.height_px / 2)
     here = _ground(camera, px, values, relief)
     if not np.isfinite(here).all():
@@ -72,36 +79,41 @@ def locate_pixel(
     slopes = _slopes(camera, px, values, relief)
     if not np.isfinite(slopes).all():
         raise FlightError(f"pixel {px[0]:g}, {px[1]:g} is next to the horizon or unknown ground")
-    covariance = fix.cov_en_m2 + _spread(slopes, stds)
     middle_m = fix.evidence.get("middle_std_m")
-    if middle_m is not None and "heading_bias_std_deg" not in fix.evidence:
+    if fix.pose_cov is not None:
+        covariance = slopes @ fix.pose_cov @ slopes.T
+    elif middle_m is None or "heading_bias_std_deg" in fix.evidence:
+        covariance = fix.cov_en_m2 + _spread(slopes[:, 2:], _stds(telemetry, fix))
+    else:
         at_middle = np.nan_to_num(_slopes(camera, middle, values, relief))
-        covariance = np.eye(2) * middle_m**2 + _spread(slopes - at_middle, stds)
+        spread = _spread((slopes - at_middle)[:, 2:], _stds(telemetry, fix))
+        covariance = np.eye(2) * middle_m**2 + spread
     lat, lon = frame.latlon_from_en(here)
     height_m = math.nan if terrain is None else float(terrain(np.array([lat]), np.array([lon]))[0])
-    drop_m = values[1] - (0.0 if terrain is None else height_m - below_m)
+    drop_m = fix.agl_m - (0.0 if terrain is None else height_m - below_m)
     range_m = math.hypot(*here.tolist(), drop_m)
     return GroundPoint(float(lat), float(lon), height_m, covariance, range_m)
 
 
-def _orientation(telemetry: Telemetry, fix: Fix) -> tuple[Array, Array]:
-    """Heading (rad), height above ground (m), pitch and roll (rad), (4,), and the standard
-    deviations (4,) of heading, log scale, pitch and roll."""
+def _camera(telemetry: Telemetry, fix: Fix) -> Array:
+    """The camera (6,): metres east, north and up of its fix, heading, pitch and roll in degrees."""
+    return np.array([0.0, 0.0, fix.agl_m, fix.heading_deg, *fix.tilt_deg(telemetry)])
+
+
+def _stds(telemetry: Telemetry, fix: Fix) -> Array:
+    """Standard deviations (4,) of height (m), heading, pitch and roll (deg), taken as
+    independent."""
     evidence = fix.evidence
-    biases = [evidence.get(f"{axis}_bias_deg", 0.0) for axis in ("pitch", "roll")]
-    angles = np.radians(
-        [fix.heading_deg, telemetry.pitch_deg + biases[0], telemetry.roll_deg + biases[1]]
-    )
-    values = np.array([angles[0], fix.agl_m, *angles[1:]])
     heading = evidence.get("heading_std_deg", evidence.get("heading_bias_std_deg"))
     scale = evidence.get("log_scale_std", evidence.get("log_scale_bias_std"))
-    tilt = telemetry.tilt_std_deg or 0.0
+    stated = telemetry.tilt_std_deg
+    tilt = DEFAULT_TILT_STD_DEG if stated is None else stated
     stds = [
-        math.radians(DEFAULT_YAW_STD_DEG if heading is None else heading),
-        DEFAULT_AGL_STD if scale is None else scale,
-        *(math.radians(evidence.get(f"{axis}_bias_std_deg", tilt)) for axis in ("pitch", "roll")),
+        fix.agl_m * (DEFAULT_AGL_STD if scale is None else scale),
+        DEFAULT_YAW_STD_DEG if heading is None else heading,
+        *(evidence.get(f"{axis}_bias_std_deg", tilt) for axis in ("pitch", "roll")),
     ]
-    return values, np.array(stds)
+    return np.array(stds)
 
 
 def _relief(terrain: TerrainHeights, frame: LocalFrame, below_m: float) -> Relief:
@@ -113,29 +125,23 @@ def _relief(terrain: TerrainHeights, frame: LocalFrame, below_m: float) -> Relie
 
 
 def _ground(camera: Camera, px: tuple[float, float], values: Array, relief: Relief | None) -> Array:
-    """Metres east and north of the camera (2,) of the ground at a pixel; NaN without any."""
-    agl_m = float(values[1])
-    yaw_deg, pitch_deg, roll_deg = np.degrees(values[[0, 2, 3]]).tolist()
+    """Metres east and north (2,) of the fix of the ground that a camera (6,) shows at a pixel; NaN
+    without any."""
+    place, up_m = values[:2], float(values[2])
     # Offset for each metre that the line of sight descends.
+    yaw_deg, pitch_deg, roll_deg = values[3:].tolist()
     slope = ground_en_m(camera, np.array([px]), yaw_deg, pitch_deg, roll_deg, 1.0)[0]
     if relief is None:
-        return np.asarray(slope * agl_m)
-    return sight_on_ground(slope, agl_m, relief)
+        return np.asarray(place + slope * up_m)
+    return np.asarray(place + sight_on_ground(slope, up_m, lambda each: relief(each + place)))
 
 
 def _slopes(camera: Camera, px: tuple[float, float], values: Array, relief: Relief | None) -> Array:
-    """Derivatives (2, 4) of the ground at a pixel by heading, log scale, pitch and roll."""
+    """Derivatives (2, 6) of the ground at a pixel by metres and degrees of the camera."""
     columns = []
-    for number in range(4):
-        sides = []
-        for sign in (1, -1):
-            moved = values.copy()
-            if number == 1:
-                moved[1] *= math.exp(sign * STEP)
-            else:
-                moved[number] += sign * STEP
-            sides.append(_ground(camera, px, moved, relief))
-        columns.append((sides[0] - sides[1]) / (2 * STEP))
+    for step in np.diag(STEPS):
+        ahead, behind = (_ground(camera, px, values + sign * step, relief) for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * step.sum()))
     return np.stack(columns, axis=1)
 
 

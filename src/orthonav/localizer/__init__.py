@@ -12,10 +12,13 @@
 4. Candidates are refined from coarse to fine, the best is compared with its strongest rival
    (`orthonav.register.registrar`); the search ends as soon as the best stands out. On a map with a
    terrain the best are orthorectified on it first (`relief`, `orthorectify`).
-5. The evidence becomes a confidence (`orthonav.confidence`) and the residuals a covariance.
+5. Position, height, heading, pitch and roll are fitted to the blocks of the view there, with the
+   reported ones as a prior (`camera`, `resection`). That gives their covariance too.
+6. The evidence becomes a confidence (`orthonav.confidence`): that the place is right, times that
+   the error of the camera is small.
 
 Where a map has no registration layer, or with `registration=False`, `tiles.TileLocalizer` takes the
-place of steps 2 to 5: the view is embedded under a few headings and put on the most similar tile.
+place of steps 2 to 6: the view is embedded under a few headings and put on the most similar tile.
 
 `tracker.Tracker` places the views of a flight one after another: `registration` gives it candidate
 places, `tilt` their pitch and roll from perspective, `odometry` the displacement between views, and

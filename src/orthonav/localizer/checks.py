@@ -41,9 +41,12 @@ def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
 
 
 def check_telemetry(
-    telemetry: Telemetry, camera: Camera, gsd_m: float, heading_known: bool
+    telemetry: Telemetry, camera: Camera, gsd_m: float | None, heading_known: bool
 ) -> NoFix | None:
-    """Why a view with this telemetry cannot be rectified to `gsd_m`; None if it can."""
+    """Why a view with this telemetry cannot be rectified to `gsd_m`; None if it can.
+
+    Without `gsd_m` its size beside a map is not checked.
+    """
     missing = [name for name in telemetry.missing() if heading_known or name != "yaw_deg"]
     if missing:
         return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
@@ -57,6 +60,8 @@ def check_telemetry(
         )
     if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
+    if gsd_m is None:
+        return None
     side_px = footprint_side_m(telemetry, camera) / gsd_m
     if side_px < MIN_VIEW_PX:
         return _too_small(side_px, MIN_VIEW_PX, f"{telemetry.agl_m:.0f} m above ground, ")

@@ -10,7 +10,7 @@ from functools import cached_property
 
 from orthonav.localizer.camera import CameraFound, camera_found, tilt_std_deg
 from orthonav.localizer.prepared import PreparedView
-from orthonav.localizer.relief import Relief
+from orthonav.localizer.relief import LevelTerrain, Relief
 from orthonav.localizer.relief_view import ReliefView
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Placed, Refiner
@@ -100,7 +100,10 @@ class ViewOnLevelGround:
         are exact or the view does not show them."""
         if tilt_std_deg(self.view.picture_at(self.view.levels.final).telemetry) == 0:
             return None
-        return camera_found(self.seen, self.registrar.reference, _window(placed))
+        seen, pose = self.seen, _window(placed)
+        if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
+            seen = ReliefView(Relief(LevelTerrain(), seen.relief.grid), self.view)
+        return camera_found(seen, self.registrar.reference, pose)
 
     def _terrain_gain(self, pose: Pose) -> float | None:
         return None

@@ -133,7 +133,7 @@ class RegistrationLocalizer:
             return seen
         if isinstance(seen.found, NoFix):
             return seen.found
-        return self._fix(seen, seen.found, view.telemetry)
+        return self.fix(seen, seen.found, view.telemetry)
 
     def register(
         self, view: View, prior: Prior | None = None, heading_known: bool = True
@@ -181,7 +181,8 @@ class RegistrationLocalizer:
         made = ViewOnLevelGround if level else ViewOverRelief
         return made(self.relief, self.registrar, view)
 
-    def _fix(self, seen: RegisteredView, best: Registered, telemetry: Telemetry) -> Fix:
+    def fix(self, seen: RegisteredView, best: Registered, telemetry: Telemetry) -> Fix:
+        """The fix of a registered view with this telemetry at its best place."""
         assert seen.ground is not None
         camera, viewed = seen.camera(best.placed), seen.ground.viewed(best)
         floor_m = self.floor_m(seen.prepared)

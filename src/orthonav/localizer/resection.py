@@ -91,7 +91,9 @@ def resected(
     alone = correction + alone_covariance @ information @ (correction - mean)
     if not all(np.isfinite(each).all() for each in (correction, covariance, alone_covariance)):
         return None
-    return Resection(correction, covariance, alone, alone_covariance)
+    return Resection(
+        correction, np.asarray(covariance), np.asarray(alone), np.asarray(alone_covariance)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,7 +53,7 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
     standard deviations account for the correlation of successive views. Raises `FlightError` where
     fewer than `MIN_VIEWS` views are confident.
     """
-    confident = [each for each in results if _is_confident(each)]
+    confident = confident_views(results)
     if len(confident) < MIN_VIEWS:
         raise FlightError(
             f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
@@ -72,6 +72,11 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
     }
     mount = Mount(**biases, views=len(confident) - begin)
     return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
+
+
+def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
+    """Confident views of a track that state their biases."""
+    return [each for each in results if _is_confident(each)]
 
 
 def _is_confident(result: ViewResult) -> bool:

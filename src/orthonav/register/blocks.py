@@ -44,7 +44,7 @@ class BlockScores(NamedTuple):
     @property
     def reach_px(self) -> int:
         """The largest displacement, R."""
-        return self.correlations.shape[1] // 2
+        return int(self.correlations.shape[1] // 2)
 
 
 def block_scores(

@@ -18,6 +18,12 @@ _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _GIMBAL_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
 LOOKS_DOWN = (0.0, 0.0, 0.0)
+GIMBAL_TILT_STD_DEG = 2.0
+"""Standard deviation of pitch and roll that a gimbal reports: its horizon errs by about 1 deg after
+turns, and cameras are mounted in it to within 1 to 2 deg."""
+AUTOPILOT_TILT_STD_DEG = 3.0
+"""The same of an autopilot's attitude and a mount that was never calibrated: mounts lean by 1 to
+5 deg, horizons err by 0.5 to 2 deg with GNSS and by more without (docs/flights.md)."""
 ASSUMED_TILT_STD_DEG = 6.0
 """Standard deviation of pitch and roll where a camera is assumed to look straight down: with it the
 covariance of fixes on 30 photographs of a DJI Mini is consistent (docs/flights.md)."""

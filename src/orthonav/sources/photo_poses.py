@@ -9,7 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthonav.geo.camera import attitude_of
-from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG, enu_from_gimbal_camera
+from orthonav.sources.attitude import (
+    ASSUMED_TILT_STD_DEG,
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
+    enu_from_gimbal_camera,
+)
 from orthonav.sources.exif import Photo
 
 UNKNOWN_YAW_STD_DEG = 180.0
@@ -37,7 +42,7 @@ class PhotoPose:
     yaw_std_deg: float | None = None
     """Standard deviation of the heading, None for the usual one."""
     tilt_std_deg: float | None = None
-    """Standard deviation of pitch and roll, None where they were recorded."""
+    """Standard deviation of pitch and roll by what recorded them, None where they are unknown."""
 
 
 def poses_of(photos: Sequence[Photo]) -> tuple[list[PhotoPose], list[str]]:
@@ -80,12 +85,12 @@ def _level(photo: Photo) -> PhotoPose:
 
 
 def _pose(photo: Photo) -> PhotoPose:
-    rotation = photo.rotation
+    rotation, tilt_std_deg = photo.rotation, AUTOPILOT_TILT_STD_DEG
     if photo.gimbal_deg is not None:
-        rotation = enu_from_gimbal_camera(photo.gimbal_deg)
+        rotation, tilt_std_deg = enu_from_gimbal_camera(photo.gimbal_deg), GIMBAL_TILT_STD_DEG
     if rotation is None:
         return PhotoPose(photo.body_yaw_deg % 360)
-    return PhotoPose(*attitude_of(rotation))
+    return PhotoPose(*attitude_of(rotation), tilt_std_deg=tilt_std_deg)
 
 
 def _is_unrecorded(photos: Sequence[Photo]) -> bool:

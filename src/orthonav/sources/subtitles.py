@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.errors import FlightError
-from orthonav.sources.attitude import enu_from_gimbal_camera
+from orthonav.sources.attitude import GIMBAL_TILT_STD_DEG, enu_from_gimbal_camera
 from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
 
 MAX_BYTES = 500_000_000
@@ -63,6 +63,7 @@ def read_srt(path: Path) -> RecordedTrack:
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         home=height.series(),
         position=position.positions(),
+        tilt_std_deg=GIMBAL_TILT_STD_DEG,
         warnings=_warnings(data),
     )
     if track.attitude is None and track.position is None:

@@ -21,6 +21,7 @@ _NAMES = {
     "velocity": ("vel_east_mps", "vel_north_mps"),
     "yaw_std": ("yaw_std_deg",),
     "agl_std": ("agl_std_m",),
+    "tilt_std": ("tilt_std_deg",),
     "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
 }
 
@@ -88,6 +89,7 @@ def _track(
         velocity=found["velocity"],
         yaw_std=found["yaw_std"],
         agl_std=found["agl_std"],
+        tilt_std=found["tilt_std"],
         prior=found["prior"],
     )
     if track.attitude is None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from orthonav.geo.camera import attitude_of
 from orthonav.records import Prior, Telemetry
+from orthonav.sources.attitude import AUTOPILOT_TILT_STD_DEG
 
 Array = NDArray[np.float64]
 DAY_NS = 86_400 * 10**9
@@ -173,6 +174,10 @@ class RecordedTrack:
     """Reported standard deviation of the heading, degrees."""
     agl_std: TimeSeries | None = None
     """Reported standard deviation of the height, metres."""
+    tilt_std: TimeSeries | None = None
+    """Reported standard deviation of pitch and roll, degrees."""
+    tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
+    """The same by the kind of the source, where none was reported."""
     prior: TimeSeries | None = None
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
     origin_ns: int = 0
@@ -203,6 +208,9 @@ class RecordedTrack:
         Where no height above ground was measured, it is the one above take-off.
         """
         yaw, pitch, roll = angles_at(self.attitude, time_ns)
+        tilt_std = _number(_at(self.tilt_std, time_ns, 1)[0])
+        if tilt_std is None and math.isfinite(pitch + roll):
+            tilt_std = self.tilt_std_deg
         prior = _at(self.prior, time_ns, 3)
         velocity = _at(self.velocity, time_ns, 2)
         return Telemetry(
@@ -213,6 +221,7 @@ class RecordedTrack:
             agl_m=self._agl_m(time_ns, ground_alt_m),
             yaw_std_deg=_number(_at(self.yaw_std, time_ns, 1)[0]),
             agl_std_m=_number(_at(self.agl_std, time_ns, 1)[0]),
+            tilt_std_deg=tilt_std,
             prior=Prior(*map(float, prior)) if np.isfinite(prior).all() else None,
             vel_en_mps=(float(velocity[0]), float(velocity[1]))
             if np.isfinite(velocity).all()

@@ -57,7 +57,7 @@ def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindo
     With a large tilt it is limited to `MAX_REACH` times the half side of a vertical view around the
     optical axis.
     """
-    refused = check_telemetry(telemetry, camera, math.inf, heading_known=True)
+    refused = check_telemetry(telemetry, camera, None, heading_known=True)
     if refused is not None:
         raise FlightError(refused.detail)
     attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
