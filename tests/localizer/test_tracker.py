@@ -121,7 +121,7 @@ def test_a_flight_is_followed(usual):
 
 @pytest.mark.long
 def test_biases_of_heading_height_and_mount_are_estimated(localizer):
-    """Uncorrected, 5 deg of pitch are 13 m from 150 m."""
+    """Uncorrected, 5 deg of pitch are 13 m from 150 m. Single views show their tilt themselves."""
     tracker = Tracker(localizer)
     seen = list(
         views(
@@ -139,7 +139,7 @@ def test_biases_of_heading_height_and_mount_are_estimated(localizer):
         np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(alone, seen[12:], strict=True)
     ]
     tracked = [row[0] for row in rows[12:]]
-    assert np.median(tracked) < 5 < 10 < np.median(single)
+    assert np.median(tracked) < 2 and np.median(single) < 2
 
 
 def test_smoothing_corrects_the_beginning_of_a_flight(localizer):
@@ -464,17 +464,20 @@ def test_a_fixed_lag_uses_the_views_after_each(localizer, usual):
 
 
 def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
-    """Against measured positions: 5 deg of pitch are 13 m from 150 m."""
+    """Against measured positions: 5 deg of pitch are 13 m from 150 m. What lasts longer than an
+    error of the horizon is the mount."""
     frame = localizer.sheet.frame
     tracker = Tracker(localizer, every_prior=True)
     seen = []
-    for grey, telemetry, place in views(10, tilt=(5.0, 0.0), year=lit):
+    for grey, telemetry, place in views(10, tilt=(5.0, 0.0), year=lit, every_s=10):
         lat, lon = frame.latlon_from_en(place)
         seen.append((grey, replace(telemetry, prior=Prior(float(lat), float(lon), 2.0)), place))
     rows = followed(tracker, localizer, seen)
     evidence = rows[-1][3].evidence
     assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.2)
     assert evidence["pitch_bias_std_deg"] < 1.5
+    assert rows[-1][3].pitch_deg == pytest.approx(5.0, abs=1.0)
+    assert rows[2][3].pitch_deg == pytest.approx(5.0, abs=2.0)
 
 
 def test_the_radius_grows_with_the_height(localizer):

@@ -14,6 +14,7 @@ from orthonav.track import (
     ReportedAttitude,
     ReportedVelocity,
     Sighting,
+    State,
 )
 from orthonav.track.model import HORIZON, SEEN, STATE, TILT, WHITE_SHARE
 from orthonav.track.motion import by_camera, predicted
@@ -203,3 +204,32 @@ def test_the_horizon_before_is_learnt_with_the_opposite_sign():
     expected = predicted(MODEL, mean, known, seconds, velocity, noise, camera)
     after, _ = by_camera(expected, camera)
     assert np.degrees(after.mean_before[HORIZON]) == pytest.approx([2.0, -1.0], abs=0.6)
+
+
+@pytest.mark.parametrize("shown_deg", [0.01, 0.1, 0.5, 2.0])
+@pytest.mark.parametrize("horizon_deg", [1.5, 3.0])
+def test_views_that_overlap_confirm_a_track_however_well_they_show_their_tilt(
+    shown_deg, horizon_deg
+):
+    """A place as expected is likelier than none, with a tilt that is known well or hardly."""
+    shown, mixture = math.radians(shown_deg), Mixture(MODEL, EXTENT)
+    spread = np.diag([1.0, 1.0, 1e-6, 1e-6, shown**2, shown**2])
+    spread[:2, :2] += shown**2 * LEVER_M @ LEVER_M.T
+    spread[:2, 4:] = -(shown**2) * LEVER_M
+    spread[4:, :2] = spread[:2, 4:].T
+    level = ReportedAttitude(0.0, 0.0, 0.0, math.radians(horizon_deg))
+    place = np.zeros(6)
+    for view in range(15):
+        if view:
+            place = place + np.array([*SPEED, 0.0, 0.0, 0.0, 0.0])
+            camera = CameraDisplacement(
+                SPEED, np.eye(2), 80.0, levers_m=np.stack([LEVER_M, LEVER_M])
+            )
+            noise = MODEL.telemetry_noise
+            noise[2] = math.radians(horizon_deg) ** 2
+            mixture.predict(1.0, camera=camera, telemetry_noise=noise)
+        mixture.update(level, [Sighting(place, spread, 25.0)], 0.15, new_ground=0.1)
+        found = mixture.estimate(RADIUS_M)
+    assert found.state is State.TRACKING and found.confidence > 0.99
+    last = [each.share for each in mixture.hypotheses if each.recognized > 0.5]
+    assert sum(last) > 0.9
