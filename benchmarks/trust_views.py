@@ -205,7 +205,10 @@ def _placed(
         return None
     found, gsd_m = seen.found, localizer.grid.gsd_m
     assert localizer.confidence is not None
+    camera = seen.camera(found.placed)
     place = localizer.camera_en_m(seen.prepared, found.placed.pose)
+    if camera is not None:
+        place = camera.orientation.position_m[:2]
     error_m = float(np.hypot(*(place - localizer.sheet.frame.en_from_latlon(*truth))))
     far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
     right = case.kind in ("found", "beside") and error_m <= far_m

@@ -127,10 +127,9 @@ def test_the_tracker_takes_the_ground_between_both_views(monkeypatch):
         return terrain_of(np.array([0.15, 0.0]), at_en_m)
 
     following = SimpleNamespace(
-        _tilt_noise=lambda _: 0.0,
-        _registration=SimpleNamespace(relief="a terrain"),
+        _registration=SimpleNamespace(relief=SimpleNamespace(is_level=False)),
         _terrain=terrain,
     )
-    found = tracker.Tracker._displacement(following, view, view, np.zeros(2), None)
+    found = tracker.Tracker._displacement(following, view, view, np.zeros(3), None)
     np.testing.assert_array_equal(asked, [ahead_m + moved_m / 2])
     assert found.displacement.moved_en_m[0] < 40.0  # uphill ground is nearer
