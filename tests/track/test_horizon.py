@@ -21,7 +21,7 @@ from orthonav.track.motion import by_camera, predicted
 
 SIDE_M, RADIUS_M, AGL_M, STEP_S, VIEWS = 2000.0, 35.0, 300.0, 1.0, 60
 EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
-MODEL = Model(sighting_growth=1.0).at_height(AGL_M)
+MODEL = Model().at_height(AGL_M)
 SPEED = np.array([12.0, 5.0])
 MOUNT_RAD, HORIZON_RAD, SHOWN_RAD = (math.radians(each) for each in (2.0, 1.5, 0.5))
 PLACE_M = 1.5

@@ -77,7 +77,7 @@ def tempered(
             for share, covariance in mounts
         )
     )
-    _, log_det = np.linalg.slogdet(2 * math.pi * noise)
+    _, log_det = np.linalg.slogdet(2 * math.pi * (noise + independent))
     odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
     odds += (1 - newness) * float(log_det) / 2 - len(mean) / 2 * math.log(newness)
     return Measurement(
