@@ -128,7 +128,7 @@ class Tracker:
         self._time_ns: int | None = None
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
-        self._velocity_variance = 0.0
+        self._velocity_variance, self._learnt_s = 0.0, 0.0
         self._seen: list[Sighting] = []
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
@@ -264,6 +264,9 @@ class Tracker:
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
             self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
+        if telemetry.tilt_std_deg is not None:
+            horizon = math.radians(telemetry.tilt_std_deg)
+            self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
             if prior is not None:
@@ -280,7 +283,7 @@ class Tracker:
         self._before = now
         camera = None if moved is None else moved.displacement
         if camera is not None:
-            self._learn_velocity(velocity, camera, seconds)
+            self._learn_velocity(velocity, camera, seconds, float(noise[2]))
         self.mixture.predict(seconds, velocity, camera, noise)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
@@ -334,22 +337,30 @@ class Tracker:
         std = telemetry.vel_std_mps
         if std is None or not std > 0:
             std = usual_velocity_std_mps(float(np.hypot(*now)))
-        std = max(std, math.sqrt(self._velocity_variance))
+        std = max(std, math.sqrt(max(self._velocity_variance, 0.0)))
         return ReportedVelocity(now, before, std, UNAIDED_S if std >= UNAIDED_STD_MPS else None)
 
     def _learn_velocity(
-        self, velocity: ReportedVelocity | None, moved: CameraDisplacement, seconds: float
+        self,
+        velocity: ReportedVelocity | None,
+        moved: CameraDisplacement,
+        seconds: float,
+        horizon_variance: float,
     ) -> None:
-        """Learn the error of the reported velocity from odometry, as far as that shows one."""
+        """Learn the variance of the reported velocity from odometry, less that of odometry itself:
+        a horizon of `horizon_variance` (rad2) that changes looks like motion."""
         if velocity is None or seconds > LEARNT_S:
             return
         bias, _ = self.mixture.bias()
         off = (
             rotation(-bias[0], math.exp(bias[1])) @ moved.moved_en_m - velocity.now_en_mps * seconds
         )
-        shown = (float(off @ off) - float(np.trace(moved.covariance))) / (2 * seconds**2)
-        share = 1 - math.exp(-seconds / LEARNT_S)
-        self._velocity_variance += share * (max(shown, 0.0) - self._velocity_variance)
+        changed = 2 * horizon_variance * (1 - math.exp(-seconds / self.model.horizon_s))
+        own = float(np.trace(moved.covariance)) + changed * float(np.sum(moved.levers_m[0] ** 2))
+        shown = (float(off @ off) - own) / (2 * seconds**2)
+        self._learnt_s += seconds
+        share = max(1 - math.exp(-seconds / LEARNT_S), seconds / self._learnt_s)
+        self._velocity_variance += share * (shown - self._velocity_variance)
 
     def _expected_displacement(
         self, seconds: float, velocity: ReportedVelocity | None

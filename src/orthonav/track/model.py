@@ -191,11 +191,6 @@ def updated(
     return moved, (after + after.swapaxes(-1, -2)) / 2
 
 
-def seen_of(mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """What a sighting measures of states (.., 10): its mean (.., 6) and covariance (.., 6, 6)."""
-    return mean @ SEEN.T, SEEN @ covariance @ SEEN.T
-
-
 def log_densities(off: Array, spread: Array) -> Array:
     """Natural logarithms (..) of the densities of Gaussians (.., N, N) at `off` (.., N)."""
     _, log_det = np.linalg.slogdet(2 * math.pi * spread)
