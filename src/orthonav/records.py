@@ -140,7 +140,7 @@ class Fix:
     ground_cov_en_m2: NDArray[np.float64] | None = None
     """Covariance (2, 2) of its east and north, m2."""
     pitch_deg: float = math.nan
-    """Pitch and roll of the camera, estimated or, where they are exact, as reported."""
+    """Pitch and roll of the camera, estimated; as reported where `pose_cov` is None."""
     roll_deg: float = math.nan
     pose_cov: NDArray[np.float64] | None = None
     """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None

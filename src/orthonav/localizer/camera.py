@@ -23,7 +23,7 @@ from orthonav.register.template import BLOCKS, ViewTemplates
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Blocks are moved so far, pixels of each level, by the first fit and by those after it. 7 px of
 the final level are what 10 deg of tilt make at the rim of a view 65 deg wide."""
-FITS = 2
+FITS = 3
 """The view is fitted at most so many times,"""
 SETTLED = 0.2
 """until a correction is below this share of its standard deviations."""
@@ -100,7 +100,10 @@ def _fitted(
     if made is None:
         return None
     reach_px = FIRST_REACH_PX if first else REACH_PX
-    levels = range(finest, min(final + 1, reference.levels - 1) + 1)
+    coarsest = min(final + 1, reference.levels - 1)
+    levels = [at for at in range(finest, coarsest + 1) if min(made.shape(at)) >= BLOCKS]
+    if not levels:
+        return None
     blocks = [block_scores(made.at(each), reference, pose, reach_px) for each in levels]
     camera = seen.view.picture_at(finest).camera
     ground = seen.relief.ground_m(pose.map_px(blocks[0].middles_px * 2.0**finest))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.geo.camera import axis_on_ground_en_m
 from orthonav.localizer.checks import check_footprint
 from orthonav.localizer.rectify import downsampled, rectify_footprint
 from orthonav.records import Telemetry, View
@@ -49,6 +50,8 @@ displacements: the next displacement cancels most of it."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 """Changes of the biases of heading, log scale, pitch and roll up to which a view need not be
 rectified again. Heading has no limit: views are rectified with their heading up."""
+LEVER_STEP_DEG = 0.05
+"""Step of the numerical derivatives by pitch and roll."""
 UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
 """Usual slope of ground whose slope is unknown, and the share of it that a terrain leaves."""
 LEAST_SCALED = 0.5
@@ -72,10 +75,18 @@ def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
 
 def tilt_lever_m(telemetry: Telemetry) -> Array:
     """Metres east and north (2, 2) by which a camera seems displaced per rad that its pitch and its
-    roll are more than reported."""
-    heading = math.radians(telemetry.yaw_deg)
-    ahead, left = (math.sin(heading), math.cos(heading)), (-math.cos(heading), math.sin(heading))
-    return telemetry.agl_m * np.array([ahead, left]).T
+    roll are more than reported: how far the ground on its optical axis moves."""
+    angles, columns = np.array([telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg]), []
+    for axis in (1, 2):
+        step = np.zeros(3)
+        step[axis] = LEVER_STEP_DEG
+        seen = []
+        for sign in (1, -1):
+            yaw_deg, pitch_deg, roll_deg = (angles + sign * step).tolist()
+            seen.append(axis_on_ground_en_m(yaw_deg, pitch_deg, roll_deg, telemetry.agl_m))
+        ahead, behind = seen
+        columns.append(np.subtract(ahead, behind) / (2 * math.radians(LEVER_STEP_DEG)))
+    return np.stack(columns, axis=1)
 
 
 class _ViewAsMap(Reference):

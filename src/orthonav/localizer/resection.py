@@ -85,7 +85,7 @@ def resected(
         correction = blocks.best(np.stack(ascents), prior)
     curvature, slopes = blocks.system(correction)
     inverse = np.linalg.pinv(curvature, hermitian=True)
-    spread = slopes.T @ slopes * (len(slopes) / max(len(slopes) - 6, 1))
+    spread = slopes.T @ slopes * (blocks.seen / max(blocks.seen - 6, 1))
     excess = max(1.0, correlated * float(np.trace(inverse @ spread)) / 6)
     for _ in range(FINAL_STEPS):
         correction = blocks.stepped(correction, 0.0, excess, prior)
@@ -122,7 +122,7 @@ class _Blocks:
         if (pixels.reshape(len(seen), -1) > 0).sum(axis=1).max() < MIN_BLOCKS:
             return None
         correlations = np.concatenate([scores.correlations for scores, _ in seen])
-        moved = np.where(known[:, None, None], moved, 0.0)
+        moved = np.where((pixels > 0)[:, None, None], moved, 0.0)
         return cls(len(seen), correlated, correlations, pixels, moved)
 
     def sampled(self, prior: tuple[Array, Array]) -> Array:
@@ -142,6 +142,11 @@ class _Blocks:
         known = moved.swapaxes(1, 2) / SAMPLE_STD_PX**2
         right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
         return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
+
+    @property
+    def seen(self) -> int:
+        """Blocks that count at any level."""
+        return int((self.pixels.reshape(self.levels, -1) > 0).any(axis=0).sum())
 
     def climbed(self, start: Array, blurs_px: Sequence[float], prior: tuple[Array, Array]) -> Array:
         """A maximum of the posterior near a correction."""

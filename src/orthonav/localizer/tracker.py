@@ -126,6 +126,7 @@ class Tracker:
         self._usual_scale = self._usual_model
         self.mixture = Mixture(self.model, self._use(localizer))
         self._time_ns: int | None = None
+        self._predicted: Telemetry | None = None
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
         self._velocity_variance, self._learnt_s = 0.0, 0.0
@@ -181,7 +182,8 @@ class Tracker:
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The position by dead reckoning, at a view whose picture cannot be used for `reason`."""
         self._seen = []
-        self._predict(None, telemetry)
+        if telemetry is not self._predicted:  # else an error ended the view after its prediction
+            self._predict(None, telemetry)
         return self._outcome(telemetry, reason)
 
     def smoothed_track(self) -> list[Fix | NoFix]:
@@ -256,6 +258,7 @@ class Tracker:
         cannot have shown, 0..1.
         """
         before, now = self._before, None
+        self._predicted = telemetry
         if view is not None and self._heading_known:
             bias, _ = self.mixture.bias()
             before = None if before is None else before.corrected(bias)

@@ -23,6 +23,9 @@ GREY_SHARE = 0.25
 season mislead about small displacements (docs/decisions/camera.md)."""
 MIN_SEEN = 0.4
 """Blocks of which less is seen on valid map do not count."""
+MIN_ENERGY = 0.1
+"""Blocks with less energy than this share of the median do not count: nearly uniform ground, where
+an edge that a displacement brings in would count for more than it is."""
 Array = NDArray[np.float32]
 
 
@@ -61,14 +64,18 @@ def block_scores(
         *(_energies(template, each) for each in (template.values, here)), strict=True
     )
     pixels = products[:, reach_px, reach_px, 3].astype(np.float64)
-    used = (pixels >= MIN_SEEN * rows * cols / count) & (np.minimum(*energies) > 0)
+    used = pixels >= MIN_SEEN * rows * cols / count
+    for each in energies:
+        used &= each > MIN_ENERGY * np.median(each)
     scale = np.sqrt(np.where(used, energies[0] * energies[1], 1.0))
     correlations = products @ np.sqrt(weights[0] * weights[1]) / scale[:, None, None]
     starts = zip(template.block_starts, template.mask.shape, strict=True)
     y, x = ((np.append(each[1:], size) + each) / 2 - size / 2 for each, size in starts)
     middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return BlockScores(
-        np.where(used[:, None, None], correlations, 0.0), np.where(used, pixels, 0.0), middles
+        np.where(used[:, None, None], np.clip(correlations, -1.0, 1.0), 0.0),
+        np.where(used, pixels, 0.0),
+        middles,
     )
 
 

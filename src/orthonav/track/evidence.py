@@ -71,10 +71,12 @@ def tempered(
     wide = math.log(map_m2) + poses
     # Tilts are distributed as those of mounts at every place: no evidence for one.
     tilts = noise[4:, 4:] + independent[4:, 4:]
-    wide -= math.log(
-        sum(
-            share * math.exp(log_density(mean[4:], tilts + (SEEN @ covariance @ SEEN.T)[4:, 4:]))
-            for share, covariance in mounts
+    wide -= float(
+        np.logaddexp.reduce(
+            [
+                math.log(share) + log_density(mean[4:], tilts + (SEEN @ each @ SEEN.T)[4:, 4:])
+                for share, each in mounts
+            ]
         )
     )
     _, log_det = np.linalg.slogdet(2 * math.pi * (noise + independent))
