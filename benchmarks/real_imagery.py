@@ -90,7 +90,12 @@ class Bench:
             return DATA / views
         folder = self.folder / (views.replace("/", "-") + ".flight")
         if not folder.is_dir():
-            errors = Errors(yaw_std_deg=self.options.yaw_std_deg, agl_std=self.options.agl_std)
+            errors = Errors(
+                yaw_std_deg=self.options.yaw_std_deg,
+                agl_std=self.options.agl_std,
+                mount_std_deg=1.0,
+                horizon_std_deg=1.0,
+            )
             simulate_flight(
                 SimulateRequest(
                     [DATA / views],

@@ -195,6 +195,13 @@ def _verdict(judged: Judged, confidence: Array, inside: NDArray[np.bool_]) -> li
     ]
 
 
+def _nees(judged: Judged, confidence: Array, inside: NDArray[np.bool_]) -> float:
+    """Mean normalized error squared of correct accepted views; NaN without one."""
+    used = judged.right & inside & (confidence >= CONFIDENT)
+    values = np.array([each["nees"] for each in judged.rows])[used]
+    return float(values.mean()) if len(values) else float("nan")
+
+
 def _scenes_table(judged: Judged) -> Table:
     left_out, shipped = judged.left_out(), judged.shipped()
     rows = []
@@ -209,15 +216,18 @@ def _scenes_table(judged: Judged) -> Table:
                 percent(float(judged.right[found].mean()), 1),
                 *_verdict(judged, left_out, inside),
                 *_verdict(judged, shipped, inside),
+                f"{_nees(judged, shipped, inside):.2f}",
             ]
         )
     header = (
         *("scene", "views on + off the map", "correct", "accepted of correct", "wrong of accepted"),
-        *("calibration error", "shipped: accepted", "wrong", "calibration error"),
+        *("calibration error", "shipped: accepted", "wrong", "calibration error", "NEES"),
     )
     notes = (
         f"accepted: confidence of {CONFIDENT:g} or more; correct: within 35 m or 10 px, with a "
         "prior within 20 px; heading sd 10 deg, height sd 10 %, tracked: 2 deg and 3 %",
+        "NEES: mean normalized error squared of correct views that the shipped weights accept, 2 "
+        "is right; pitch and roll err by a mount and a horizon of 1 deg each, not reported",
         "by a fit to the other scenes; shipped: by the weights of the program, fitted to views of "
         "these scenes",
     )

@@ -23,11 +23,13 @@ from orthonav.flight.folder import read_image
 from orthonav.localizer import Localizer
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile import open_map
-from orthonav.records import PRIOR_SIGMAS, NoFix, Telemetry, View
+from orthonav.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
+TILT_STD_DEG = 1.0
+"""Of the mount and of the horizon, in pitch and in roll, not reported."""
 TRACK_YAW_STD_DEG, TRACK_AGL_STD = 2.0, 0.03
 """Errors of heading and height, and what a track knows of them."""
 FAR_PX, FAR_M, FAR_FROM_PRIOR_PX = 10.0, 35.0, 20.0
@@ -205,17 +207,17 @@ def _placed(
         return None
     found, gsd_m = seen.found, localizer.grid.gsd_m
     assert localizer.confidence is not None
-    camera = seen.camera(found.placed)
-    place = localizer.camera_en_m(seen.prepared, found.placed.pose)
-    if camera is not None:
-        place = camera.orientation.position_m[:2]
-    error_m = float(np.hypot(*(place - localizer.sheet.frame.en_from_latlon(*truth))))
+    fix, frame = localizer.fix(seen, found, view.telemetry), localizer.sheet.frame
+    off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
+    error_m = float(np.hypot(*off_m))
     far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
+    far_m = max(far_m, RADIUS_SHARE * fix.agl_m)
     right = case.kind in ("found", "beside") and error_m <= far_m
     return {
         "evidence": found.evidence(),
         "chances": asdict(localizer.confidence.chances),
         "error_px": error_m / gsd_m,
+        "nees": float(off_m @ np.linalg.solve(fix.cov_en_m2, off_m)),
         "right": right,
         "pose": astuple(found.placed.pose),
         "side_px": seen.prepared.side_px,
@@ -299,7 +301,13 @@ def _flight(ortho: Path, case: Case, count: int, seed: int, work: Path) -> Path:
         yaw_std_deg, agl_std = YAW_STD_DEG, AGL_STD
         if case.tracked:
             yaw_std_deg, agl_std = TRACK_YAW_STD_DEG, TRACK_AGL_STD
-        errors = Errors(yaw_std_deg=yaw_std_deg, agl_std=agl_std, prior_std_m=prior_m)
+        errors = Errors(
+            yaw_std_deg=yaw_std_deg,
+            agl_std=agl_std,
+            prior_std_m=prior_m,
+            mount_std_deg=TILT_STD_DEG,
+            horizon_std_deg=TILT_STD_DEG,
+        )
         agl_m = case.width_px * gsd_m / min(DEFAULT_CAMERA.extent)
         request = SimulateRequest(
             [ortho], folder, random=count, agl_m=agl_m, errors=errors, seed=seed
