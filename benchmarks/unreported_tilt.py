@@ -29,19 +29,17 @@ from benchmarks.inputs import DATA, file_of, map_of
 from benchmarks.record import Table, number, provenance
 from benchmarks.tilt_pictures import Exterior, attitude_of, write_picture
 from benchmarks.trust_views import Pair, is_covered, pairs, views_in
+from benchmarks.verdicts import FAR_M
 from orthonav.geo.camera import axis_on_ground_en_m
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, locate_view
-from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
+from orthonav.records import CONFIDENT, RADIUS_SHARE, Fix, NoFix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 """Errors of heading and height, which are reported."""
-WRONG_M, WRONG_SHARE = 35.0, 0.025
-"""A camera is placed wrongly if it is off by more than this and by more than this share of the
-height."""
 HEADER = (
     *("scene", "px", "tilt sd", "views", "confident %", "median m", "95 % m", "% of height"),
     *("stated sd m", "NEES", "middle m", "wrong", "ms"),
@@ -93,7 +91,7 @@ class Placed:
     @property
     def is_wrong(self) -> bool:
         """Whether the camera is farther off than tilt explains."""
-        return self.error_m > WRONG_M and self.share_of_height > WRONG_SHARE
+        return self.error_m > FAR_M and self.share_of_height > RADIUS_SHARE
 
 
 @dataclass(frozen=True)
@@ -260,7 +258,7 @@ def notes(options: argparse.Namespace) -> tuple[str, ...]:
         "median m, 95 % m, % of height: error of the camera; stated sd: root of the mean "
         "eigenvalue of the covariance; NEES: mean, 2 if the covariance is right; middle: median "
         "error of the ground in the middle of the picture",
-        f"wrong: camera off by more than {WRONG_M:g} m and {WRONG_SHARE:.1%} of the height; "
+        f"wrong: camera off by more than {FAR_M:g} m and {RADIUS_SHARE:.1%} of the height; "
         "ms: median of all views, one core, warm",
     )
 

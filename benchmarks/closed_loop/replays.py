@@ -15,9 +15,15 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.ground import Demo
 from benchmarks.closed_loop.recorded import MIRRORED, OFF, ON, SHIFTED, Exposure, Recorded
+from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.inputs import DATA
 from benchmarks.record import Section, Table, number
 from orthonav.localizer.tracker import Tracker
+from orthonav.onboard.aiding import (
+    AIDED_TILT_STD_DEG,
+    UNAIDED_TILT_STD_DEG,
+    UNAIDED_VEL_STD_MPS,
+)
 from orthonav.onboard.run import Locator, SingleViews, locate_view
 from orthonav.publish.estimate import Clock, error_ellipse, estimate_from_result
 from orthonav.publish.gate import Gate
@@ -25,11 +31,6 @@ from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
 
 RECORDED = DATA / "closed_loop"
 METHODS = ("single", "single, no prior", "track")
-FAR_M, FAR_STD = 35.0, 3.0
-"""A position is wrong if its error exceeds both, as in `benchmarks.faults`."""
-GNSS_TILT_STD_DEG = 1.5
-ALONE_TILT_STD_DEG, ALONE_VEL_STD_MPS = 3.0, 5.0
-"""Stated deviations of the telemetry while GNSS aids the autopilot, and while it does not."""
 HEADER = (
     *(
         "flight",
@@ -95,8 +96,8 @@ def is_wrong(error_m: float, cov_en_m2: Array | None) -> bool:
 def stated(telemetry: Telemetry, gnss: bool) -> Telemetry:
     """Telemetry with the deviations of an autopilot with and without GNSS."""
     if gnss:
-        return replace(telemetry, tilt_std_deg=GNSS_TILT_STD_DEG)
-    return replace(telemetry, tilt_std_deg=ALONE_TILT_STD_DEG, vel_std_mps=ALONE_VEL_STD_MPS)
+        return replace(telemetry, tilt_std_deg=AIDED_TILT_STD_DEG)
+    return replace(telemetry, tilt_std_deg=UNAIDED_TILT_STD_DEG, vel_std_mps=UNAIDED_VEL_STD_MPS)
 
 
 def plain(telemetry: Telemetry, gnss: bool) -> Telemetry:

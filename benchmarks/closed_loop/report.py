@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.ground import Demo
 from benchmarks.closed_loop.loop import Flown, Located, Scenario, fly, spans, tilt_off_rad
-from benchmarks.closed_loop.replays import FAR_M, FAR_STD, Rule
+from benchmarks.closed_loop.replays import Rule
+from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.record import Section, Table, number
 
 GNSS_S, BEFORE_S, AFTER_S = 60.0, 60.0, 60.0

@@ -44,7 +44,7 @@ def peaks_px(scores):
             for before, after in ((part[1, 0], part[1, 2]), (part[0, 1], part[2, 1]))
         ]
         found.append([col + 1 + off[0], row + 1 + off[1]])
-    return np.array(found) - scores.reach_px
+    return np.array(found) - scores.correlations.shape[1] // 2
 
 
 @pytest.mark.parametrize("level", [0, 1])

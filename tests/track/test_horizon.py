@@ -2,6 +2,7 @@
 
 import functools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -212,12 +213,13 @@ def test_views_that_overlap_confirm_a_track_however_well_they_show_their_tilt(
     shown_deg, horizon_deg
 ):
     """A place as expected is likelier than none, with a tilt that is known well or hardly."""
-    shown, mixture = math.radians(shown_deg), Mixture(MODEL, EXTENT)
+    shown = math.radians(shown_deg)
+    model = replace(MODEL, horizon_rad=math.radians(horizon_deg))
+    mixture = Mixture(model, EXTENT)
     spread = np.diag([1.0, 1.0, 1e-6, 1e-6, shown**2, shown**2])
     spread[:2, :2] += shown**2 * LEVER_M @ LEVER_M.T
     spread[:2, 4:] = -(shown**2) * LEVER_M
     spread[4:, :2] = spread[:2, 4:].T
-    level = ReportedAttitude(0.0, 0.0, 0.0, math.radians(horizon_deg))
     place = np.zeros(6)
     for view in range(15):
         if view:
@@ -225,10 +227,8 @@ def test_views_that_overlap_confirm_a_track_however_well_they_show_their_tilt(
             camera = CameraDisplacement(
                 SPEED, np.eye(2), 80.0, levers_m=np.stack([LEVER_M, LEVER_M])
             )
-            noise = MODEL.telemetry_noise
-            noise[2] = math.radians(horizon_deg) ** 2
-            mixture.predict(1.0, camera=camera, telemetry_noise=noise)
-        mixture.update(level, [Sighting(place, spread, 25.0)], 0.15, new_ground=0.1)
+            mixture.predict(1.0, camera=camera)
+        mixture.update(LEVEL, [Sighting(place, spread, 25.0)], 0.15, new_ground=0.1)
         found = mixture.estimate(RADIUS_M)
     assert found.state is State.TRACKING and found.confidence > 0.99
     last = [each.share for each in mixture.hypotheses if each.recognized > 0.5]

@@ -286,7 +286,7 @@ class Tracker:
         self._before = now
         camera = None if moved is None else moved.displacement
         if camera is not None:
-            self._learn_velocity(velocity, camera, seconds, float(noise[2]))
+            self._learn_velocity(velocity, camera, seconds)
         self.mixture.predict(seconds, velocity, camera, noise)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
@@ -316,8 +316,6 @@ class Tracker:
             noise[0] = math.radians(telemetry.yaw_std_deg) ** 2
         if telemetry.agl_std_m is not None and telemetry.agl_m > 0:
             noise[1] = (telemetry.agl_std_m / telemetry.agl_m) ** 2
-        if telemetry.tilt_std_deg is not None:
-            noise[2] = math.radians(telemetry.tilt_std_deg) ** 2
         return noise
 
     def _odometry_view(
@@ -344,21 +342,18 @@ class Tracker:
         return ReportedVelocity(now, before, std, UNAIDED_S if std >= UNAIDED_STD_MPS else None)
 
     def _learn_velocity(
-        self,
-        velocity: ReportedVelocity | None,
-        moved: CameraDisplacement,
-        seconds: float,
-        horizon_variance: float,
+        self, velocity: ReportedVelocity | None, moved: CameraDisplacement, seconds: float
     ) -> None:
         """Learn the variance of the reported velocity from odometry, less that of odometry itself:
-        a horizon of `horizon_variance` (rad2) that changes looks like motion."""
+        a horizon that changes looks like motion."""
         if velocity is None or seconds > LEARNT_S:
             return
         bias, _ = self.mixture.bias()
         off = (
             rotation(-bias[0], math.exp(bias[1])) @ moved.moved_en_m - velocity.now_en_mps * seconds
         )
-        changed = 2 * horizon_variance * (1 - math.exp(-seconds / self.model.horizon_s))
+        model = self.model
+        changed = 2 * model.horizon_rad**2 * (1 - math.exp(-seconds / model.horizon_s))
         own = float(np.trace(moved.covariance)) + changed * float(np.sum(moved.levers_m[0] ** 2))
         shown = (float(off @ off) - own) / (2 * seconds**2)
         self._learnt_s += seconds
@@ -441,7 +436,6 @@ class Tracker:
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
-            math.sqrt(self._telemetry_noise(telemetry)[2]),
         )
         self._seen = sightings
         self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)

@@ -44,11 +44,6 @@ class BlockScores(NamedTuple):
     pixels: NDArray[np.float64]
     middles_px: NDArray[np.float64]
 
-    @property
-    def reach_px(self) -> int:
-        """The largest displacement, R."""
-        return int(self.correlations.shape[1] // 2)
-
 
 def block_scores(
     template: Template, reference: Reference, pose: Pose, reach_px: int

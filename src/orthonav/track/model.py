@@ -131,14 +131,12 @@ class Model:
 class ReportedAttitude:
     """The reported attitude of a view.
 
-    `heading_rad`: None where unknown. `pitch_rad`, `roll_rad`. `horizon_rad`: standard deviation of
-    the changing error of these two, that of the model where None.
+    `heading_rad`: None where unknown. `pitch_rad`, `roll_rad`.
     """
 
     heading_rad: float | None
     pitch_rad: float
     roll_rad: float
-    horizon_rad: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +164,7 @@ def measurement(
     noise = sighting.covariance.copy()
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)
-    horizon = model.horizon_rad if reported.horizon_rad is None else reported.horizon_rad
-    white = WHITE_SHARE * horizon
+    white = WHITE_SHARE * model.horizon_rad
     independent = np.diag(np.square([0.0, 0.0, 0.0, 0.0, white, white]))
     seen = sighting.mean.copy()
     if reported.heading_rad is None:
