@@ -36,6 +36,10 @@ from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
 from orthonav.track.hypotheses import within
 
+ERROR_VARIANCE = 1.5
+"""Of errors over what their covariance says, for the confidence: errors of a camera have heavier
+tails than a Gaussian (docs/decisions/camera.md)."""
+
 
 @dataclass(frozen=True, eq=False)
 class RegisteredView:
@@ -196,7 +200,7 @@ class RegistrationLocalizer:
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
         radius_m = max(self.radius_m, RADIUS_SHARE * found.agl_m)
         # Of the camera: its place is right, and its error is within the radius.
-        confidence *= within(found.place_en_m, found.cov_en_m2, radius_m)
+        confidence *= within(found.place_en_m, ERROR_VARIANCE * found.cov_en_m2, radius_m)
         evidence |= found.stds
         if found.middle_cov_en_m2 is not None:
             widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
