@@ -17,6 +17,7 @@ import rasterio
 from rasterio.warp import transform_bounds
 
 from benchmarks.inputs import DATA, file_of, map_of
+from orthonav.errors import OutputError
 from orthonav.files import write_text
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.folder import read_image
@@ -312,7 +313,11 @@ def _flight(ortho: Path, case: Case, count: int, seed: int, work: Path) -> Path:
         request = SimulateRequest(
             [ortho], folder, random=count, agl_m=agl_m, errors=errors, seed=seed
         )
-        simulate_flight(request)
+        try:
+            simulate_flight(request)
+        except OutputError:
+            if not folder.is_dir():  # else another process has made the same flight meanwhile
+                raise
     return folder
 
 
