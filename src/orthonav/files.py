@@ -142,6 +142,16 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def with_paths(record: object, *names: str) -> None:
+    """Turn fields of a frozen record that are text, or hold texts, into paths; None stays."""
+    for name in names:
+        value = getattr(record, name)
+        if isinstance(value, str):
+            object.__setattr__(record, name, Path(value))
+        elif value is not None and not isinstance(value, Path):
+            object.__setattr__(record, name, tuple(Path(each) for each in value))
+
+
 def require_file(path: Path, what: str) -> Path:
     """Return `path` if it is an existing file, else raise `MissingFileError` naming `what`."""
     path = Path(path)

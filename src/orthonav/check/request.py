@@ -7,6 +7,7 @@ from orthonav.changes.record import ChangedGround
 from orthonav.check.outcome import CheckedInputs
 from orthonav.check.recalibrate import LEARNT, Recalibration
 from orthonav.errors import CheckError
+from orthonav.files import with_paths
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
 from orthonav.records import CONFIDENT
@@ -80,6 +81,7 @@ class CheckRequest:
 
     def __post_init__(self) -> None:
         """Raise `CheckError` for values out of range."""
+        with_paths(self, "map_path", "other_date")
         if self.other_sensor and self.other_date is not None:
             raise CheckError("--other-sensor is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {

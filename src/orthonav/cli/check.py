@@ -160,11 +160,10 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
 def _add_effort(group: argparse._ActionsContainer) -> None:
     """The confidence that is required, and the number of trials."""
     group.add_argument(
-        "--min-confidence",
-        type=float,
-        metavar="P",
-        default=0.9,
-        help="confidence that a fix needs to be accepted (default 0.9)",
+        "--accept",
+        metavar="NAME:MIN",
+        default="confidence:0.9",
+        help="confidence that a fix needs to be accepted (default confidence:0.9)",
     )
     group.add_argument(
         "--effort",
@@ -202,6 +201,17 @@ def run(options: argparse.Namespace) -> int:
     return result.verdict.word.exit_code
 
 
+def _accepted(text: str) -> float:
+    """The least confidence of `--accept`; raises `VariantError`."""
+    from orthonav.confidence.accept import Acceptance
+    from orthonav.errors import VariantError
+
+    accept = Acceptance.parse(text)
+    if accept.criterion != "confidence":
+        raise VariantError(f"--accept of a check is a confidence, such as confidence:0.9: {text}")
+    return accept.threshold
+
+
 def _request(options: argparse.Namespace) -> "CheckRequest":
     from orthonav.check.request import DEFAULT_CAMERA, CheckRequest
     from orthonav.errors import CheckError
@@ -225,7 +235,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         yaw_std_deg=None if options.heading == "unknown" else options.yaw_std_deg,
         agl_std=options.agl_std,
         prior_std_m=None if options.prior == "none" else options.prior_std_m,
-        accept=options.min_confidence,
+        accept=_accepted(options.accept),
         speed_mps=options.speed_mps,
         drift=options.drift,
         relief_m=options.relief_m,

@@ -132,7 +132,7 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
     if options.report_changes is None or opened is None:
         return None
     flights = [
-        (open_flight(folder), read_results(fixes))
+        (open_flight(folder, images_needed=False), read_results(fixes))
         for folder, fixes in zip(options.flight, options.fixes, strict=True)
     ]
     with progress(options) as shown:
@@ -172,7 +172,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None
     layer = _grey_layer(opened) if opened and options.flight else None
-    folders = [open_flight(path) for path in options.flight or []]
+    folders = [open_flight(path, images_needed=False) for path in options.flight or []]
     names = _names(options.fixes)
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):

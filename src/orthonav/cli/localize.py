@@ -111,7 +111,7 @@ def _add_views(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--skip-bad-images",
         action="store_true",
-        help="write images that cannot be decoded as no_fix instead of stopping",
+        help="write images that are missing or cannot be decoded as no_fix instead of stopping",
     )
 
 

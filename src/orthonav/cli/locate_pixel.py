@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
     fix = result.outcome
     if not isinstance(fix, Fix):
         raise FlightError(f"view {options.frame!r} has no position ({fix.reason})")
-    flight = open_flight(options.flight)
+    flight = open_flight(options.flight, images_needed=False)
     view = next((each for each in flight.views if each.frame == options.frame), None)
     if view is None:
         raise FlightError(f"there is no view {options.frame!r}: {options.flight}")

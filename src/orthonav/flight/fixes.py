@@ -113,8 +113,13 @@ def write_results(path: Path, results: Iterable[ViewResult]) -> None:
             out.write(result_to_json(result) + "\n")
 
 
+def is_health(line: str) -> bool:
+    """Whether a line of `fly --jsonl` is one of health, which is no result."""
+    return line.startswith('{"health"')
+
+
 def read_results(path: Path) -> list[ViewResult]:
-    """All results in `path`, in its order; empty lines are skipped.
+    """All results in `path`, in its order; empty lines and those of health are skipped.
 
     Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
     first invalid line.
@@ -130,7 +135,7 @@ def read_results(path: Path) -> list[ViewResult]:
                         f"more than {MAX_LINE_BYTES:,} bytes in a line, or {MAX_RESULTS:,} lines"
                     )
                 line = raw.decode("utf-8").strip()
-                if line:
+                if line and not is_health(line):
                     results.append(result_from_json(line))
             except UnicodeDecodeError as error:
                 raise FlightError(f"line {number}: not UTF-8 text: {path}") from error

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import AreaError, CameraError, FlightError
-from orthonav.files import replacing_folder
+from orthonav.files import replacing_folder, with_paths
 from orthonav.flight.gnss import FILE as GNSS_FILE
 from orthonav.flight.gnss import GnssSample, write_gnss
 from orthonav.flight.writer import FlightWriter
@@ -186,6 +186,9 @@ class SimulateRequest:
     terrain_posting_m: float = 5.0
     camera_pitch_deg: float = 0.0
     gnss: Good | None = None
+
+    def __post_init__(self) -> None:
+        with_paths(self, "orthos", "out")
 
     @property
     def in_perspective(self) -> bool:

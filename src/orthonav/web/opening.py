@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
+from orthonav.files import with_paths
 from orthonav.flight import read_truth
 from orthonav.flight.mount import read_mount
 from orthonav.mapfile import open_map
@@ -31,6 +32,9 @@ class ViewRequest:
     mount: Path | None = None
     radius_m: float = 15.0
     live: bool = False
+
+    def __post_init__(self) -> None:
+        with_paths(self, "run", "map_path", "flight", "truth", "mount")
 
 
 def open_run(request: ViewRequest) -> Run:
