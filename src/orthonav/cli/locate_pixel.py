@@ -1,10 +1,18 @@
 """`orthonav locate-pixel`: where on the ground a pixel of a placed view lies."""
 
 import argparse
+import logging
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json
+
+if TYPE_CHECKING:
+    from orthonav.flight.identity import Source
+    from orthonav.mapfile.terrain import TerrainLayer
+
+log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -46,10 +54,9 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.errors import FlightError
     from orthonav.flight import open_flight
     from orthonav.flight.fixes import read_results
+    from orthonav.flight.identity import Identity, flight_source, read_identity
     from orthonav.flight.mount import read_mount
     from orthonav.flight.pixel import locate_pixel
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.terrain import TerrainLayer
     from orthonav.publish.estimate import ellipse_95
     from orthonav.records import Fix
 
@@ -66,11 +73,10 @@ def run(options: argparse.Namespace) -> None:
     telemetry = view.telemetry
     if options.mount is not None:
         telemetry = read_mount(options.mount).corrected(telemetry)
-    terrain = None
-    if options.map is not None:
-        terrain = TerrainLayer.of(open_map(options.map))
-        if terrain is None:
-            raise FlightError(f"the map has no terrain: {options.map}")
+    terrain, used = (None, None) if options.map is None else _terrain(options.map)
+    given = Identity(used, flight_source(options.flight, flight.views))
+    for difference in read_identity(options.fixes).differences(given):
+        log.warning("fixes are of another run: %s: %s", difference, options.fixes)
     found = locate_pixel(flight.camera, telemetry, fix, (options.x, options.y), terrain)
     ellipse = ellipse_95(found.cov_en_m2)
     height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
@@ -96,3 +102,17 @@ def run(options: argparse.Namespace) -> None:
     print(f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera")
     if not result.is_confident:
         print("! the position of this view is a best guess")
+
+
+def _terrain(path: Path) -> "tuple[TerrainLayer, Source]":
+    """The terrain of a map, and the map; raises `FlightError` without one."""
+    from orthonav.errors import FlightError
+    from orthonav.flight.identity import Source
+    from orthonav.mapfile import open_map
+    from orthonav.mapfile.terrain import TerrainLayer
+
+    opened = open_map(path)
+    terrain = TerrainLayer.of(opened)
+    if terrain is None:
+        raise FlightError(f"the map has no terrain: {path}")
+    return terrain, Source(path.name, opened.manifest.sha256)

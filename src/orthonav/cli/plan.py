@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, add_dem, print_json
+from orthonav.cli.common import add_area, add_dem, beside, print_json
 
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
@@ -93,10 +93,11 @@ def run(options: argparse.Namespace) -> None:
     if options.out is not None:
         _write(options.out, [sheet for sheet in sheets if not isinstance(sheet, tuple)])
         plain["out"] = str(options.out)
-    if options.json:
-        print_json(plain)
-    else:
-        print(plan_text(plain))
+    with beside(options.out):
+        if options.json:
+            print_json(plain)
+        else:
+            print(plan_text(plain))
 
 
 def _sheets(
@@ -258,8 +259,7 @@ def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
 
 
 def _write(path: Path, sheets: list["Route"]) -> None:
-    from orthonav.files import replacing
+    from orthonav.files import write_text
     from orthonav.geo.routes.geojson import to_geojson
 
-    with replacing(path) as temporary:
-        temporary.write_text(to_geojson(sheets), encoding="utf-8")
+    write_text(path, to_geojson(sheets))

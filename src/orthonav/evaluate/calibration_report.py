@@ -67,7 +67,7 @@ def consistency_to_json(consistency: CovarianceConsistency) -> dict[str, object]
 
 
 def calibration_lines(metrics: Metrics) -> list[str]:
-    """Standard figures, confidence and covariance in lines for a terminal."""
+    """Standard figures and confidence in lines for a terminal."""
     standard = metrics.standard
     cep50, cep95 = (measure_text(each, " m") for each in (standard.cep50_m, standard.cep95_m))
     frames = f"{RPE_FRAMES} frame{'s' * (RPE_FRAMES != 1)}"
@@ -80,7 +80,6 @@ def calibration_lines(metrics: Metrics) -> list[str]:
         f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
         f"confidence: {confidence_text(metrics)}",
         *(accepted if metrics.calibration.n_fixes else []),
-        f"covariance: {covariance_text(metrics.consistency)}",
     ]
 
 

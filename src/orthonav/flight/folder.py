@@ -226,8 +226,8 @@ def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[Fligh
         image = frames / frame
         if images_needed and not _is_file(image):
             raise FlightError(
-                f"telemetry line {line} names an image that does not exist; give --skip-bad-images "
-                f"to go on without it: {image}"
+                f"telemetry line {line} names an image that does not exist (localize "
+                f"--skip-bad-images goes on without it): {image}"
             )
         prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
         if hint := swapped_hint(*prior):
