@@ -163,7 +163,8 @@ def _add_effort(group: argparse._ActionsContainer) -> None:
         "--accept",
         metavar="NAME:MIN",
         default="confidence:0.9",
-        help="confidence that a fix needs to be accepted (default confidence:0.9)",
+        help="criterion of a confident fix and its threshold, a confidence (default "
+        "confidence:0.9)",
     )
     group.add_argument(
         "--effort",

@@ -89,6 +89,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "fixes, or one for each in the same order",
     )
     add_report_changes(parser)
+    parser.set_defaults(wrong_usage=parser.error)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -102,7 +103,9 @@ def run(options: argparse.Namespace) -> None:
     options.truth = _one_each(options.truth, options.fixes, "--truth")
     options.truth = options.truth or [folder / "truth.csv" for folder in options.flight]
     if not options.truth:
-        raise FlightError("give --flight FLIGHT_DIR, whose truth.csv is used, or --truth truth.csv")
+        options.wrong_usage(
+            "give --flight FLIGHT_DIR, whose truth.csv is used, or --truth truth.csv"
+        )
     if not 0 < options.radius_m < 1e7:
         raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
     if not 0 < options.rpe_distance_m < 1e7:
@@ -135,7 +138,7 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
         return given * len(fixes)
     if given and len(given) != len(fixes):
         raise FlightError(
-            f"give {option} once, or once per file of fixes: {len(fixes)} expected, got "
+            f"give {option} once per file of fixes, or one for all: {len(fixes)} expected, got "
             f"{len(given)}"
         )
     return given
@@ -148,13 +151,13 @@ def _print(
     plain: dict[str, Any],
     changed: "ChangedGround | None",
 ) -> None:
-    from orthonav.evaluate.calibration_report import covariance_text
+    from orthonav.evaluate.calibration_report import covariance_verdict
     from orthonav.evaluate.flights import summary, table, verdict
 
     if options.json:
         print_json(plain)
         return
-    print(f"{verdict(whole)}\ncovariance: {covariance_text(whole.consistency)}\n")
+    print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
     print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
     for line in changes_text(options, changed):
         print(line)
@@ -239,8 +242,7 @@ def _refuse_swapped(
     )
     if far_m > _SWAPPED_M and swapped_m < far_m / 10:
         raise FlightError(
-            f"true positions are {far_m / 1000:,.0f} km from the fixes or the map, and "
-            f"{swapped_m / 1000:,.1f} km where latitude and longitude are exchanged: {HINT}: {path}"
+            f"true positions are {far_m / 1000:,.0f} km from the fixes (median); {HINT}: {path}"
         )
     if far_m > _FAR_M:
         log.warning(

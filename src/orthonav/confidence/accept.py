@@ -7,7 +7,7 @@ from orthonav.errors import VariantError
 from orthonav.records import Fix, NoFix
 
 CRITERIA = {
-    "confidence": (0.01, 0.999),
+    "confidence": (0.01, 1.0),
     "peak_ratio": (1.0, 1000.0),
     "lowe_ratio": (1.0, 1000.0),
 }

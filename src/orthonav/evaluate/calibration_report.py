@@ -67,7 +67,7 @@ def consistency_to_json(consistency: CovarianceConsistency) -> dict[str, object]
 
 
 def calibration_lines(metrics: Metrics) -> list[str]:
-    """Standard figures and confidence in lines for a terminal."""
+    """Standard figures, confidence and covariance in lines for a terminal."""
     standard = metrics.standard
     cep50, cep95 = (measure_text(each, " m") for each in (standard.cep50_m, standard.cep95_m))
     frames = f"{RPE_FRAMES} frame{'s' * (RPE_FRAMES != 1)}"
@@ -80,6 +80,7 @@ def calibration_lines(metrics: Metrics) -> list[str]:
         f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
         f"confidence: {confidence_text(metrics)}",
         *(accepted if metrics.calibration.n_fixes else []),
+        f"covariance: {covariance_text(metrics.consistency)}",
     ]
 
 
@@ -179,6 +180,14 @@ def confidence_text(metrics: Metrics) -> str:
         f"{calibration.share_right:.3f} of them are within the stated radius{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
+
+
+def covariance_verdict(consistency: CovarianceConsistency) -> str:
+    """A sentence that answers whether the stated covariances can be used."""
+    if not consistency.nees.size:
+        return "Whether covariances are right is unknown: no correct fix states one."
+    judged = nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
+    return f"Covariances are {judged}."
 
 
 def covariance_text(consistency: CovarianceConsistency) -> str:

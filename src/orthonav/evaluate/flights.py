@@ -152,7 +152,7 @@ def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> dict[str
 
 
 def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
-    """Standard figures and confidence of all flights, and metrics of each track.
+    """Standard figures, confidence and covariance of all flights, and metrics of each track.
 
     `whole`: what `total` gives.
     """
