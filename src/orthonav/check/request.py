@@ -9,17 +9,14 @@ from orthonav.check.recalibrate import LEARNT, Recalibration
 from orthonav.errors import CheckError
 from orthonav.files import with_paths
 from orthonav.geo.camera import Camera
+from orthonav.geo.planning import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 from orthonav.geo.route import Route
 from orthonav.records import CONFIDENT
 
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 by 51 degrees, usual for small drones."""
 DEFAULT_SPEED_MPS = 20.0
 """Cruise speed of a small fixed-wing aircraft."""
 DEFAULT_DRIFT = 0.03
 """Dead reckoning with an airspeed sensor and a known wind is usually off by 2 to 5 %."""
-DEFAULT_PRIOR_STD_M = 150.0
-"""About 5 km of dead reckoning at that drift."""
 DEFAULT_RELIEF_M = 3.0
 """Height of houses and trees in open country, one standard deviation."""
 

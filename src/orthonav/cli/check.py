@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
     from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
-    from orthonav.geo.camera import Camera
     from orthonav.geo.route import Route
     from orthonav.geo.terrain import LegProfile
 
@@ -214,15 +213,16 @@ def _accepted(text: str) -> float:
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.check.request import DEFAULT_CAMERA, CheckRequest
+    from orthonav.check.request import CheckRequest
     from orthonav.errors import CheckError
+    from orthonav.geo.planning import DEFAULT_CAMERA
     from orthonav.geo.route import read_route
     from orthonav.sources.cameras import read_camera_file
 
     if options.band_m is not None and options.route is None:
         raise CheckError("--band-m is the width of a band around a route; give --route too")
     route = read_route(options.route) if options.route else None
-    camera: Camera = DEFAULT_CAMERA
+    camera = DEFAULT_CAMERA
     if options.camera is not None:
         camera = read_camera_file(options.camera)
     agl_m, origin = _agl_m(options, route)

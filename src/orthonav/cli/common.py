@@ -73,8 +73,11 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-def add_area(parser: argparse._ActionsContainer, group: argparse._ActionsContainer) -> None:
-    """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser."""
+def add_area(
+    parser: argparse._ActionsContainer, group: argparse._ActionsContainer, band: str = ""
+) -> None:
+    """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser, with
+    its default `band` as text."""
     group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     group.add_argument(
         "--bounds",
@@ -85,7 +88,7 @@ def add_area(parser: argparse._ActionsContainer, group: argparse._ActionsContain
     parser.add_argument(
         "--band-m",
         type=float,
-        help="width of the search band for legs without a width of their own",
+        help=f"width of the search band for legs without a width of their own{band}",
     )
 
 

@@ -20,6 +20,7 @@ from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera, footprint_en_m
 from orthonav.geo.ground import TerrainHeights
+from orthonav.geo.planning import DEFAULT_CAMERA as DEFAULT_CAMERA
 from orthonav.geo.route import Route
 from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
@@ -46,8 +47,6 @@ from orthonav.simulate.terrain import (
     surface_of,
 )
 
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 x 51 deg, typical of survey drones."""
 MAX_VIEWS = 1_000_000
 """Sanity limit."""
 TRIES_PER_VIEW = 400
