@@ -390,8 +390,9 @@ def test_help(run, command):
 @pytest.mark.parametrize(
     "arguments",
     [
-        [],
         ["fly-away"],
+        ["localize", "a.onav", "flight", "--out", "c", "--head", "unknown"],
+        ["--vers"],
         ["info"],
         ["info", "a", "b"],
         ["build", "--ortho", "a.tif"],
