@@ -185,7 +185,7 @@ def test_localize(run, map_path, flight_path, short_flight, out, names_in):
     assert text.code == 0 and "2 views: " in text.out
     cameras = (out / "cameras.csv").read_text().splitlines()
     assert f"{len(cameras) - 1} camera positions: " in text.out
-    refused(run("localize", map_path, few, *to, "--export", "kml=a.kml"), "odm-geo")
+    refused(run("localize", map_path, few, *to, "--export", "shp=a.shp"), "odm-geo")
     assert "confident (confidence 0.9 or more), " in text.out
 
 

@@ -43,7 +43,7 @@ def write_preview(opened: MapFile, path: Path) -> None:
 
 
 def footprint_geojson(opened: MapFile) -> str:
-    """The area with imagery as GeoJSON (RFC 7946): one feature with a polygon or several.
+    """The area with imagery of the first sheet as GeoJSON (RFC 7946): a polygon, or several.
 
     Of a map without a registration layer it is the rectangle of its tiles.
     """
@@ -52,23 +52,20 @@ def footprint_geojson(opened: MapFile) -> str:
     fine = shown.repeat(_FINER, axis=0).repeat(_FINER, axis=1)
     lines, nesting = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     parts: dict[int, list[Any]] = {}
-    for number, line in enumerate(lines):
-        simple = cv2.approxPolyDP(line, _FINER, True)[:, 0]
-        if len(simple) < 3:
-            continue
-        around = int(
-            nesting[0, number, 3]
-        )  # -1: an outer line, else the one that this is a hole of
-        ring = _ring(simple, px_m / _FINER, sheet, outer=around < 0)
-        if around < 0:
-            parts.setdefault(number, []).insert(0, ring)
-        elif around in parts:
-            parts[around].append(ring)
-    feature = {
-        "type": "Feature",
-        "properties": {"map": opened.path.name, "gsd_m": sheet.grid.gsd_m},
-        "geometry": {"type": "MultiPolygon", "coordinates": list(parts.values())},
-    }
+    for holes in (False, True):
+        for number, line in enumerate(lines):
+            around = int(nesting[0, number, 3])  # the line that this is a hole of; -1: none
+            simple = cv2.approxPolyDP(line, _FINER, True)[:, 0]
+            if len(simple) < 3 or (around >= 0) != holes or (holes and around not in parts):
+                continue
+            ring = _ring(simple, px_m / _FINER, sheet, outer=not holes)
+            parts.setdefault(around if holes else number, []).append(ring)
+    several = list(parts.values())
+    geometry = {"type": "MultiPolygon", "coordinates": several}
+    if len(several) == 1:
+        geometry = {"type": "Polygon", "coordinates": several[0]}
+    about = {"map": opened.path.name, "gsd_m": sheet.grid.gsd_m}
+    feature = {"type": "Feature", "properties": about, "geometry": geometry}
     return json.dumps({"type": "FeatureCollection", "features": [feature]}) + "\n"
 
 
