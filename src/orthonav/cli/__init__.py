@@ -108,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Read once, when OpenCV is loaded: a few bytes must not become a picture of gigabytes.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
     arguments = list(sys.argv[1:] if argv is None else argv)
-    verbose = False
+    verbose, options = False, argparse.Namespace()
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
             return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
@@ -125,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
-        return _failed(_one_line(error), verbose)
+        return _failed(_with_options(_one_line(error), options), verbose)
     except KeyboardInterrupt:
         return _failed("interrupted; nothing was written", False)
     except BrokenPipeError:
@@ -271,6 +271,14 @@ def _module(command: str) -> ModuleType:
     # "import" is a word of Python's own.
     name = "import_" if command == "import" else command.replace("-", "_")
     return importlib.import_module(f"orthonav.cli.{name}")
+
+
+def _with_options(message: str, options: argparse.Namespace) -> str:
+    """The message with the option that a value came from, where it begins with a field's name."""
+    name, must, rest = message.partition(" must be ")
+    if not (must and name in vars(options)):
+        return message
+    return f"--{name.replace('_', '-')}{must}{rest}"
 
 
 def _one_line(error: Exception) -> str:

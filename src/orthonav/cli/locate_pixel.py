@@ -60,7 +60,10 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.publish.estimate import ellipse_95
     from orthonav.records import Fix
 
-    result = {each.frame: each for each in read_results(options.fixes)}.get(options.frame)
+    results = {each.frame: each for each in read_results(options.fixes)}
+    if options.frame not in results and Path(options.frame).name in results:
+        options.frame = Path(options.frame).name  # the path of an image
+    result = results.get(options.frame)
     if result is None:
         raise FlightError(f"there is no view {options.frame!r}: {options.fixes}")
     fix = result.outcome

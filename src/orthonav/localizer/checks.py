@@ -46,7 +46,8 @@ def check_telemetry(
     if tilt_deg > MAX_TILT_DEG:
         return NoFix(
             "extreme_tilt",
-            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used",
+            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used; pitch and "
+            "roll are 0 for a camera that looks down",
         )
     if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
