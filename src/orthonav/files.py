@@ -3,8 +3,9 @@
 import errno
 import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -136,10 +137,33 @@ def _remove_folder(path: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
+def is_stdout(path: Path) -> bool:
+    """Whether the path of a text file is `-`, stdout."""
+    return str(path) == "-"
+
+
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 to `path`, whole or not at all."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    """As `write_lines`."""
+    write_lines(path, [text])
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write lines with their ends as UTF-8 to `path`, whole or not at all; `-` is stdout."""
+    if is_stdout(path):
+        sys.stdout.writelines(lines)
+        return
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
+        out.writelines(lines)
+
+
+def with_paths(record: object, *names: str) -> None:
+    """Turn fields of a frozen record that are text, or hold texts, into paths; None stays."""
+    for name in names:
+        value = getattr(record, name)
+        if isinstance(value, str):
+            object.__setattr__(record, name, Path(value))
+        elif value is not None and not isinstance(value, Path):
+            object.__setattr__(record, name, tuple(Path(each) for each in value))
 
 
 def require_file(path: Path, what: str) -> Path:

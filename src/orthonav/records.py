@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthonav.geo.camera import Camera
 from orthonav.geo.ground import Ground
+from orthonav.grey import grey_levels
 
 CONFIDENT = 0.9
 """A fix of at least this confidence counts as confident: the default of publishing and reports."""
@@ -107,14 +108,22 @@ class Telemetry:
 class View:
     """What the camera saw at one exposure, and the telemetry of that time.
 
-    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified.
-    `camera`: calibration of the camera at the size of `grey`.
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified. Images of other
+    kinds are converted by `orthonav.grey.grey_levels`.
+    `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
     `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
+
+    Raises `FlightError` for what is no image, `CameraError` where the aspect ratios differ.
     """
 
     grey: NDArray[np.uint8]
     camera: Camera
     telemetry: Telemetry
+
+    def __post_init__(self) -> None:
+        grey = grey_levels(self.grey)
+        object.__setattr__(self, "grey", grey)
+        object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -463,7 +463,7 @@ def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, rou
 @pytest.mark.parametrize(
     "options, said",
     [
-        (["--min-confidence", "1.5"], "accept must be"),
+        (["--accept", "confidence:1.5"], "--accept confidence: the threshold must be 0.01"),
         (["--seed", "-3"], "seed must be"),
         (["--workers", "0"], "workers must be"),
         (["--effort", "0"], "effort must be"),

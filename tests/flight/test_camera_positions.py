@@ -5,6 +5,7 @@ import io
 import json
 import math
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -87,7 +88,7 @@ def test_exiftool_gets_references_of_both_hemispheres(tmp_path):
     assert other["GPSAltitudeRef"] == "Below Sea Level" and other["GPSImgDirection"] == ""
 
 
-@pytest.mark.parametrize("text", ["csv", "csv=", "kml=a", "=a", ""])
+@pytest.mark.parametrize("text", ["csv", "csv=", "shp=a", "=a", ""])
 def test_an_unknown_export_is_refused(text):
     with pytest.raises(VariantError, match="odm-geo"):
         export_of(text)
@@ -96,3 +97,38 @@ def test_an_unknown_export_is_refused(text):
 def test_an_export_is_a_format_and_a_path(tmp_path):
     name, path = export_of(f"csv={tmp_path}/a=b.csv")
     assert name == "csv" and path == tmp_path / "a=b.csv"
+
+
+def test_a_trajectory_for_evo(tmp_path):
+    """Columns of TUM: seconds, position, and a quaternion that turns camera axes to east, north,
+    up."""
+    comment, first, second = written(tmp_path, "tum", hill).splitlines()
+    assert comment == "# east, north, up (m) of 48.50000000, -2.25000000 (WGS84)"
+    numbers = np.array(first.split(), dtype=float)
+    assert numbers[:4].tolist() == [0, 0, 0, 425.0] and len(second.split()) == 8
+    x, y, z, w = numbers[4:]
+    down = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+    right = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    assert down == pytest.approx([0, 0, -1], abs=1e-6)  # the optical axis
+    heading = np.radians(271.5)
+    assert right == pytest.approx([np.cos(heading), -np.sin(heading), 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("terrain", [hill, None])
+def test_kml_and_gpx_are_xml(tmp_path, terrain):
+    space = {"k": "http://www.opengis.net/kml/2.2", "g": "http://www.topografix.com/GPX/1/1"}
+    kml = ElementTree.fromstring(written(tmp_path, "kml", terrain))
+    mode = {each.text for each in kml.iterfind(".//k:altitudeMode", space)}
+    assert mode == {"absolute" if terrain else "relativeToGround"}
+    line, one, _ = (each.text for each in kml.iterfind(".//k:coordinates", space))
+    assert one == line.split()[0] == f"-2.25000000,48.50000000,{425 if terrain else 120}.00"
+    gpx = ElementTree.fromstring(written(tmp_path, "gpx", terrain))
+    points = gpx.findall(".//g:trkpt", space)
+    assert [each.get("lat") for each in points] == ["48.50000000", "-33.00000000"]
+    assert gpx.find(".//g:time", space) is None
+    assert (gpx.find(".//g:ele", space) is not None) == (terrain is not None)
+    dated = replace(RESULTS[0], frame="a & b.jpg", time_ns=1_700_000_000_250_000_000)
+    export(tmp_path / "a.gpx", "gpx", camera_positions([dated], terrain))
+    gpx = ElementTree.parse(tmp_path / "a.gpx")
+    assert gpx.find(".//g:time", space).text == "2023-11-14T22:13:20.250Z"
+    assert gpx.find(".//g:name", space).text == "a & b.jpg"

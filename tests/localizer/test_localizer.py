@@ -375,11 +375,11 @@ def test_a_picture_with_detail_only_where_it_is_not_compared(localizer):
     assert isinstance(outcome, NoFix) and outcome.reason == "blank"
 
 
-@pytest.mark.parametrize("shape", [(240, 319), (320, 240), (480, 640)])
-def test_a_camera_of_another_size_is_an_error(localizer, flight, shape):
+@pytest.mark.parametrize("shape", [(240, 300), (320, 240), (480, 320)])
+def test_a_camera_of_another_aspect_ratio_is_an_error(flight, shape):
     telemetry = Telemetry(0, 0.0, 0.0, 0.0, 300.0)
     with pytest.raises(CameraError, match=f"320 x 240 px, the image is {shape[1]} x {shape[0]}"):
-        localizer.locate(View(np.zeros(shape, np.uint8), flight.camera, telemetry))
+        View(np.zeros(shape, np.uint8), flight.camera, telemetry)
 
 
 anything = st.floats(allow_nan=True, allow_infinity=True)

@@ -137,8 +137,8 @@ def test_a_missing_image_is_named(localizer, copied):
         list(localize_flight(SingleViews(localizer), flight))
 
 
-def test_a_camera_of_another_size_ends_the_flight(localizer, short):
-    wrong = replace(short, camera=short.camera.resized(640, 480))
+def test_a_camera_of_another_aspect_ratio_ends_the_flight(localizer, short):
+    wrong = replace(short, camera=short.camera.resized(640, 240))
     for skip in (False, True):
         with pytest.raises(CameraError, match=str(short.views[0].path)):
             list(localize_flight(SingleViews(localizer), wrong, skip_bad_images=skip))

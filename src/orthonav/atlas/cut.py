@@ -62,6 +62,7 @@ def cut_map(
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
     or cannot be cut from, `StorageError`, `OutputError`.
     """
+    out = Path(out)
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")

@@ -19,6 +19,7 @@ from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AreaError, AtlasError
+from orthonav.files import with_paths
 from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.route import Route
 from orthonav.geo.sheets import sheets_of_route
@@ -62,6 +63,9 @@ class AtlasRequest:
     index: bool = True
     dem: Path | None = None
     dem_datum: str | None = None
+
+    def __post_init__(self) -> None:
+        with_paths(self, "orthos", "dem")
 
 
 @dataclass(frozen=True)

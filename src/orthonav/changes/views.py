@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.changes.record import ChangeGrid
-from orthonav.errors import FlightError
+from orthonav.errors import OrthonavError
 from orthonav.flight.recording import Flight
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_view
@@ -97,10 +97,10 @@ def views_beside_map(
         if last is not None and math.dist(place, last) < MIN_MOVE * side_m:
             continue
         try:
-            grey = view.grey()
-        except FlightError:
+            shown = View(view.grey(), flight.camera, view.telemetry)
+        except OrthonavError:
             continue
-        seen = beside_map(registration, grid, View(grey, flight.camera, view.telemetry), fix)
+        seen = beside_map(registration, grid, shown, fix)
         if seen is not None:
             last = place
             yield seen

@@ -7,18 +7,16 @@ from orthonav.changes.record import ChangedGround
 from orthonav.check.outcome import CheckedInputs
 from orthonav.check.recalibrate import LEARNT, Recalibration
 from orthonav.errors import CheckError
+from orthonav.files import with_paths
 from orthonav.geo.camera import Camera
+from orthonav.geo.planning import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 from orthonav.geo.route import Route
 from orthonav.records import CONFIDENT
 
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 by 51 degrees, usual for small drones."""
 DEFAULT_SPEED_MPS = 20.0
 """Cruise speed of a small fixed-wing aircraft."""
 DEFAULT_DRIFT = 0.03
 """Dead reckoning with an airspeed sensor and a known wind is usually off by 2 to 5 %."""
-DEFAULT_PRIOR_STD_M = 150.0
-"""About 5 km of dead reckoning at that drift."""
 DEFAULT_RELIEF_M = 3.0
 """Height of houses and trees in open country, one standard deviation."""
 
@@ -80,6 +78,7 @@ class CheckRequest:
 
     def __post_init__(self) -> None:
         """Raise `CheckError` for values out of range."""
+        with_paths(self, "map_path", "other_date")
         if self.other_sensor and self.other_date is not None:
             raise CheckError("--other-sensor is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {

@@ -40,22 +40,19 @@ from orthonav.cores import usable_cores
 from orthonav.errors import AreaError, CameraError, MapFileError
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area
+from orthonav.geo.planning import MIN_BAND_VIEWS, default_band_m
 from orthonav.geo.route import distance_to_polyline_m
 from orthonav.mapfile import open_map
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import MAP_STD_M
 
 Array = NDArray[np.float64]
-BAND_PRIORS = 4.0
-"""Width of a band that is not given, in standard deviations of the prior: two to each side."""
 ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
 """Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
 """Narrower bands that are compared, as parts of the planned one."""
 MIN_VIEWS = 20
 """A check of fewer trial views is refused."""
-MIN_BAND_VIEWS = 0.5
-"""A band is checked at least so many sides of a view wide."""
 MAX_ASPECT = 8.0
 """Largest ratio of the sides of a view."""
 MIN_COVERED = 0.25
@@ -138,8 +135,7 @@ class _Check:
         if route is None:
             return ()
         if band_m is None:
-            priors = BAND_PRIORS * (self.plan.side_m if prior_std_m is None else prior_std_m)
-            band_m = max(priors, MIN_BAND_VIEWS * self.plan.side_m)
+            band_m = default_band_m(self.plan.side_m, prior_std_m)
         Area.from_route(route, band_m)
         return route.bands_m(band_m) or ()
 

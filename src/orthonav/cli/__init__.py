@@ -22,26 +22,78 @@ from orthonav.errors import OrthonavError
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 """Last words of option names that are units."""
 
-COMMANDS = {
-    "demo": "generate an area, build a map, simulate a flight, localize it and report",
-    "plan": "recommend a map for a route, a camera and a height",
-    "fetch": "download orthophotos of an area from open services",
-    "build": "build a map from orthophotos",
-    "atlas": "build, inspect, check and cut an atlas of many sheets",
-    "check": "predict before the flight where views will be localized",
-    "info": "print the contents of a map",
-    "sign": "sign a map, or create a signing key",
-    "verify": "check the signature and the contents of a map",
-    "import": "convert photographs, a video or a ROS recording to a flight folder",
-    "calibrate": "estimate constant errors of mount, compass and height from a flight",
-    "localize": "find the positions of the views of a flight",
-    "locate-pixel": "find the coordinates of a pixel of a localized view",
-    "fly": "send position fixes from a live camera to an autopilot",
-    "evaluate": "compare fixes with the truth",
-    "view": "show a run in the browser: track, views beside the map, health",
-    "simulate": "simulate a flight over an orthophoto of another year",
-    "landscape": "generate orthophotos of a landscape at several dates",
+GROUPS = {
+    "prepare a map": {
+        "plan": (
+            "recommend a map for a route, a camera and a height",
+            "--route route.kml --agl-m 120",
+        ),
+        "fetch": (
+            "download orthophotos of an area from open services",
+            "route.kml --source ign --out ortho.tif",
+        ),
+        "build": (
+            "build a map from orthophotos",
+            "--ortho ortho.tif --route route.kml --band-m 600 --out area.onav",
+        ),
+        "check": (
+            "predict before the flight where views will be localized",
+            "area.onav --route route.kml --agl-m 120 --out check",
+        ),
+        "info": ("print the contents of a map", "area.onav"),
+        "sign": ("sign a map, or create a signing key", "area.onav --key keys/private.pem"),
+        "verify": (
+            "check the signature and the contents of a map",
+            "area.onav --public-key keys/public.pem",
+        ),
+        "atlas": (
+            "build, inspect, check and cut an atlas of many sheets",
+            "build ATLAS --ortho orthos/",
+        ),
+    },
+    "fly": {
+        "fly": (
+            "send position fixes from a live camera to an autopilot",
+            "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550",
+        ),
+    },
+    "analyse a recorded flight": {
+        "import": (
+            "convert photographs, a video or a ROS recording to a flight folder",
+            "photos/ --out flight",
+        ),
+        "localize": (
+            "find the positions of the views of a flight",
+            "area.onav flight --out fixes.jsonl",
+        ),
+        "evaluate": (
+            "compare fixes with the ground truth",
+            "fixes.jsonl --flight flight --map area.onav --report report",
+        ),
+        "view": (
+            "show a run in the browser: track, views beside the map, health",
+            "fixes.jsonl --map area.onav --flight flight",
+        ),
+        "locate-pixel": (
+            "find the coordinates of a pixel of a localized view",
+            "fixes.jsonl 0001.jpg 640 480 --flight flight",
+        ),
+        "calibrate": (
+            "estimate constant errors of mount, compass and height from a flight",
+            "area.onav flight --out mount.json",
+        ),
+    },
+    "try it without data": {
+        "demo": ("generate an area, build a map, simulate a flight, localize it and report", ""),
+        "landscape": ("generate orthophotos of a landscape at several dates", "--out landscape"),
+        "simulate": (
+            "simulate a flight over an orthophoto of another year",
+            "--ortho other-year.tif --route route.kml --agl-m 120 --out flight",
+        ),
+    },
 }
+"""By group and command: what it does, and the arguments of an example."""
+COMMANDS = {name: text for group in GROUPS.values() for name, (text, _) in group.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,11 +108,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Read once, when OpenCV is loaded: a few bytes must not become a picture of gigabytes.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
     arguments = list(sys.argv[1:] if argv is None else argv)
-    verbose = False
+    verbose, options = False, argparse.Namespace()
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
             return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
-        options = _parser(arguments).parse_args(arguments)
+        options = _parse(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
@@ -73,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
-        return _failed(_one_line(error), verbose)
+        return _failed(_with_options(_one_line(error), options), verbose)
     except KeyboardInterrupt:
         return _failed("interrupted; nothing was written", False)
     except BrokenPipeError:
@@ -112,13 +164,35 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    """The options; without a command it prints the help, and wrong ones end with exit code 2."""
+    parser = _parser(arguments)
+    options, unknown = parser.parse_known_args(arguments or ["--help"])
+    if unknown:  # with the usage of the command, not of the whole program
+        options.command_error(f"unrecognized arguments: {' '.join(unknown)}")
+    return options
+
+
+def _overview() -> str:
+    """The commands by group, each with an example."""
+    lines = []
+    for group, commands in GROUPS.items():
+        lines.append(f"{group}:")
+        for name, (text, example) in commands.items():
+            lines += [f"  {name:<13} {text}", f"{'':16}orthonav {name} {example}".rstrip()]
+        lines.append("")
+    return "\n".join([*lines, "options of a command: orthonav COMMAND --help"])
+
+
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     """The parser; only the command asked for loads its own arguments."""
     parser = argparse.ArgumentParser(
         prog="orthonav",
         description="Position fixes for aircraft without GNSS, from a downward camera and an "
         "orthophoto of another year.",
-        epilog="Options of a command: orthonav COMMAND --help",
+        epilog=_overview(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument(
         "--version",
@@ -131,10 +205,14 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     common.add_argument("-q", "--quiet", action="store_true", help="errors only, no progress")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, text in COMMANDS.items():
-        command = commands.add_parser(name, help=text, description=text, parents=[common])
+        command = commands.add_parser(name, description=text, parents=[common], allow_abbrev=False)
+        command.set_defaults(command_error=command.error)
         if name in arguments:
             module = _module(name)
             module.add(command)
+            example = next(group[name][1] for group in GROUPS.values() if name in group)
+            notes = (command.epilog, f"example: orthonav {name} {example}".rstrip())
+            command.epilog = "; ".join(filter(None, notes))
             _name_units(command)
             everyday = getattr(module, "EVERYDAY", ())
             by_action = everyday if isinstance(everyday, dict) else {"": everyday}
@@ -193,6 +271,14 @@ def _module(command: str) -> ModuleType:
     # "import" is a word of Python's own.
     name = "import_" if command == "import" else command.replace("-", "_")
     return importlib.import_module(f"orthonav.cli.{name}")
+
+
+def _with_options(message: str, options: argparse.Namespace) -> str:
+    """The message with the option that a value came from, where it begins with a field's name."""
+    name, must, rest = message.partition(" must be ")
+    if not (must and name in vars(options)):
+        return message
+    return f"--{name.replace('_', '-')}{must}{rest}"
 
 
 def _one_line(error: Exception) -> str:

@@ -29,7 +29,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def action(name: str, text: str) -> argparse.ArgumentParser:
-        found = actions.add_parser(name, help=text, description=text, parents=[common])
+        found = actions.add_parser(
+            name, help=text, description=text, parents=[common], allow_abbrev=False
+        )
         found.add_argument("atlas", metavar="ATLAS", help="folder or URL: s3://, gs://, abfs://")
         return found
 

@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import print_json, progress
+from orthonav.cli.common import beside, print_json, progress
 from orthonav.cli.heights import dem_of, flight_heights
 from orthonav.cli.source import add_source, open_source
 
@@ -75,6 +75,11 @@ def run(options: argparse.Namespace) -> None:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
     found, by_track = _calibrated(options)
     write_mount(options.out, found.mount)
+    with beside(options.out):
+        _print_mount(options, found, by_track)
+
+
+def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_track: bool) -> None:
     if options.json:
         print_json(_plain(found))
         return
@@ -153,11 +158,12 @@ def _run_latency(options: argparse.Namespace) -> None:
 
         found = calibrate_latency(flight.camera, views(), heading_known=options.heading == "known")
     write_latency(options.out, found)
-    if options.json:
-        print_json(asdict(found))
-        return
-    print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
-    print(f"from {found.pairs} pairs of images; written to {options.out}")
+    with beside(options.out):
+        if options.json:
+            print_json(asdict(found))
+            return
+        print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
+        print(f"from {found.pairs} pairs of images; written to {options.out}")
 
 
 def _plain(found: "MountCalibration") -> dict[str, Any]:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
     from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
-    from orthonav.geo.camera import Camera
     from orthonav.geo.route import Route
     from orthonav.geo.terrain import LegProfile
 
@@ -160,11 +159,11 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
 def _add_effort(group: argparse._ActionsContainer) -> None:
     """The confidence that is required, and the number of trials."""
     group.add_argument(
-        "--min-confidence",
-        type=float,
-        metavar="P",
-        default=0.9,
-        help="confidence that a fix needs to be accepted (default 0.9)",
+        "--accept",
+        metavar="NAME:MIN",
+        default="confidence:0.9",
+        help="criterion of a confident fix and its threshold, a confidence (default "
+        "confidence:0.9)",
     )
     group.add_argument(
         "--effort",
@@ -202,16 +201,28 @@ def run(options: argparse.Namespace) -> int:
     return result.verdict.word.exit_code
 
 
+def _accepted(text: str) -> float:
+    """The least confidence of `--accept`; raises `VariantError`."""
+    from orthonav.confidence.accept import Acceptance
+    from orthonav.errors import VariantError
+
+    accept = Acceptance.parse(text)
+    if accept.criterion != "confidence":
+        raise VariantError(f"--accept of a check is a confidence, such as confidence:0.9: {text}")
+    return accept.threshold
+
+
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.check.request import DEFAULT_CAMERA, CheckRequest
+    from orthonav.check.request import CheckRequest
     from orthonav.errors import CheckError
+    from orthonav.geo.planning import DEFAULT_CAMERA
     from orthonav.geo.route import read_route
     from orthonav.sources.cameras import read_camera_file
 
     if options.band_m is not None and options.route is None:
         raise CheckError("--band-m is the width of a band around a route; give --route too")
     route = read_route(options.route) if options.route else None
-    camera: Camera = DEFAULT_CAMERA
+    camera = DEFAULT_CAMERA
     if options.camera is not None:
         camera = read_camera_file(options.camera)
     agl_m, origin = _agl_m(options, route)
@@ -225,7 +236,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         yaw_std_deg=None if options.heading == "unknown" else options.yaw_std_deg,
         agl_std=options.agl_std,
         prior_std_m=None if options.prior == "none" else options.prior_std_m,
-        accept=options.min_confidence,
+        accept=_accepted(options.accept),
         speed_mps=options.speed_mps,
         drift=options.drift,
         relief_m=options.relief_m,

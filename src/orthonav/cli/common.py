@@ -5,7 +5,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,8 +73,11 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-def add_area(parser: argparse._ActionsContainer, group: argparse._ActionsContainer) -> None:
-    """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser."""
+def add_area(
+    parser: argparse._ActionsContainer, group: argparse._ActionsContainer, band: str = ""
+) -> None:
+    """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser, with
+    its default `band` as text."""
     group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     group.add_argument(
         "--bounds",
@@ -85,7 +88,7 @@ def add_area(parser: argparse._ActionsContainer, group: argparse._ActionsContain
     parser.add_argument(
         "--band-m",
         type=float,
-        help="width of the search band for legs without a width of their own",
+        help=f"width of the search band for legs without a width of their own{band}",
     )
 
 
@@ -134,6 +137,16 @@ def search_plan(options: argparse.Namespace) -> "SearchPlan":
     if not 1 <= options.threads <= MAX_THREADS:
         raise VariantError(f"--threads must be 1 to {MAX_THREADS}, got {options.threads}")
     return replace(DEFAULT_PLAN, budget_ms=budget_ms, threads=options.threads)
+
+
+@contextmanager
+def beside(*outputs: Path | None) -> Iterator[None]:
+    """What is printed goes to stderr where one of the outputs of a command is `-`, stdout."""
+    from orthonav.files import is_stdout
+
+    taken = any(path is not None and is_stdout(path) for path in outputs)
+    with redirect_stdout(sys.stderr) if taken else nullcontext():
+        yield
 
 
 def print_json(plain: Any) -> None:

@@ -5,8 +5,9 @@ import json
 import logging
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.changed import (
     add_report_changes,
@@ -14,7 +15,7 @@ from orthonav.cli.changed import (
     changes_to_plain,
     report_changes,
 )
-from orthonav.cli.common import print_json, progress
+from orthonav.cli.common import beside, print_json, progress
 from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 _FAR_M = 50_000.0
 """A larger median error is none of the method: maps of one sheet are smaller."""
+_SWAPPED_M = 1000.0
+"""Nearer true positions are not examined: latitude and longitude may be nearly equal."""
 log = logging.getLogger(__name__)
 
 
@@ -45,10 +48,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--truth",
         type=Path,
-        required=True,
         action="append",
+        default=[],
         metavar="truth.csv",
-        help="true positions; one per file of fixes, in the same order",
+        help="true positions (default: truth.csv of --flight); one for all files of fixes, or one "
+        "for each in the same order",
     )
     parser.add_argument(
         "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
@@ -78,24 +82,29 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--flight",
         type=Path,
         action="append",
+        default=[],
         metavar="FLIGHT_DIR",
-        help="flight folder with the images, for the worst views in the report (with --map and "
-        "--report) and for --report-changes; one per file of fixes, in the same order",
+        help="flight folder with the true positions, and with the images for the worst views in "
+        "the report (with --map and --report) and for --report-changes; one for all files of "
+        "fixes, or one for each in the same order",
     )
     add_report_changes(parser)
+    parser.set_defaults(wrong_usage=parser.error)
 
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.flights import flights_to_json, summary, table, total, verdict
+    from orthonav.evaluate.flights import flights_to_json, total
     from orthonav.files import write_text
     from orthonav.mapfile import open_map
 
-    if len(options.fixes) != len(options.truth):
-        raise FlightError(
-            f"give --truth once per file of fixes: {len(options.fixes)} expected, got "
-            f"{len(options.truth)}"
+    options.flight = _one_each(options.flight, options.fixes, "--flight")
+    options.truth = _one_each(options.truth, options.fixes, "--truth")
+    options.truth = options.truth or [folder / "truth.csv" for folder in options.flight]
+    if not options.truth:
+        options.wrong_usage(
+            "give --flight FLIGHT_DIR, whose truth.csv is used, or --truth truth.csv"
         )
     if not 0 < options.radius_m < 1e7:
         raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
@@ -103,7 +112,10 @@ def run(options: argparse.Namespace) -> None:
         raise FlightError(f"--rpe-distance-m must be above 0, got {options.rpe_distance_m}")
     if options.report:
         require_extras("evaluate --report")
-    _check_flights(options)
+    if options.report_changes and not (options.map and options.flight):
+        raise FlightError(
+            "--report-changes compares views with the map; give --map and --flight too"
+        )
     opened = open_map(options.map) if options.map else None
     flights = _measured(options, opened)
     whole = total(flights)
@@ -114,10 +126,39 @@ def run(options: argparse.Namespace) -> None:
     plain |= changes_to_plain(options, changed)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+    with beside(options.metrics, options.report_changes):
+        _print(options, flights, whole, plain, changed)
+
+
+def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
+    """One path per file of fixes: a single one is for all; none stays none."""
+    from orthonav.errors import FlightError
+
+    if len(given) == 1:
+        return given * len(fixes)
+    if given and len(given) != len(fixes):
+        raise FlightError(
+            f"give {option} once per file of fixes, or one for all: {len(fixes)} expected, got "
+            f"{len(given)}"
+        )
+    return given
+
+
+def _print(
+    options: argparse.Namespace,
+    flights: "list[FlightReport]",
+    whole: "Metrics",
+    plain: dict[str, Any],
+    changed: "ChangedGround | None",
+) -> None:
+    from orthonav.evaluate.calibration_report import covariance_verdict
+    from orthonav.evaluate.flights import summary, table, verdict
+
     if options.json:
         print_json(plain)
         return
-    print(f"{verdict(whole)}\n\n{table(flights, whole)}\n\n{summary(flights, whole)}")
+    print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
+    print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
     for line in changes_text(options, changed):
         print(line)
     if options.report:
@@ -132,32 +173,11 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
     if options.report_changes is None or opened is None:
         return None
     flights = [
-        (open_flight(folder), read_results(fixes))
+        (open_flight(folder, images_needed=False), read_results(fixes))
         for folder, fixes in zip(options.flight, options.fixes, strict=True)
     ]
     with progress(options) as shown:
         return report_changes(options, opened, flights, shown)
-
-
-def _check_flights(options: argparse.Namespace) -> None:
-    """Raise `FlightError` where `--flight` or `--report-changes` lack other options."""
-    from orthonav.errors import FlightError
-
-    flights = options.flight or []
-    if options.report_changes and not (options.map and flights):
-        raise FlightError(
-            "--report-changes compares views with the map; give --map and --flight too"
-        )
-    if flights and not (options.map and (options.report or options.report_changes)):
-        raise FlightError(
-            "--flight shows views beside the map in a report; give --map and --report too, or "
-            "--report-changes"
-        )
-    if flights and len(flights) != len(options.fixes):
-        raise FlightError(
-            f"give --flight once per file of fixes: {len(options.fixes)} expected, got "
-            f"{len(flights)}"
-        )
 
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
@@ -171,15 +191,16 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
 
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None
-    layer = _grey_layer(opened) if opened and options.flight else None
-    folders = [open_flight(path) for path in options.flight or []]
+    layer = _grey_layer(opened) if opened and options.flight and options.report else None
+    folders = [open_flight(path, images_needed=False) for path in options.flight]
     names = _names(options.fixes)
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
         results = read_results(fixes)
         known = read_truth(truth)
         comparison = compare(known, results, local)
-        _warn_if_far(known, results, truth)
+        _refuse_swapped(known, results, opened, truth)
+        _warn_of_another_run(fixes, truth, folders[i] if folders else None, opened)
         worst: tuple[Row, ...] = ()
         if opened and layer:
             worst = _worst(comparison, results, folders[i], opened, layer)
@@ -190,12 +211,17 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     return flights
 
 
-def _warn_if_far(
-    truth: "Mapping[str, tuple[float, float]]", results: "list[ViewResult]", path: Path
+def _refuse_swapped(
+    truth: "Mapping[str, tuple[float, float]]",
+    results: "list[ViewResult]",
+    opened: "MapFile | None",
+    path: Path,
 ) -> None:
-    """Log a warning where true positions are so far from the fixes that one of both is misread."""
+    """Raise `FlightError` where swapping brings the true positions to the fixes or, without any,
+    to the map; log a warning where they are far away as they are."""
     import numpy as np
 
+    from orthonav.errors import FlightError
     from orthonav.geo.frames import distances_m
     from orthonav.geo.swapped import HINT
     from orthonav.records import Fix
@@ -205,20 +231,47 @@ def _warn_if_far(
         for result in results
         if isinstance(result.outcome, Fix) and result.frame in truth
     ]
+    if not both and opened is not None:
+        frame = opened.manifest.sheets[0].frame
+        both = [(place, (frame.lat_deg, frame.lon_deg)) for place in truth.values()]
     if not both:
         return
-    true, found = np.array(both).transpose(1, 0, 2)
+    true, expected = np.array(both).transpose(1, 0, 2)
     far_m, swapped_m = (
-        float(np.nanmedian(distances_m(places, found))) for places in (true, true[:, ::-1])
+        float(np.nanmedian(distances_m(places, expected))) for places in (true, true[:, ::-1])
     )
+    if far_m > _SWAPPED_M and swapped_m < far_m / 10:
+        raise FlightError(
+            f"true positions are {far_m / 1000:,.0f} km from the fixes (median); {HINT}: {path}"
+        )
     if far_m > _FAR_M:
-        hint = HINT if swapped_m < _FAR_M else "are these of the same flight?"
         log.warning(
-            "true positions are %s km from the fixes (median); %s: %s",
+            "true positions are %s km from the fixes (median); are these of the same flight?: %s",
             f"{far_m / 1000:,.0f}",
-            hint,
             path,
         )
+
+
+def _warn_of_another_run(
+    fixes: Path, truth: Path, flight: "FlightFolder | None", opened: "MapFile | None"
+) -> None:
+    """Log a warning where fixes were computed from another map or flight than the given ones.
+
+    Without a flight, it is the flight folder in which the truth is, if any.
+    """
+    from orthonav.errors import OrthonavError
+    from orthonav.flight import open_flight
+    from orthonav.flight.identity import Identity, Source, flight_source, read_identity
+
+    if flight is None and (truth.parent / "telemetry.csv").is_file():
+        with suppress(OrthonavError):
+            flight = open_flight(truth.parent, images_needed=False)
+    given = Identity(
+        Source(opened.path.name, opened.manifest.sha256) if opened else None,
+        flight_source(flight.path, flight.views) if flight else None,
+    )
+    for difference in read_identity(fixes).differences(given):
+        log.warning("fixes are of another run: %s: %s", difference, fixes)
 
 
 def _grey_layer(opened: "MapFile") -> "GreyLayer":

@@ -19,6 +19,7 @@ from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
 from orthonav.flight import read_camera
+from orthonav.flight.identity import Identity, Source
 from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
@@ -88,7 +89,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
         gnss = made(options, localizer.sheet.frame, digest, used, queue, least, clocks)
-    publisher = _publisher(options, clocks, link, least, graph)
+    publisher = _publisher(options, clocks, link, least, graph, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera, digest)
@@ -268,6 +269,7 @@ def _publisher(
     link: AutopilotLink | None,
     least: float,
     graph: PositionOutput | None,
+    digest: str,
 ) -> Publisher:
     interval = {}
     if options.send_rate_hz is not None:
@@ -296,7 +298,10 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        lines = [JsonOut(None if each == "-" else Path(each)) for each in options.jsonl]
+        used = Identity(Source(options.map.name, digest))
+        lines = [
+            JsonOut(None if each == "-" else Path(each), identity=used) for each in options.jsonl
+        ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
     messenger = None if link is None else Messenger(chosen, gate, link.send, clocks)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import print_json
+from orthonav.cli.common import beside, print_json
 
 if TYPE_CHECKING:
     from orthonav.mapfile.manifest import Manifest, SheetInfo
@@ -15,18 +15,37 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to describe")
     parser.add_argument("--json", action="store_true", help="print as JSON")
+    parser.add_argument(
+        "--footprint",
+        type=Path,
+        metavar="FILE.geojson",
+        help="write the outline of the area with imagery as GeoJSON; -: stdout",
+    )
+    parser.add_argument(
+        "--preview",
+        type=Path,
+        metavar="FILE.png",
+        help="write the imagery as a grey .png or .tif for QGIS, placed by FILE.aux.xml beside it",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
     """Open the map, which checks its contents, and print a summary."""
+    from orthonav.files import write_text
     from orthonav.mapfile import open_map
+    from orthonav.mapfile.shown import footprint_geojson, write_preview
 
     opened = open_map(options.map)
+    if options.footprint is not None:
+        write_text(options.footprint, footprint_geojson(opened))
+    if options.preview is not None:
+        write_preview(opened, options.preview)
     plain = summary(opened.manifest, opened.size_bytes, options.map)
-    if options.json:
-        print_json(plain)
-    else:
-        print(summary_text(plain))
+    with beside(options.footprint):
+        if options.json:
+            print_json(plain)
+        else:
+            print(summary_text(plain))
 
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
@@ -172,6 +191,7 @@ def summary_text(plain: dict[str, Any]) -> str:
             f"{sheet['stride_m']:g} m, centre {sheet['centre_lat_deg']:.6f}, "
             f"{sheet['centre_lon_deg']:.6f}"
         )
+        lines.append(f"bounds     {','.join(f'{each:.6f}' for each in sheet['bounds_deg'])}")
     lines.append(f"grey       {_registration_text(plain['registration'])}")
     lines += _terrain_lines(plain["terrain"])
     for source in plain["imagery"]:

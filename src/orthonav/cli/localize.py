@@ -13,7 +13,7 @@ from orthonav.cli.changed import (
     check_comparable,
     report_changes,
 )
-from orthonav.cli.common import add_search, print_json, progress, search_plan
+from orthonav.cli.common import add_search, beside, print_json, progress, search_plan
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
@@ -54,7 +54,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="fixes.jsonl", help="file to write"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="fixes.jsonl",
+        help="file to write; -: stdout, and the summary on stderr",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     _add_views(parser.add_argument_group("placing views"))
@@ -111,7 +115,7 @@ def _add_views(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--skip-bad-images",
         action="store_true",
-        help="write images that cannot be decoded as no_fix instead of stopping",
+        help="write images that are missing or cannot be decoded as no_fix instead of stopping",
     )
 
 
@@ -151,9 +155,9 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
         action="append",
         default=[],
         metavar="FORMAT=PATH",
-        help="write the confident camera positions for other programs too: csv, geojson, odm-geo "
-        "(OpenDroneMap's geo.txt) or exif (a table for `exiftool -csv=PATH FOLDER`); heights above "
-        "sea need a terrain; can be repeated",
+        help="write the confident camera positions for other programs too: csv, geojson, kml, gpx, "
+        "tum (a trajectory for evo), odm-geo (OpenDroneMap's geo.txt) or exif (a table for "
+        "`exiftool -csv=PATH FOLDER`); heights above sea need a terrain; can be repeated",
     )
     add_report_changes(group)
 
@@ -172,6 +176,7 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
+    from orthonav.flight.identity import FlightDigest, Identity, Source
     from orthonav.flight.mount import MountedFlight
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
@@ -207,6 +212,7 @@ def _on_map(options: argparse.Namespace) -> None:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
     results, advisor = [], SetupAdvice(options, flight, localizer, mount, heights)
+    digest, used = FlightDigest(), Source(options.map.name, opened.manifest.sha256)
     with progress(options) as shown:
         for result in localize_flight(
             locator,
@@ -214,7 +220,7 @@ def _on_map(options: argparse.Namespace) -> None:
             skip_bad_images=options.skip_bad_images,
             accept=accept,
             heights=heights,
-            views=advisor.watching(),
+            views=digest.watching(advisor.watching()),
         ):
             results.append(result)
             advisor.take(result)
@@ -224,7 +230,7 @@ def _on_map(options: argparse.Namespace) -> None:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
-        write_results(options.out, results)
+        write_results(options.out, results, Identity(used, digest.source(options.flight)))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
@@ -262,6 +268,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
+    from orthonav.flight.identity import FlightDigest, Identity
     from orthonav.onboard.run import localize_flight
 
     asked = [
@@ -282,7 +289,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     exports = [export_of(each) for each in options.export]
     flight = open_source(options.flight, options)
     say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
-    results = []
+    results, digest = [], FlightDigest()
     search = TileSearch(Atlas.open(options.map))
     with progress(options) as shown:
         if search.unknown:
@@ -295,12 +302,16 @@ def _on_atlas(options: argparse.Namespace) -> None:
             SheetRegistrar(search.atlas), search, heading_known=options.heading == "known"
         )
         for result in localize_flight(
-            locator, flight, skip_bad_images=options.skip_bad_images, accept=accept
+            locator,
+            flight,
+            skip_bad_images=options.skip_bad_images,
+            accept=accept,
+            views=digest.watching(flight.views),
         ):
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    write_results(options.out, results)
+    write_results(options.out, results, Identity(flight=digest.source(options.flight)))
     export_all(exports, results, None)
     _print_summary(options, results, accept)
 
@@ -313,7 +324,21 @@ def _print_summary(
     tried: Sequence[dict[str, Any]] = (),
     changed: "ChangedGround | None" = None,
 ) -> None:
-    """Print the summary."""
+    """Print the summary, on stderr where an output is stdout."""
+    outputs = [options.out, options.report_changes]
+    outputs += [Path(each.partition("=")[2]) for each in options.export]
+    with beside(*outputs):
+        _print_counts(options, results, accept, advice, tried, changed)
+
+
+def _print_counts(
+    options: argparse.Namespace,
+    results: "list[ViewResult]",
+    accept: "Acceptance",
+    advice: Sequence[str],
+    tried: Sequence[dict[str, Any]],
+    changed: "ChangedGround | None",
+) -> None:
     import numpy as np
 
     counts = Counts.of(results)
@@ -326,6 +351,7 @@ def _print_summary(
         "n_confident": counts.confident,
         "n_low_confidence": counts.low,
         "n_none": counts.none,
+        "reasons": dict(counts.reasons),
         "accept": options.accept,
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
         "advice": list(advice),
@@ -336,9 +362,12 @@ def _print_summary(
         print_json(plain)
         return
     least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
+    named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
+    why = f" ({named})" if named else ""
     print(
         f"{counts.views} views: {counts.confident} confident ({least}), {counts.low} of low "
-        f"confidence, {counts.none} without a position; median {median_ms or 0:.1f} ms per view"
+        f"confidence, {counts.none} without a position{why}; "
+        f"median {median_ms or 0:.1f} ms per view"
     )
     for line in advice:
         print(f"! {line}")

@@ -1,10 +1,18 @@
 """`orthonav locate-pixel`: where on the ground a pixel of a placed view lies."""
 
 import argparse
+import logging
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json
+
+if TYPE_CHECKING:
+    from orthonav.flight.identity import Source
+    from orthonav.mapfile.terrain import TerrainLayer
+
+log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -46,31 +54,32 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.errors import FlightError
     from orthonav.flight import open_flight
     from orthonav.flight.fixes import read_results
+    from orthonav.flight.identity import Identity, flight_source, read_identity
     from orthonav.flight.mount import read_mount
     from orthonav.flight.pixel import locate_pixel
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.terrain import TerrainLayer
     from orthonav.publish.estimate import ellipse_95
     from orthonav.records import Fix
 
-    result = {each.frame: each for each in read_results(options.fixes)}.get(options.frame)
+    results = {each.frame: each for each in read_results(options.fixes)}
+    if options.frame not in results and Path(options.frame).name in results:
+        options.frame = Path(options.frame).name  # the path of an image
+    result = results.get(options.frame)
     if result is None:
         raise FlightError(f"there is no view {options.frame!r}: {options.fixes}")
     fix = result.outcome
     if not isinstance(fix, Fix):
         raise FlightError(f"view {options.frame!r} has no position ({fix.reason})")
-    flight = open_flight(options.flight)
+    flight = open_flight(options.flight, images_needed=False)
     view = next((each for each in flight.views if each.frame == options.frame), None)
     if view is None:
         raise FlightError(f"there is no view {options.frame!r}: {options.flight}")
     telemetry = view.telemetry
     if options.mount is not None:
         telemetry = read_mount(options.mount).corrected(telemetry)
-    terrain = None
-    if options.map is not None:
-        terrain = TerrainLayer.of(open_map(options.map))
-        if terrain is None:
-            raise FlightError(f"the map has no terrain: {options.map}")
+    terrain, used = (None, None) if options.map is None else _terrain(options.map)
+    given = Identity(used, flight_source(options.flight, flight.views))
+    for difference in read_identity(options.fixes).differences(given):
+        log.warning("fixes are of another run: %s: %s", difference, options.fixes)
     found = locate_pixel(flight.camera, telemetry, fix, (options.x, options.y), terrain)
     ellipse = ellipse_95(found.cov_en_m2)
     height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
@@ -96,3 +105,17 @@ def run(options: argparse.Namespace) -> None:
     print(f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera")
     if not result.is_confident:
         print("! the position of this view is a best guess")
+
+
+def _terrain(path: Path) -> "tuple[TerrainLayer, Source]":
+    """The terrain of a map, and the map; raises `FlightError` without one."""
+    from orthonav.errors import FlightError
+    from orthonav.flight.identity import Source
+    from orthonav.mapfile import open_map
+    from orthonav.mapfile.terrain import TerrainLayer
+
+    opened = open_map(path)
+    terrain = TerrainLayer.of(opened)
+    if terrain is None:
+        raise FlightError(f"the map has no terrain: {path}")
+    return terrain, Source(path.name, opened.manifest.sha256)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, add_dem, print_json
+from orthonav.cli.common import add_area, add_dem, beside, print_json
 
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
@@ -20,12 +20,17 @@ if TYPE_CHECKING:
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    add_area(parser, parser.add_mutually_exclusive_group(required=True))
+    add_area(
+        parser,
+        parser.add_mutually_exclusive_group(required=True),
+        " (default: 600 m, at least half a view)",
+    )
     parser.add_argument(
         "--camera",
         type=Path,
         metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: 1280 x "
+        "960 px, 65 by 51 deg",
     )
     parser.add_argument("--agl-m", type=float, help="height above ground (default: from the route)")
     parser.add_argument("--speed-mps", type=float, help="ground speed")
@@ -62,7 +67,7 @@ def run(options: argparse.Namespace) -> None:
     """Compute and print the plan."""
     from orthonav.cli.plan_text import plan_text
     from orthonav.errors import RouteError
-    from orthonav.geo.planning import rate_cautions, view_cautions
+    from orthonav.geo.planning import default_band_m, rate_cautions, view_cautions
     from orthonav.geo.route import read_route
     from orthonav.geo.terrain import terrain_cautions
 
@@ -73,8 +78,10 @@ def run(options: argparse.Namespace) -> None:
         raise RouteError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
         raise RouteError(f"ground speed must be above 0 m/s, got {options.speed_mps}")
-    sheets, areas = _sheets(options, route)
     view = _view(options, route)
+    if route is not None and options.band_m is None:
+        options.band_m = default_band_m(0.0 if view is None else view.side_m)
+    sheets, areas = _sheets(options, route)
     gsd_m, tile_px = _map_of(options, view)
     legs: list[LegProfile] = []
     if route is not None and options.dem is not None:
@@ -84,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
         cautions += rate_cautions(view, options.speed_mps)
     cautions += terrain_cautions(legs)
     plain: dict[str, Any] = {
-        "route": None if route is None else _route_plain(route, options.speed_mps),
+        "route": None if route is None else _route_plain(route, options),
         "view": None if view is None else _view_plain(view, gsd_m, options.speed_mps),
         "map": _map_plain(options, areas, sheets, gsd_m, tile_px),
         "terrain": [_leg_plain(leg) for leg in legs] if options.dem else None,
@@ -93,10 +100,11 @@ def run(options: argparse.Namespace) -> None:
     if options.out is not None:
         _write(options.out, [sheet for sheet in sheets if not isinstance(sheet, tuple)])
         plain["out"] = str(options.out)
-    if options.json:
-        print_json(plain)
-    else:
-        print(plan_text(plain))
+    with beside(options.out):
+        if options.json:
+            print_json(plain)
+        else:
+            print(plan_text(plain))
 
 
 def _sheets(
@@ -116,20 +124,21 @@ def _sheets(
 def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
     """The view from `--agl-m`, else from the lowest height of the route."""
     from orthonav.errors import CameraError
-    from orthonav.geo.planning import ViewPlan
+    from orthonav.geo.planning import DEFAULT_CAMERA, ViewPlan
     from orthonav.sources.cameras import read_camera_file
 
-    if options.camera is None:
-        return None
     agl_m = options.agl_m
     if agl_m is None and route is not None:
         agl_m = _lowest_agl_m(options, route)
+    if agl_m is None and options.camera is None:
+        return None
     if agl_m is None:
         raise CameraError(
             "--camera needs a height above ground: give --agl-m, or a route with heights (above "
             "ground; with --dem also above the sea or above home)"
         )
-    return ViewPlan.of(read_camera_file(options.camera), agl_m)
+    camera = read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA
+    return ViewPlan.of(camera, agl_m)
 
 
 def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
@@ -152,7 +161,8 @@ def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float
     if view is None:
         if options.gsd_m is None:
             raise AreaError(
-                "the ground resolution of the map is unknown; give --gsd-m, or --camera and --agl-m"
+                "the ground resolution of the map is unknown; give --agl-m, a route with heights "
+                "above ground, or --gsd-m"
             )
         return options.gsd_m, 256 if options.tile_px is None else options.tile_px
     gsd_m, tile_px = suited_map(view)
@@ -175,16 +185,17 @@ def _profile(
     return profile(route, bands_m, agl_m, view_m, ground)
 
 
-def _route_plain(route: "Route", speed_mps: float | None) -> dict[str, Any]:
+def _route_plain(route: "Route", options: argparse.Namespace) -> dict[str, Any]:
     from orthonav.geo.route import leg_lengths_m
 
-    length_m = float(leg_lengths_m(route).sum())
+    length_m, speed_mps = float(leg_lengths_m(route).sum()), options.speed_mps
     frames = {each.frame for each in route.heights if each is not None}
     return {
         "name": route.name,
         "waypoints": len(route.waypoints),
         "length_m": round(length_m, 1),
         "duration_s": None if speed_mps is None else round(length_m / speed_mps, 1),
+        "band_m": round(options.band_m, 1),
         "heights_above": sorted("unknown" if frame is None else frame for frame in frames),
         "legs_with_own_band": sum(band is not None for band in route.leg_bands_m),
     }
@@ -258,8 +269,7 @@ def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
 
 
 def _write(path: Path, sheets: list["Route"]) -> None:
-    from orthonav.files import replacing
+    from orthonav.files import write_text
     from orthonav.geo.routes.geojson import to_geojson
 
-    with replacing(path) as temporary:
-        temporary.write_text(to_geojson(sheets), encoding="utf-8")
+    write_text(path, to_geojson(sheets))

@@ -33,10 +33,16 @@ def _route(route: dict[str, Any]) -> str:
         seconds = route["duration_s"]
         text += f", {seconds:.0f} s" if seconds < 300 else f", {seconds / 60:.0f} min"
     if route["heights_above"]:
-        text += f", heights above {' and '.join(route['heights_above'])}"
+        text += f", heights above {' and '.join(map(_reference, route['heights_above']))}"
     if route["legs_with_own_band"]:
         text += f", {_count(route['legs_with_own_band'], 'leg')} with a band of its own"
+    if route["legs_with_own_band"] < max(1, route["waypoints"] - 1):
+        text += f", search band {route['band_m']:.0f} m"
     return text
+
+
+def _reference(name: str) -> str:
+    return {"agl": "ground", "unknown": "an unknown reference"}.get(name, name)
 
 
 def _view(view: dict[str, Any]) -> list[str]:

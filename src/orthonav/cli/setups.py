@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -36,15 +37,26 @@ class Counts:
     confident: int
     low: int
     none: int
+    reasons: tuple[tuple[str, int], ...] = ()
+    """Reasons of views without a position and their numbers, the most frequent first."""
 
     @classmethod
     def of(cls, results: "Sequence[ViewResult]") -> "Counts":
         """The counts of these results."""
-        from orthonav.records import Fix
+        from orthonav.records import Fix, NoFix
 
+        reasons = Counter(
+            each.outcome.reason for each in results if isinstance(each.outcome, NoFix)
+        )
         fixes = sum(isinstance(result.outcome, Fix) for result in results)
         confident = sum(result.is_confident for result in results)
-        return cls(len(results), confident, fixes - confident, len(results) - fixes)
+        return cls(
+            len(results),
+            confident,
+            fixes - confident,
+            len(results) - fixes,
+            tuple(reasons.most_common()),
+        )
 
     @property
     def few(self) -> bool:

@@ -168,6 +168,7 @@ def open_source(
         ground_alt_m=options.ground_alt_m,
         looks_down=options.looks_down,
         over_terrain=over_terrain,
+        skip_bad_images=getattr(options, "skip_bad_images", False),
     )
     recording = open_source(path, source_options)
     for warning in recording.warnings:

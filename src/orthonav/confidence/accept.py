@@ -6,7 +6,12 @@ from dataclasses import dataclass
 from orthonav.errors import VariantError
 from orthonav.records import Fix, NoFix
 
-CRITERIA = ("confidence", "peak_ratio", "lowe_ratio")
+CRITERIA = {
+    "confidence": (0.01, 1.0),
+    "peak_ratio": (1.0, 1000.0),
+    "lowe_ratio": (1.0, 1000.0),
+}
+"""Thresholds that make sense, by criterion. The best of two scores is no less than the other."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +28,7 @@ class Acceptance:
 
     @classmethod
     def parse(cls, text: str) -> "Acceptance":
-        """From `name:threshold`; raises `VariantError`."""
+        """From `name:threshold`, the value of `--accept`; raises `VariantError`."""
         name, _, value = text.partition(":")
         try:
             threshold = float(value)
@@ -31,8 +36,13 @@ class Acceptance:
             threshold = math.nan
         if name not in CRITERIA or not math.isfinite(threshold):
             raise VariantError(
-                f"criterion must be one of {', '.join(CRITERIA)} with a threshold, such as "
+                f"--accept must be one of {', '.join(CRITERIA)} with a threshold, such as "
                 f"confidence:0.9 or lowe_ratio:1.13, got '{text}'"
+            )
+        least, most = CRITERIA[name]
+        if not least <= threshold <= most:
+            raise VariantError(
+                f"--accept {name}: the threshold must be {least:g} to {most:g}, got {value}"
             )
         return cls(name, threshold)
 

@@ -182,6 +182,14 @@ def confidence_text(metrics: Metrics) -> str:
     )
 
 
+def covariance_verdict(consistency: CovarianceConsistency) -> str:
+    """A sentence that answers whether the stated covariances can be used."""
+    if not consistency.nees.size:
+        return "Whether covariances are right is unknown: no correct fix states one."
+    judged = nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
+    return f"Covariances are {judged}."
+
+
 def covariance_text(consistency: CovarianceConsistency) -> str:
     """Consistency of the covariance in a sentence."""
     if not consistency.n_right:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import FlightError
+from orthonav.errors import FlightError, OrthonavError
 from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import Comparison
 from orthonav.flight.recording import Flight, RecordedView
@@ -159,7 +159,7 @@ def _row(
         try:
             side_m, centre_en_m, shown = _view_cutout(view, flight.camera, result)
             why_not = ""
-        except FlightError as error:
+        except OrthonavError as error:
             why_not = str(error).removesuffix(f": {view.where}")
     maps = [_map_cutout(pyramid, grid, at, centre_en_m, side_m) for at in (fix_en_m, truth_en_m)]
     return Row(
@@ -184,15 +184,13 @@ def _view_cutout(
 ) -> tuple[float, NDArray[np.float64], Cutout]:
     """Width of the image in metres, its middle from the camera (2,), and the image.
 
-    Raises `FlightError` with the reason where there is none.
+    Raises `OrthonavError` with the reason where there is none.
     """
     used = as_fixed(view.telemetry, result)
     refused = check_telemetry(used, camera, None, heading_known=True)
     if refused is not None:
         raise FlightError(refused.detail)
     grey = view.grey()
-    if grey.shape != (camera.height_px, camera.width_px):
-        raise FlightError("the image does not have the size of the calibration")
     longer_m = max(camera.extent) * used.agl_m
     side_m = MARGIN * longer_m
     gsd_m = side_m / SIDE_PX

@@ -17,7 +17,7 @@ from orthonav.fetch.politeness import RequestLimits, Stopped
 from orthonav.fetch.service import CellSource
 from orthonav.fetch.sources import open_cells
 from orthonav.fetch.write import Packing, write_mosaic
-from orthonav.files import Progress, no_progress
+from orthonav.files import Progress, no_progress, with_paths
 from orthonav.geo.area import Area
 from orthonav.geo.swapped import swapped_hint
 
@@ -57,6 +57,9 @@ class FetchRequest:
     """Whether the file is written although tiles failed; they are masked."""
     limits: RequestLimits = field(default_factory=RequestLimits)
     """How the service is asked."""
+
+    def __post_init__(self) -> None:
+        with_paths(self, "out", "cache")
 
 
 @dataclass(frozen=True)

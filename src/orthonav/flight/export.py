@@ -1,4 +1,4 @@
-"""Camera positions of a flight for other programs: CSV, GeoJSON, OpenDroneMap, ExifTool.
+"""Camera positions of a flight for other programs: tables, maps, photogrammetry, trajectories.
 
 Only confident positions are written: photogrammetry takes what it is given as measured.
 """
@@ -9,16 +9,26 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from orthonav.errors import VariantError
 from orthonav.files import write_text
+from orthonav.geo.camera import enu_from_camera
+from orthonav.geo.frames import LocalFrame
 from orthonav.geo.ground import TerrainHeights
 from orthonav.records import MAP_STD_M, Fix, ViewResult
 
+_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
+_YEAR_2000_NS = 946_684_800 * 10**9
+"""Earlier times count from something else than 1970."""
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
 
 
@@ -29,7 +39,8 @@ class CameraPosition:
     `lat_deg`, `lon_deg`: WGS84. `height_m`: above mean sea level, NaN without a terrain. `agl_m`:
     above ground. `heading_deg`: of the top of the picture, clockwise from north. `std_m`: standard
     deviation of the position along its worst axis, the displacement of the map included.
-    `confidence`: probability in 0..1.
+    `confidence`: probability in 0..1. `time_ns`: exposure. `pitch_deg`, `roll_deg`: of the camera,
+    NaN where unknown.
     """
 
     frame: str
@@ -40,6 +51,9 @@ class CameraPosition:
     heading_deg: float
     std_m: float
     confidence: float
+    time_ns: int = 0
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
 
 
 def camera_positions(
@@ -67,6 +81,9 @@ def camera_positions(
                 fix.heading_deg,
                 math.sqrt(worst),
                 fix.confidence,
+                result.time_ns,
+                fix.pitch_deg,
+                fix.roll_deg,
             )
         )
     return found
@@ -189,6 +206,88 @@ def _exif(positions: Sequence[CameraPosition]) -> str:
     return _table([header, *rows])
 
 
+def _tum(positions: Sequence[CameraPosition]) -> str:
+    """A trajectory as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
+
+    East, north and up of the first position; the quaternion turns camera axes (x to the right of
+    the image, y down the image, z along the optical axis) to these. Unknown angles count as 0.
+    Heights are above sea where all are known, else above ground.
+    """
+    if not positions:
+        return ""
+    origin = positions[0].lat_deg, positions[0].lon_deg
+    plane, above_sea = LocalFrame(*origin), _are_above_sea(positions)
+    lines = [f"# east, north, up (m) of {origin[0]:.8f}, {origin[1]:.8f} (WGS84)"]
+    for each in positions:
+        east, north = plane.en_from_latlon(each.lat_deg, each.lon_deg).tolist()
+        up = each.height_m if above_sea else each.agl_m
+        angles = np.nan_to_num([each.heading_deg, each.pitch_deg, each.roll_deg]).tolist()
+        numbers = " ".join(f"{value:.9f}" for value in _quaternion(enu_from_camera(*angles)))
+        lines.append(
+            f"{Decimal(each.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation (3, 3)."""
+    vector, _ = cv2.Rodrigues(rotation)
+    angle = float(np.linalg.norm(vector))
+    x, y, z = (vector.ravel() * (math.sin(angle / 2) / angle if angle else 0.0)).tolist()
+    return x, y, z, math.cos(angle / 2)
+
+
+def _are_above_sea(positions: Sequence[CameraPosition]) -> bool:
+    return all(math.isfinite(each.height_m) for each in positions)
+
+
+def _kml(positions: Sequence[CameraPosition]) -> str:
+    """The track and a place for each picture; heights are absolute where all are above sea."""
+    above_sea = _are_above_sea(positions)
+    mode = "absolute" if above_sea else "relativeToGround"
+    points = [
+        f"{each.lon_deg:.8f},{each.lat_deg:.8f},{each.height_m if above_sea else each.agl_m:.2f}"
+        for each in positions
+    ]
+
+    def placemark(name: str, about: str, kind: str, coordinates: str) -> str:
+        return (
+            f"<Placemark><name>{escape(name)}</name><description>{about}</description>"
+            f"<{kind}><altitudeMode>{mode}</altitudeMode><coordinates>{coordinates}</coordinates>"
+            f"</{kind}></Placemark>"
+        )
+
+    marks = [placemark("track", f"{len(points)} positions", "LineString", " ".join(points))]
+    marks += [
+        placemark(each.frame, f"std {each.std_m:.1f} m", "Point", point)
+        for each, point in zip(positions, points, strict=True)
+    ]
+    body = "\n".join(marks)
+    return (
+        f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n{body}\n</Document></kml>\n'
+    )
+
+
+def _gpx(positions: Sequence[CameraPosition]) -> str:
+    """A track (GPX 1.1); with heights above sea where known, and times that are dates."""
+    lines = []
+    for each in positions:
+        height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
+        time = ""
+        if each.time_ns >= _YEAR_2000_NS:
+            seconds = datetime.fromtimestamp(each.time_ns // 10**9, UTC).strftime(
+                "%Y-%m-%dT%H:%M:%S"
+            )
+            time = f"<time>{seconds}.{each.time_ns % 10**9 // 10**6:03d}Z</time>"
+        place = f'lat="{each.lat_deg:.8f}" lon="{each.lon_deg:.8f}"'
+        lines.append(f"<trkpt {place}>{height}{time}<name>{escape(each.frame)}</name></trkpt>")
+    body = "\n".join(lines)
+    return (
+        f'{_XML}<gpx version="1.1" creator="orthonav" xmlns="http://www.topografix.com/GPX/1/1">'
+        f"<trk><trkseg>\n{body}\n</trkseg></trk></gpx>\n"
+    )
+
+
 def _table(rows: Sequence[Sequence[str]]) -> str:
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(rows)
@@ -200,5 +299,8 @@ FORMATS: dict[str, Callable[[Sequence[CameraPosition]], str]] = {
     "geojson": _geojson,
     "odm-geo": _odm_geo,
     "exif": _exif,
+    "tum": _tum,
+    "kml": _kml,
+    "gpx": _gpx,
 }
 """Writers by the name of their format."""

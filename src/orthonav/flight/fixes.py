@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from decimal import Decimal
+from itertools import chain, repeat
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
@@ -18,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
-from orthonav.files import replacing, require_file
+from orthonav.files import require_file, write_lines
+from orthonav.flight.identity import Identity
 from orthonav.records import Evidence, Fix, NoFix, ViewResult
 
 KEYS = (
@@ -60,6 +62,8 @@ MAX_LINE_BYTES = 2**20
 MAX_RESULTS = 1_000_000
 """Limit of lines: as many as a flight folder may have views."""
 _TIME_LIMIT_S = 2**63 / 1e9
+UNKNOWN = Identity()
+"""Of a run whose map and flight are not stated."""
 
 
 def result_to_json(result: ViewResult) -> str:
@@ -106,15 +110,23 @@ def result_from_json(line: str) -> ViewResult:
     )
 
 
-def write_results(path: Path, results: Iterable[ViewResult]) -> None:
-    """Write `results` to `path`, one line each, whole or not at all."""
-    with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
-        for result in results:
-            out.write(result_to_json(result) + "\n")
+def write_results(path: Path, results: Iterable[ViewResult], identity: Identity = UNKNOWN) -> None:
+    """Write `results` to `path`, one line each, whole or not at all; `-` is stdout.
+
+    The first line states `identity`, the map and the flight that they were computed from.
+    """
+    stated = chain([identity], repeat(UNKNOWN))
+    lines = map(result_to_json, results)
+    write_lines(path, (own.added_to(line) + "\n" for line, own in zip(lines, stated, strict=False)))
+
+
+def is_health(line: str) -> bool:
+    """Whether a line of `fly --jsonl` is one of health, which is no result."""
+    return line.startswith('{"health"')
 
 
 def read_results(path: Path) -> list[ViewResult]:
-    """All results in `path`, in its order; empty lines are skipped.
+    """All results in `path`, in its order; empty lines and those of health are skipped.
 
     Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
     first invalid line.
@@ -130,7 +142,7 @@ def read_results(path: Path) -> list[ViewResult]:
                         f"more than {MAX_LINE_BYTES:,} bytes in a line, or {MAX_RESULTS:,} lines"
                     )
                 line = raw.decode("utf-8").strip()
-                if line:
+                if line and not is_health(line):
                     results.append(result_from_json(line))
             except UnicodeDecodeError as error:
                 raise FlightError(f"line {number}: not UTF-8 text: {path}") from error

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path, PurePosixPath
@@ -81,11 +81,12 @@ class FlightFolder:
         return len(self.views)
 
 
-def open_flight(path: Path) -> FlightFolder:
-    """Open a flight folder and check that every image named is there.
+def open_flight(path: Path, *, images_needed: bool = True) -> FlightFolder:
+    """Open a flight folder and, if `images_needed`, check that every image named is there.
 
-    Raises `MissingFileError`, `FlightError` or `CameraError` with file and line. Values that are
-    not numbers become NaN: a missing heading or height concerns one view only.
+    The camera is scaled to the size of the first image that can be decoded. Raises
+    `MissingFileError`, `FlightError` or `CameraError` with file and line. Values that are not
+    numbers become NaN: a missing heading or height concerns one view only.
     """
     path = Path(path)
     if not path.is_dir():
@@ -93,10 +94,24 @@ def open_flight(path: Path) -> FlightFolder:
         raise MissingFileError(f"flight folder {kind}: {path}")
     camera, note = read_camera(path / "flight.json")
     telemetry = require_file(path / "telemetry.csv", "telemetry of the flight")
-    views = tuple(_views(telemetry, path / "frames"))
+    views = tuple(_views(telemetry, path / "frames", images_needed))
     if not views:
         raise FlightError(f"telemetry has no views: {telemetry}")
-    return FlightFolder(path, camera, note, views)
+    return FlightFolder(path, _fitted(camera, views), note, views)
+
+
+def _fitted(camera: Camera, views: Iterable[FlightView]) -> Camera:
+    """The camera at the size of the first image that can be decoded."""
+    for view in views:
+        try:
+            height, width = view.grey().shape
+        except (FlightError, MissingFileError):
+            continue
+        try:
+            return camera.fitted(width, height)
+        except CameraError as error:
+            raise CameraError(f"{error}: {view.where}") from error
+    return camera
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -195,7 +210,7 @@ def read_camera(path: Path) -> tuple[Camera, str]:
         ) from error
 
 
-def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
+def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[FlightView]:
     seen: set[str] = set()
     for line, row in csv_rows(telemetry, TELEMETRY_COLUMNS):
         frame = row["frame"]
@@ -209,8 +224,11 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         if time_ns is None:
             raise FlightError(f"line {line}: time_s is not a time in seconds: {telemetry}")
         image = frames / frame
-        if not _is_file(image):
-            raise FlightError(f"telemetry line {line} names an image that does not exist: {image}")
+        if images_needed and not _is_file(image):
+            raise FlightError(
+                f"telemetry line {line} names an image that does not exist (localize "
+                f"--skip-bad-images goes on without it): {image}"
+            )
         prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
         if hint := swapped_hint(*prior):
             raise FlightError(f"line {line}: prior position is out of range{hint}: {telemetry}")

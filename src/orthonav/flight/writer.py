@@ -25,12 +25,12 @@ class FlightWriter:
     """
 
     def __init__(self, folder: Path, camera: Camera, note: str) -> None:
-        self._folder = folder
+        self._folder = Path(folder)
         self._camera = camera
         self._note = note
         self._rows: list[dict[str, Any]] = []
         self._truth: list[tuple[str, str, str]] = []
-        (folder / "frames").mkdir()
+        (self._folder / "frames").mkdir()
 
     def add(
         self,

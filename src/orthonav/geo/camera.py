@@ -90,6 +90,22 @@ class Camera:
         """Ground resolution in metres per pixel of a vertical view from `agl_m`."""
         return agl_m / math.sqrt(self.fx_px * self.fy_px)
 
+    def fitted(self, width_px: int, height_px: int) -> "Camera":
+        """The camera for images of this size.
+
+        Raises `CameraError` where the aspect ratio differs: then the image is an unknown crop, not
+        a scaled version of the same view.
+        """
+        if (self.width_px, self.height_px) == (width_px, height_px):
+            return self
+        apart = abs(self.height_px * width_px - height_px * self.width_px)
+        if apart > max(self.width_px, width_px):
+            raise CameraError(
+                f"camera is {self.width_px} x {self.height_px} px, the image is {width_px} x "
+                f"{height_px} px, a size with another aspect ratio; calibrate in that mode"
+            )
+        return self.resized(width_px, height_px)
+
     def resized(self, width_px: int, height_px: int) -> "Camera":
         """The camera of the same picture resampled to another size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px

@@ -29,8 +29,22 @@ VIEW_OVERLAP = 0.6
 """Usual forward overlap of aerial photography."""
 TRACKED_PER_S = 10.0
 """Views per second while tracking on one desktop core: docs/benchmarks.md."""
+DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
+"""A field of view of 65 by 51 degrees, usual for small drones."""
+DEFAULT_PRIOR_STD_M = 150.0
+"""About 5 km of dead reckoning with an error of 3 %."""
+BAND_PRIORS = 4.0
+"""Width of a band that is not given, in standard deviations of the prior: two to each side."""
+MIN_BAND_VIEWS = 0.5
+"""A band is checked at least so many sides of a view wide."""
 _NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 """Mantissas of round ground resolutions."""
+
+
+def default_band_m(view_m: float, prior_std_m: float | None = DEFAULT_PRIOR_STD_M) -> float:
+    """Width of the search band of a route, for views of `view_m` and a prior position, if any."""
+    priors = BAND_PRIORS * (view_m if prior_std_m is None else prior_std_m)
+    return max(priors, MIN_BAND_VIEWS * view_m)
 
 
 @dataclass(frozen=True)
@@ -70,6 +84,11 @@ class ViewPlan:
     def short_m(self) -> float:
         """The shorter side in metres."""
         return min(self.width_m, self.height_m)
+
+    @property
+    def side_m(self) -> float:
+        """Root of the area in metres."""
+        return math.sqrt(self.width_m * self.height_m)
 
     @property
     def spacing_m(self) -> float:

@@ -138,7 +138,7 @@ def _suffixes(folder: Path) -> str:
     """The kinds of files in a folder, the most common first."""
     counted = Counter(path.suffix.lower() or path.name for path in _files(folder))
     named = [f"{count} {suffix}" for suffix, count in counted.most_common(NAMED)]
-    return ", ".join(named) or "nothing"
+    return ", ".join(named) or "nothing, it is empty"
 
 
 def _preference(source: Source) -> tuple[object, ...]:

@@ -375,7 +375,9 @@ def _outline(
     latlon = np.stack([np.asarray(lat, dtype=float), np.asarray(lon, dtype=float)], axis=1)
     if not np.isfinite(latlon).all() or np.abs(latlon[:, 0]).max() > 90:
         raise ImageryError(
-            f"orthophoto's border cannot be converted to latitude, longitude: {path}"
+            "orthophoto's border cannot be converted to latitude, longitude: x of "
+            f"{x.min():g} to {x.max():g} and y of {y.min():g} to {y.max():g} do not fit its "
+            f"coordinate system; assign the correct one: {path}"
         )
     if system.is_geographic and max(-float(x.min()), float(x.max())) > 180 + 1e-6:
         raise ImageryError(

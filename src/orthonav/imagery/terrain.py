@@ -199,6 +199,7 @@ def open_dem(path: Path, datum: str | None = None) -> Dem:
     `datum`: what its heights count from, where the file does not state it (`datum.OPTION`).
     Raises `MissingFileError` or `ImageryError`.
     """
+    path = Path(path)
     if not path.is_file():
         raise MissingFileError(f"terrain file does not exist: {path}")
     try:

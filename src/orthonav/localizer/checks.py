@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import CameraError
 from orthonav.geo.camera import Camera
 from orthonav.localizer.rectify import RectifiedView, off_nadir_deg
 from orthonav.records import NoFix, Telemetry, View
@@ -26,18 +25,9 @@ _SAMPLE_STEP_PX = 8
 
 
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
-    """Why a view cannot be placed on a map of resolution `gsd_m`; None if it can be tried.
-
-    Raises `CameraError` where the picture is not of the camera's size.
-    """
-    grey, camera = view.grey, view.camera
-    if grey.shape != (camera.height_px, camera.width_px):
-        raise CameraError(
-            f"camera is {camera.width_px} x {camera.height_px} px, "
-            f"the image is {grey.shape[1]} x {grey.shape[0]} px"
-        )
-    refused = check_telemetry(view.telemetry, camera, gsd_m, heading_known)
-    return refused or check_picture(grey)
+    """Why a view cannot be placed on a map of resolution `gsd_m`; None if it can be tried."""
+    refused = check_telemetry(view.telemetry, view.camera, gsd_m, heading_known)
+    return refused or check_picture(view.grey)
 
 
 def check_telemetry(
@@ -56,7 +46,8 @@ def check_telemetry(
     if tilt_deg > MAX_TILT_DEG:
         return NoFix(
             "extreme_tilt",
-            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used",
+            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used; pitch and "
+            "roll are 0 for a camera that looks down",
         )
     if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")

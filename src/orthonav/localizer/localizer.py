@@ -74,8 +74,8 @@ class Localizer:
         """The position from which a view was taken.
 
         `prior` limits the search to three standard deviations around it. With `heading_known`
-        false all headings are tried and the reported heading may be NaN. Raises `CameraError` if
-        the camera has another size than the picture; any other fault of a view makes a `NoFix`.
+        false all headings are tried and the reported heading may be NaN. Any fault of a view makes
+        a `NoFix`.
         """
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:

@@ -237,7 +237,7 @@ def _header(opened: _OpenFile) -> tuple[dict[str, Any], int]:
     head = opened.read(0, 9)
     length = int.from_bytes(head[:8], "little")
     if length > MAX_HEADER_BYTES or head[8:] != b"{":
-        raise MapFileError("not an orthonav map")
+        raise MapFileError("not an orthonav map; `orthonav build` makes one from orthophotos")
     data = opened.read(8, length)
     if len(data) != length:
         raise MapFileError("map is truncated (header)")

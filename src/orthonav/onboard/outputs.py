@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Protocol, TextIO
 
 from orthonav.errors import VariantError
-from orthonav.flight.fixes import result_to_json
+from orthonav.flight.fixes import UNKNOWN, result_to_json
+from orthonav.flight.identity import Identity
 from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.correlation import FilterCovariance
@@ -382,9 +383,12 @@ class JsonOut:
     """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld` in addition, and
     lines of health, which begin with the key `health`."""
 
-    def __init__(self, path: Path | None, stream: TextIO | None = None) -> None:
-        """Append to a file, or write to `stream` (stdout) where `path` is None."""
-        self._path = path
+    def __init__(
+        self, path: Path | None, stream: TextIO | None = None, identity: Identity = UNKNOWN
+    ) -> None:
+        """Append to a file, or write to `stream` (stdout) where `path` is None; the first view
+        states `identity`."""
+        self._path, self._identity = path, identity
         self._stream: TextIO | None = stream or sys.stdout
         if path is not None:
             self._stream = path.open("a", encoding="ascii")
@@ -394,7 +398,9 @@ class JsonOut:
     ) -> None:
         """Write one view. Raises `OSError`."""
         more = {"age_ms": round(age_ms, 3), "sent": list(sent), "withheld": withheld}
-        self._write(result_to_json(result)[:-1] + ", " + json.dumps(more)[1:])
+        line = result_to_json(result)[:-1] + ", " + json.dumps(more)[1:]
+        self._write(self._identity.added_to(line))
+        self._identity = UNKNOWN
 
     def health(self, plain: dict[str, object]) -> None:
         """Write one line of health. Raises `OSError`."""

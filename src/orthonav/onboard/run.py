@@ -10,7 +10,13 @@ from typing import Protocol
 import numpy as np
 
 from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError, FlightError, MapChangedError, MapFileError
+from orthonav.errors import (
+    CameraError,
+    FlightError,
+    MapChangedError,
+    MapFileError,
+    MissingFileError,
+)
 from orthonav.flight.heights import FlownHeights
 from orthonav.flight.recording import Flight, RecordedView
 from orthonav.localizer.localizer import Localizer
@@ -95,16 +101,16 @@ def localize_flight(
     """Results of the views of a recorded flight, in order, as they are computed.
 
     `heights`: turns reported heights into heights above ground; None: they are used as reported.
-    With `accept` each result says whether its fix meets it. Raises `FlightError` at an image that
-    cannot be decoded, unless `skip_bad_images` makes it a `NoFix`; raises `CameraError` where an
-    image has not the camera's size.
+    With `accept` each result says whether its fix meets it. Raises `FlightError` or
+    `MissingFileError` at an image that cannot be decoded or is missing, unless `skip_bad_images`
+    makes it a `NoFix`; raises `CameraError` where an image has not the camera's aspect ratio.
     """
     for view in flight.views if views is None else views:
         outcome: Fix | NoFix
         telemetry = view.telemetry if heights is None else heights.corrected(view.telemetry)
         try:
             grey = view.grey()
-        except FlightError as error:
+        except (FlightError, MissingFileError) as error:
             if not skip_bad_images:
                 raise
             reason = NoFix("bad_image", str(error))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthonav import represent
 from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.errors import AreaError, OutputError, VariantError
+from orthonav.files import with_paths
 from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.estimate import estimate_map
 from orthonav.geo.grid import TileGrid
@@ -88,6 +89,9 @@ class BuildRequest:
     dem_needed: bool = True
     device: str = "auto"
     cells: bool = False
+
+    def __post_init__(self) -> None:
+        with_paths(self, "orthos", "out", "other_dates", "work", "dem")
 
 
 @dataclass(frozen=True)

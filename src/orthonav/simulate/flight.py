@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import AreaError, CameraError, FlightError
-from orthonav.files import replacing_folder
+from orthonav.files import replacing_folder, with_paths
 from orthonav.flight.gnss import FILE as GNSS_FILE
 from orthonav.flight.gnss import GnssSample, write_gnss
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera, footprint_en_m
 from orthonav.geo.ground import TerrainHeights
+from orthonav.geo.planning import DEFAULT_CAMERA as DEFAULT_CAMERA
 from orthonav.geo.route import Route
 from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
@@ -46,8 +47,6 @@ from orthonav.simulate.terrain import (
     surface_of,
 )
 
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 x 51 deg, typical of survey drones."""
 MAX_VIEWS = 1_000_000
 """Sanity limit."""
 TRIES_PER_VIEW = 400
@@ -186,6 +185,9 @@ class SimulateRequest:
     terrain_posting_m: float = 5.0
     camera_pitch_deg: float = 0.0
     gnss: Good | None = None
+
+    def __post_init__(self) -> None:
+        with_paths(self, "orthos", "out")
 
     @property
     def in_perspective(self) -> bool:

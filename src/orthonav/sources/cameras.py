@@ -70,9 +70,11 @@ def read_camera_file(path: Path) -> Camera:
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
     except _BROKEN as error:
+        found = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise CameraError(
-            "expected flight.json, or a camera of OpenCV, ROS or Kalibr "
-            f"({type(error).__name__}: {error}): {path}"
+            "expected flight.json, or a camera of OpenCV (camera_matrix, image_width, ..), ROS "
+            "(camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..); "
+            f"{found}: {path}"
         ) from error
 
 

@@ -32,7 +32,7 @@ def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
     if kind == "video" and not path.is_file():
         raise FlightError(f"expected a file for kind video, got a folder: {path}")
     if kind == "flight":
-        return _flight(open_flight(path), options)
+        return _flight(open_flight(path, images_needed=not options.skip_bad_images), options)
     if kind == "photos":
         return open_photos(path, options)
     if kind == "log":
@@ -42,6 +42,7 @@ def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
 
 def source_kind(path: Path) -> str:
     """`flight`, `photos`, `video`, `ros` or `log`, by content. Raises `FlightError` for others."""
+    path = Path(path)
     if path.is_dir():
         if (path / "flight.json").exists() or (path / "telemetry.csv").exists():
             return "flight"

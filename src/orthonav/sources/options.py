@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from orthonav.errors import FlightError
+from orthonav.files import with_paths
 
 KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
@@ -39,8 +40,11 @@ class SourceOptions:
     """Whether the camera looked straight down where pitch and roll were not recorded."""
     over_terrain: bool = False
     """Whether a terrain turns the heights of the recording into heights above ground later on."""
+    skip_bad_images: bool = False
+    """Whether images that a flight folder names may be missing."""
 
     def __post_init__(self) -> None:
+        with_paths(self, "camera", "telemetry")
         for name in ("rate_hz", "prior_std_m", "sensor_width_mm"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

@@ -191,21 +191,11 @@ def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptio
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:
-    """The camera for images of this size.
-
-    Raises `CameraError` where the aspect ratio differs: then the image is an unknown crop, not a
-    scaled version of the same view.
-    """
-    if (camera.width_px, camera.height_px) == (width_px, height_px):
-        return camera
-    if abs(camera.height_px * width_px - height_px * camera.width_px) > max(
-        camera.width_px, width_px
-    ):
-        raise CameraError(
-            f"camera is {camera.width_px} x {camera.height_px} px, images are {width_px} x "
-            f"{height_px} px, with another aspect ratio; calibrate in that mode: {where}"
-        )
-    return camera.resized(width_px, height_px)
+    """`Camera.fitted`; its error says `where` the images are."""
+    try:
+        return camera.fitted(width_px, height_px)
+    except CameraError as error:
+        raise CameraError(f"{error}: {where}") from error
 
 
 def check_overlap(track: RecordedTrack, first_ns: int, last_ns: int, path: Path) -> None:

@@ -70,7 +70,7 @@ def columns_of(
         "gerr": _rounded(np.hypot(*(gnss_en_m - truth_en_m).T), 2),
         "gdiff": _rounded(np.hypot(*(gnss_en_m - fix_en_m).T), 2),
         "gfault": [fault_of(r.outcome.evidence) for r in results],
-        "err": _rounded(error_m, 2),
+        "err": _rounded(error_m, 4),
         "conf": _each(fixes, "confidence", 4),
         "radius": _rounded(own_m, 1),
         "a": _rounded(axes_m[:, 1], 2),

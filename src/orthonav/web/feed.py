@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from orthonav.errors import FlightError
 from orthonav.files import require_file
-from orthonav.flight.fixes import result_from_json
+from orthonav.flight.fixes import is_health, result_from_json
 from orthonav.records import ViewResult
 
 MAX_LINE_BYTES = 2**20
@@ -48,7 +48,7 @@ class LineFeed:
     """
 
     def __init__(self, path: Path, *, live: bool = False) -> None:
-        self._path, self._live = path, live
+        self._path, self._live = Path(path), live
         self._reset()
 
     def _reset(self) -> None:
@@ -109,7 +109,7 @@ class LineFeed:
 
 def _health_of(text: str) -> dict[str, Any] | None:
     """The health in a line; None for any other line."""
-    if not text.startswith('{"health"'):
+    if not is_health(text):
         return None
     try:
         plain = json.loads(text)

@@ -50,7 +50,7 @@ class FolderImages:
 
     def __init__(self, path: Path) -> None:
         """Raises as `open_flight` does."""
-        folder = open_flight(path)
+        folder = open_flight(path, images_needed=False)
         self._camera = folder.camera
         self._views = {view.frame: view for view in folder.views}
 

@@ -81,7 +81,7 @@ class LogReader:
 
         With `live` it need not exist yet; of several flights the newest is taken.
         """
-        self._path, self._live = path, live
+        self._path, self._live = Path(path), live
         self._lock = threading.Lock()
         self._files: list[_LogFile] = []
         self._names: set[Path] = set()

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight import read_truth
+from orthonav.files import with_paths
+from orthonav.flight import open_flight, read_truth
+from orthonav.flight.identity import Identity, Source, flight_source, read_identity
 from orthonav.flight.mount import read_mount
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
@@ -31,6 +33,9 @@ class ViewRequest:
     mount: Path | None = None
     radius_m: float = 15.0
     live: bool = False
+
+    def __post_init__(self) -> None:
+        with_paths(self, "run", "map_path", "flight", "truth", "mount")
 
 
 def open_run(request: ViewRequest) -> Run:
@@ -111,6 +116,18 @@ def _images_name(request: ViewRequest, images: ViewImages) -> str:
     return (request.flight or request.run).name
 
 
+def _differences(request: ViewRequest, feed: Feed) -> list[str]:
+    """Where a file of fixes states another map or flight folder than the given ones."""
+    if not isinstance(feed, LineFeed) or not request.run.is_file():
+        return []
+    flight = None
+    if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
+        views = open_flight(request.flight, images_needed=False).views
+        flight = flight_source(request.flight, views)
+    given = Identity(Source(request.map_path.name, map_digest(request.map_path)), flight)
+    return read_identity(request.run).differences(given)
+
+
 def _warn(
     request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, tuple[float, float]]
 ) -> None:
@@ -118,6 +135,8 @@ def _warn(
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
+    for difference in _differences(request, feed):
+        log.warning("the run is another one: %s: %s", difference, request.run)
     if not run.count:
         return
     if truth and not run.any_known("tx"):

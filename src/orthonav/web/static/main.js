@@ -176,12 +176,15 @@ function drawProblems(problems) {
 function drawFigures(store) {
   const { stats, count, run } = store;
   const errors = (store.columns.err ?? []).filter((v) => v >= 0).sort((p, q) => p - q);
-  const quantile = (part) => errors[Math.min(errors.length - 1, Math.floor(part * errors.length))];
+  const quantile = (part) => { // interpolated, as in reports
+    const at = part * (errors.length - 1), low = Math.floor(at);
+    return errors.length ? errors[low] + (at - low) * (errors[Math.ceil(at)] - errors[low]) : NaN;
+  };
   const rows = [["views", count], ["confident", ratio(stats.confident, count)]];
   rows.push(["low confidence", ratio(stats.fixes - stats.confident, count)], ["no fix", ratio(count - stats.fixes, count)]);
   if (stats.withTruth) {
     rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
-    rows.push(["CEP50", metres(quantile(0.5) ?? NaN)], ["CEP95", metres(quantile(0.95) ?? NaN)]);
+    rows.push(["CEP50", metres(quantile(0.5))], ["CEP95", metres(quantile(0.95))]);
     rows.push(["confident and wrong", stats.wrong]);
   }
   if (stats.withGnss || stats.gnssAlarms) rows.push(["GNSS alarms", stats.gnssAlarms]);

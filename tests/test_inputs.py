@@ -1,0 +1,239 @@
+"""Inputs as they are: other runs, missing and resized images, odd arrays, wrong options."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.cli import main
+from orthonav.confidence.accept import Acceptance
+from orthonav.errors import FlightError, VariantError
+from orthonav.flight import open_flight
+from orthonav.flight.fixes import read_results
+from orthonav.flight.identity import Identity, Source, flight_source, read_identity
+from orthonav.geo.camera import Camera
+from orthonav.grey import grey_levels
+from orthonav.mapfile import open_map
+from orthonav.records import Telemetry, View
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
+NADIR = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
+GREY = np.random.default_rng(0).integers(0, 256, (48, 64)).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def few(flight_path, tmp_path_factory):
+    """A flight of four views, not to be changed."""
+    flight = shutil.copytree(flight_path, tmp_path_factory.mktemp("few") / "flight")
+    for name in ("telemetry.csv", "truth.csv"):
+        lines = (flight / name).read_text().splitlines()
+        (flight / name).write_text("\n".join(lines[:5]) + "\n")
+    return flight
+
+
+@pytest.fixture(scope="module")
+def fixes(map_path, few):
+    """Its fixes, not to be changed."""
+    path = few.parent / "fixes.jsonl"
+    assert main(["localize", str(map_path), str(few), "--out", str(path), "-q"]) == 0
+    return path
+
+
+def test_the_truth_is_that_of_the_flight(run, fixes, few):
+    done = run("evaluate", fixes, "--flight", few)
+    lines = done.out.splitlines()
+    assert (done.code, done.err) == (0, "") and "confident" in lines[0]
+    assert lines[1].startswith(("Covariances are ", "Whether covariances are right"))
+    assert run("evaluate", fixes, "--truth", few / "truth.csv").out == done.out
+    both = run("evaluate", fixes, fixes, "--flight", few, "--json")
+    assert json.loads(both.out)["n_views"] == 8
+
+
+def test_fixes_state_their_map_and_flight(fixes, few, map_path):
+    first, *others = (json.loads(line) for line in fixes.read_text().splitlines())
+    assert first["map"] == {"name": "area.onav", "sha256": open_map(map_path).manifest.sha256}
+    assert first["flight"]["name"] == "flight" and not any("map" in each for each in others)
+    flight = flight_source(few, open_flight(few).views)
+    assert read_identity(fixes).flight == flight
+    assert read_identity(fixes).differences(Identity(None, flight)) == []
+    assert len(read_results(fixes)) == 4
+    assert Identity().differences(Identity(Source("a", "1"), flight)) == []
+
+
+def test_fixes_of_another_run_are_named(run, fixes, few, map_path, tmp_path):
+    other = shutil.copytree(few, tmp_path / "other")
+    rows = [line.split(",") for line in (other / "telemetry.csv").read_text().splitlines()]
+    turned = [rows[0], *([*row[:2], str(float(row[2]) + 1), *row[3:]] for row in rows[1:])]
+    (other / "telemetry.csv").write_text("\n".join(",".join(row) for row in turned) + "\n")
+    stated = fixes.read_text().replace(open_map(map_path).manifest.sha256, "0" * 64)
+    fixes = tmp_path / "fixes.jsonl"
+    fixes.write_text(stated)
+    of_map, of_flight = "map area.onav (00000000), not area.onav", "flight flight ("
+    done = run("evaluate", fixes, "--truth", other / "truth.csv", "--map", map_path)
+    assert done.code == 0 and of_map in done.err and of_flight in done.err
+    done = run("locate-pixel", fixes, "0001.jpg", 10, 20, "--flight", other)
+    assert done.code == 0 and of_flight in done.err and of_map not in done.err
+
+
+def test_lines_of_health_are_skipped(run, fixes, few, tmp_path):
+    lines = fixes.read_text().splitlines()
+    mixed = tmp_path / "lines.jsonl"
+    mixed.write_text('{"health": "OK", "reasons": []}\n' + "\n".join([*lines, '{"health": "OK"}']))
+    assert run("evaluate", mixed, "--flight", few).code == 0
+    assert read_identity(mixed) == read_identity(fixes)
+
+
+def test_a_dash_is_stdout(run, fixes, few, map_path):
+    done = run("localize", map_path, few, "--out", "-", "--export", "csv=-")
+    lines, table = done.out.splitlines()[:4], done.out.splitlines()[4:]
+    assert [json.loads(line)["frame"] for line in lines] == [f"000{i}.jpg" for i in range(1, 5)]
+    assert table[0].startswith("frame,lat_deg") and done.err.startswith("4 views: ")
+    done = run("evaluate", fixes, "--flight", few, "--metrics", "-")
+    assert json.loads(done.out)["n_views"] == 4 and "confident" in done.err
+    outline = json.loads(run("info", map_path, "--footprint", "-").out)
+    assert outline["features"][0]["properties"]["map"] == "area.onav"
+    assert not Path("-").exists()
+
+
+def test_missing_images_are_skipped_and_counted(run, few, map_path, tmp_path):
+    flight, out = shutil.copytree(few, tmp_path / "flight"), tmp_path / "fixes.jsonl"
+    (flight / "frames" / "0001.jpg").unlink()
+    (flight / "frames" / "0003.jpg").write_bytes(b"")
+    done = run("localize", map_path, flight, "--out", out)
+    assert done.code == 1 and "0001.jpg" in done.err and "--skip-bad-images" in done.err
+    done = run("localize", map_path, flight, "--out", out, "--skip-bad-images")
+    assert done.code == 0 and "2 without a position (bad_image 2)" in done.out
+    assert run("evaluate", out, "--flight", flight).code == 0
+    plain = run("localize", map_path, flight, "--out", out, "--skip-bad-images", "--json").out
+    assert json.loads(plain)["reasons"] == {"bad_image": 2}
+
+
+def test_images_of_another_size_are_scaled_in_a_flight_folder(run, few, map_path, tmp_path):
+    flight, out = shutil.copytree(few, tmp_path / "flight"), tmp_path / "fixes.jsonl"
+    for path in sorted((flight / "frames").iterdir()):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(path), cv2.resize(image, None, fx=0.75, fy=0.75, interpolation=3))
+    assert open_flight(flight).camera.width_px == 0.75 * open_flight(few).camera.width_px
+    plain = json.loads(run("localize", map_path, flight, "--out", out, "--json").out)
+    assert plain["n_confident"] >= 3
+    cv2.imwrite(str(flight / "frames" / "0001.jpg"), GREY)
+    cv2.imwrite(str(flight / "frames" / "0002.jpg"), GREY[:20])
+    done = run("localize", map_path, flight, "--out", out)
+    assert done.code == 1 and "another aspect ratio" in done.err and "0002.jpg" in done.err
+
+
+@pytest.mark.parametrize(
+    "text", ["confidence:90", "confidence:0", "confidence:-1", "confidence:nan", "peak_ratio:0.5"]
+)
+def test_thresholds_that_make_no_sense_name_the_option(run, few, map_path, tmp_path, text):
+    with pytest.raises(VariantError, match="--accept"):
+        Acceptance.parse(text)
+    for command in (
+        ["localize", map_path, few, "--out", tmp_path / "f.jsonl"],
+        ["fly", map_path, few, "--recorded-telemetry", "--dry-run"],
+        ["check", map_path, "--out", tmp_path / "check"],
+    ):
+        done = run(*command, "--accept", text)
+        assert done.code == 1 and "--accept" in done.err and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        GREY[:, :, None],
+        np.dstack([GREY] * 3),
+        np.dstack([GREY] * 4),
+        GREY.astype(np.uint16) << 8,
+        GREY.astype(np.float32),
+        GREY / 255.0,
+        GREY.astype(np.int64),
+    ],
+)
+def test_images_are_converted(image):
+    found = View(image, CAMERA, NADIR).grey
+    assert found.dtype == np.uint8 and found.shape == GREY.shape and np.ptp(found) > 200
+    np.testing.assert_array_equal(found, GREY)
+
+
+@pytest.mark.parametrize(
+    ("image", "said"),
+    [
+        (None, "None"),
+        (GREY > 9, "bool"),
+        (GREY - 300.0, "values of -300"),
+        (np.full((48, 64), np.nan), "values of nan"),
+        (np.stack([GREY] * 3), r"shape \(3, 48, 64\)"),
+        (GREY[:0], "shape"),
+        (GREY.astype(np.int32) * 9, "values of 0 to"),
+        (GREY.astype(complex), "complex"),
+    ],
+)
+def test_what_is_no_image_is_refused(image, said):
+    with pytest.raises(FlightError, match=f"{said}.*expected"):
+        grey_levels(image)
+
+
+def test_a_camera_is_scaled_to_the_image():
+    half = View(GREY[::2, ::2], CAMERA, NADIR)
+    assert half.camera == CAMERA.resized(32, 24)
+    assert View(GREY, CAMERA, NADIR).camera is CAMERA
+    assert replace(half, grey=GREY).camera == CAMERA
+
+
+def test_paths_may_be_text(map_path, few, area, tmp_path):
+    from orthonav.prepare import BuildRequest, build_map
+    from orthonav.simulate.flight import SimulateRequest, simulate_flight
+    from orthonav.sources import SourceOptions, open_source
+    from orthonav.web.opening import ViewRequest
+
+    made = str(tmp_path / "small.onav")
+    small = {"tile_px": 64, "gsd_m": 5.0, "registration": False}
+    build_map(BuildRequest([str(area.past)], made, **small))
+    assert open_map(made).manifest.sheets[0].tiles > 0
+    out = str(tmp_path / "flight")
+    simulate_flight(SimulateRequest([str(area.present)], out, random=1, agl_m=area.agl_m))
+    assert open_flight(out).views and open_source(str(few)).expected == 4
+    assert SourceOptions(camera="a.json").camera == Path("a.json")
+    assert ViewRequest("fixes.jsonl", made).map_path == Path(made)
+
+
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_qgis_can_place_a_map(run, map_path, tmp_path, ending):
+    rasterio = pytest.importorskip("rasterio")
+    shape = pytest.importorskip("shapely.geometry").shape
+    picture, outline = tmp_path / f"area.{ending}", tmp_path / "area.geojson"
+    done = run("info", map_path, "--preview", picture, "--footprint", outline)
+    assert (done.code, done.err) == (0, "")
+    sheet = open_map(map_path).manifest.sheets[0]
+    with rasterio.open(picture) as image:
+        assert image.nodata == 0 and image.read(1).std() > 10
+        west, south, east, north = rasterio.warp.transform_bounds(
+            image.crs, "EPSG:4326", *image.bounds
+        )
+    assert west < sheet.frame.lon_deg < east and south < sheet.frame.lat_deg < north
+    (feature,) = json.loads(outline.read_text())["features"]
+    area = shape(feature["geometry"])
+    assert area.is_valid and area.within(shape_of(west, south, east, north, shape))
+    refused = run("info", map_path, "--preview", tmp_path / "area.gif")
+    assert refused.code == 1 and ".png or .tif" in refused.err
+
+
+def shape_of(west, south, east, north, shape):
+    """The box, a little wider."""
+    corners = [(west, south), (east, south), (east, north), (west, north), (west, south)]
+    return shape({"type": "Polygon", "coordinates": [corners]}).buffer(1e-4)
+
+
+def test_without_a_command_the_help_is_shown(run):
+    done = run()
+    assert (done.code, done.err) == (0, "") and "orthonav localize area.onav" in done.out
+
+
+def test_abbreviations_are_refused_with_the_usage_of_the_command(run):
+    done = run("localize", "a.onav", "flight", "--out", "c", "--head", "unknown")
+    assert done.code == 2 and done.err.startswith("usage: orthonav localize")
+    assert "unrecognized arguments: --head" in done.err
