@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.cli.common import search_plan
+from orthonav.cli.flying_console import awaited, camera_line, opened_console, plan_lines
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
 from orthonav.cli.source import FAR_M, distance_from_map, far_text
 from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError, OutputError, VariantError
+from orthonav.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.files import require_file
 from orthonav.flight import read_camera
 from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
@@ -28,11 +29,12 @@ from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import MapFile, open_map
 from orthonav.onboard import cameras
 from orthonav.onboard.calibrate import MountCorrected, model_of
-from orthonav.onboard.cameras import CameraThread
+from orthonav.onboard.cameras import CameraThread, NewestImage
 from orthonav.onboard.fly import FlyOptions, LogSink, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
+from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import (
     KINDS,
     LOCAL,
@@ -44,7 +46,7 @@ from orthonav.onboard.outputs import (
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
-from orthonav.onboard.publisher import PositionOutput, Publisher
+from orthonav.onboard.publisher import PositionOutput, Publisher, ViewOutput
 from orthonav.onboard.run import Locator
 from orthonav.onboard.serials import require_newest
 from orthonav.onboard.state import boot_id, load, prior_of
@@ -58,6 +60,9 @@ from orthonav.records import CONFIDENT, Prior
 from orthonav.sources.cameras import read_camera_file
 
 log = logging.getLogger(__name__)
+START_OFF_M, START_SIGMAS = 3000.0, 3.0
+"""A start farther off the map than this distance and so many of its deviations ends the program: a
+flight that comes from there gives the place where it reaches the map, or a larger deviation."""
 LEAST_VIEW_PX = 60.0
 """Narrower views (pixels of the map across) are seldom confident and take the longest, which makes
 the next ones late. An aircraft climbs through them."""
@@ -66,12 +71,14 @@ the next ones late. An aircraft climbs through them."""
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
     """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
+    console = opened_console(options, clocks, stack)
     opened = _opened(options)
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
+    start = _start(options, clocks, localizer)
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
@@ -80,7 +87,10 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
+    for line in plan_lines(options, opened, least):
+        console.say(line)
     camera = camera or source.wait_for_camera()
+    console.say(camera_line(options, camera))
     digest = opened.manifest.sha256
     gnss = None
     if options.gnss != "off":  # only where it is asked for
@@ -88,7 +98,11 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
         gnss = made(options, localizer.sheet.frame, digest, used, queue, least, clocks)
-    publisher = _publisher(options, clocks, link, least, graph)
+    newest = NewestImage()
+    sends = not options.dry_run and (link is not None or graph is not None)
+    inputs = Inputs(newest, awaited(options), link, options.autopilot, sends)
+    narrator = Narrator(console, clocks, inputs)
+    publisher = _publisher(options, clocks, link, least, graph, narrator)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera, digest)
@@ -96,7 +110,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         source.log_gnss = sink.gnss
     if gnss is not None and sink is not None and not options.ros2:
         gnss.log = sink.gnss  # with ROS 2 messages are logged as received
-    thread = CameraThread(source, stopping)
+    thread = CameraThread(source, stopping, newest)
     stack.callback(thread.stop)
     fly = FlyOptions(
         mount_deg=tuple(options.mount_deg),
@@ -115,7 +129,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         logged_options=_logged_options(options, mount),
     )
     return Runner(
-        thread.newest,
+        newest,
         camera,
         locator,
         publisher,
@@ -123,8 +137,10 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         clocks,
         link=link,
         sink=sink,
-        diagnosis=TelemetryDiagnosis(localizer, least),
-        start=_start(options, clocks, localizer),
+        diagnosis=TelemetryDiagnosis(
+            localizer, least, has_start=bool(options.start or options.state)
+        ),
+        start=start,
         notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
@@ -268,6 +284,7 @@ def _publisher(
     link: AutopilotLink | None,
     least: float,
     graph: PositionOutput | None,
+    narrator: Narrator,
 ) -> Publisher:
     interval = {}
     if options.send_rate_hz is not None:
@@ -296,7 +313,9 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        lines = [JsonOut(None if each == "-" else Path(each)) for each in options.jsonl]
+        lines: list[ViewOutput] = [
+            JsonOut(None if each == "-" else Path(each)) for each in options.jsonl
+        ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
     messenger = None if link is None else Messenger(chosen, gate, link.send, clocks)
@@ -306,7 +325,7 @@ def _publisher(
         messenger=messenger,
         link=link,
         nmea=nmea,
-        lines=lines,
+        lines=[*lines, narrator],
         graph=graph,
         min_confidence=least,
         min_std_m=options.min_std_m,
@@ -347,18 +366,25 @@ def _start(
 
 
 def _given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
-    """The position of `--start`; a warning where it is far from the map. Raises `VariantError`."""
+    """The position of `--start`; a warning where it is off the map. Raises `UsageError` where it is
+    none, or where the aircraft cannot be over the map by it."""
     if not options.start:
         return None
     start = Prior(*options.start)
     place = start.lat_deg, start.lon_deg
     if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and start.std_m > 0):
-        raise VariantError(
+        raise UsageError(
             "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
             f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
             f"{swapped_hint(*place)}"
         )
     far_m, hint = distance_from_map(place, localizer)
+    most_m = START_OFF_M + START_SIGMAS * start.std_m
+    if far_m > most_m:
+        raise UsageError(
+            f"--start is {far_m / 1000:,.1f} km from the map, more than {START_OFF_M / 1000:g} km and "
+            f"{START_SIGMAS:g} times its deviation; check the map and the position{hint}"
+        )
     if far_m > FAR_M:
         log.warning("%s", far_text("--start is", far_m, hint))
     return start
