@@ -1,6 +1,5 @@
 """The flight loop: every fault of a flight, and a flight over UDP from end to end."""
 
-import argparse
 import json
 import math
 import os
@@ -34,19 +33,18 @@ from fake_autopilot import (
 from paced import pace_by
 
 from orthonav.cli import main
-from orthonav.errors import CameraError, MapChangedError, MapFileError, VariantError
+from orthonav.errors import CameraError, MapChangedError, MapFileError
 from orthonav.flight.fixes import result_from_json
 from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.flight.heights import FlownHeights
 from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
@@ -79,6 +77,25 @@ class BoundedLog:
         return [arguments for called, arguments in self.calls if called == name]
 
 
+class Said:
+    """A console that keeps what it is told."""
+
+    is_terminal = True
+
+    def __init__(self):
+        self.lines, self.warnings = [], []
+
+    def say(self, text):
+        self.lines.append(text)
+
+    def warn(self, text):
+        self.warnings.append(text)
+        self.say(text)
+
+    def with_word(self, word):
+        return [line for line in self.lines if word in line]
+
+
 class Flight:
     """A runner with fake parts and a fake clock: one view every tenth of a second."""
 
@@ -90,15 +107,16 @@ class Flight:
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
         messages = MessageOptions(kinds)
-        self.lines = tmp_path / "lines.jsonl"
+        self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
+        inputs = Inputs(self.newest, "images from 0", self.link, "udpin:1", sends=True)
         publisher = Publisher(
             self.gate,
             clocks,
             messenger=Messenger(messages, self.gate, self.link.send, clocks),
             link=self.link,
-            lines=[JsonOut(self.lines)],
+            lines=[JsonOut(self.lines), Narrator(self.said, clocks, inputs)],
         )
-        self.locator, self.newest, self.log = locator or FakeLocator(), NewestImage(), BoundedLog()
+        self.locator, self.log = locator or FakeLocator(), BoundedLog()
         rest = {name: options.pop(name) for name in ("diagnosis", "start") if name in options}
         options = FlyOptions(**options)
         self.runner = Runner(
@@ -992,24 +1010,49 @@ def test_invalid_options_end_with_one_line(flown, run, tmp_path):
     assert done.code == 2 and "LAT,LON,STD_M" in done.err
 
 
-def test_a_start_far_from_the_map_is_named_and_a_swap_too(flown, caplog):
-    from orthonav.cli.flying import _given_start
-
-    localizer = Localizer(open_map(flown[0]))
-    lat, lon = localizer.sheet.frame.lat_deg, localizer.sheet.frame.lon_deg
+def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(flown, run, tmp_path):
+    path, folder, frame, _ = flown
+    lines = tmp_path / "lines.jsonl"
+    options = ("--recorded-telemetry", "--pace", "1000", "--jsonl", lines)
 
     def start(*values):
-        caplog.clear()
-        return _given_start(argparse.Namespace(start=values), localizer), caplog.text
+        text = ",".join(map(str, values))
+        return run("fly", path, folder, *options, f"--start={text}")
 
-    assert start(lat, lon, 50.0) == (Prior(lat, lon, 50.0), "")
-    assert _given_start(argparse.Namespace(start=None), localizer) is None
-    assert "km from the map; check the map and the positions\n" in start(lat + 1, lon, 50.0)[1]
-    assert "seem to be swapped" in start(lon, lat, 50.0)[1]
-    with pytest.raises(VariantError, match=r"got 120,46,50; latitude and longitude seem"):
-        start(120.0, 46.0, 50.0)
-    with pytest.raises(VariantError, match="above 0 m"):
-        start(lat, lon, 0.0)
+    lat, lon = frame.lat_deg, frame.lon_deg
+    for values, words in {
+        (lat + 0.05, lon, 50): "5.2 km from the map, more than 3 km and 3 times its deviation",
+        (lon, lat, 50): "; latitude and longitude seem to be swapped",
+        (120, 46, 50): "got 120,46,50; latitude and longitude seem to be swapped",
+        (lat, lon, 0): "above 0 m",
+    }.items():
+        done = start(*values)
+        assert (done.code, done.err.count("\n")) == (2, 1) and words in done.err
+        assert not lines.exists()
+    done = start(lat + 0.02, lon, 50)
+    assert done.code == 0 and "WARNING: --start is 2 km from the map; check" in done.err
+    done = start(lat + 0.05, lon, 2000)
+    assert done.code == 0 and "WARNING: --start is 5 km from the map; check" in done.err
+
+
+def test_a_start_that_the_ground_contradicts_is_named(flown, run, paced, tmp_path):
+    path, folder, frame, truth = flown
+    first, lines = next(iter(truth.values())), tmp_path / "lines.jsonl"
+
+    def mismatches(*off_m):
+        lines.unlink(missing_ok=True)
+        lat, lon = frame.latlon_from_en(first + off_m)
+        paced(lines)
+        done = run(
+            *("fly", path, folder, "--recorded-telemetry", "--deadline-ms", "60000"),
+            *("--jsonl", lines, f"--start={lat},{lon},5"),
+        )
+        assert done.code == 0 and "-> tracking" in done.err
+        return [line for line in done.err.splitlines() if "start_mismatch" in line]
+
+    assert mismatches(3.0, -3.0) == []
+    (line,) = mismatches(-170.0, -210.0)
+    assert "the ground contradicts the start position" in line
 
 
 def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():

@@ -13,17 +13,16 @@ from typing import Any
 
 from orthonav.cli.common import search_plan
 from orthonav.cli.flying_console import awaited, camera_line, opened_console, plan_lines
+from orthonav.cli.flying_start import start_of
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
-from orthonav.cli.source import FAR_M, distance_from_map, far_text
 from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError, OutputError, UsageError, VariantError
+from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
 from orthonav.flight import read_camera
 from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
-from orthonav.geo.swapped import swapped_hint
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import MapFile, open_map
@@ -49,20 +48,17 @@ from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.publisher import PositionOutput, Publisher, ViewOutput
 from orthonav.onboard.run import Locator
 from orthonav.onboard.serials import require_newest
-from orthonav.onboard.state import boot_id, load, prior_of
+from orthonav.onboard.state import load
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.publish.local import Origin
 from orthonav.publish.mavlink import Signing, signing_timestamp
 from orthonav.publish.nmea import Quality
-from orthonav.records import CONFIDENT, Prior
+from orthonav.records import CONFIDENT
 from orthonav.sources.cameras import read_camera_file
 
 log = logging.getLogger(__name__)
-START_OFF_M, START_SIGMAS = 3000.0, 3.0
-"""A start farther off the map than this distance and so many of its deviations ends the program: a
-flight that comes from there gives the place where it reaches the map, or a larger deviation."""
 LEAST_VIEW_PX = 60.0
 """Narrower views (pixels of the map across) are seldom confident and take the longest, which makes
 the next ones late. An aircraft climbs through them."""
@@ -78,7 +74,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
-    start = _start(options, clocks, localizer)
+    start = start_of(options, clocks, localizer)
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
@@ -344,50 +340,6 @@ def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
             1 / PX4_VISION_S,
             min(rates),
         )
-
-
-def _start(
-    options: argparse.Namespace, clocks: Clocks, localizer: Localizer
-) -> Callable[[], Prior | None]:
-    """Function that gives the prior of the first view.
-
-    It is the saved position if that is recent, else `--start`, else None.
-    """
-    given = _given_start(options, localizer)
-    saved = load(options.state) if options.state else None
-
-    def prior() -> Prior | None:
-        if saved is None:
-            return given
-        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(saved, age_s, options.state_max_age_s) or given
-
-    return prior
-
-
-def _given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
-    """The position of `--start`; a warning where it is off the map. Raises `UsageError` where it is
-    none, or where the aircraft cannot be over the map by it."""
-    if not options.start:
-        return None
-    start = Prior(*options.start)
-    place = start.lat_deg, start.lon_deg
-    if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and start.std_m > 0):
-        raise UsageError(
-            "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
-            f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
-            f"{swapped_hint(*place)}"
-        )
-    far_m, hint = distance_from_map(place, localizer)
-    most_m = START_OFF_M + START_SIGMAS * start.std_m
-    if far_m > most_m:
-        raise UsageError(
-            f"--start is {far_m / 1000:,.1f} km from the map, more than {START_OFF_M / 1000:g} km and "
-            f"{START_SIGMAS:g} times its deviation; check the map and the position{hint}"
-        )
-    if far_m > FAR_M:
-        log.warning("%s", far_text("--start is", far_m, hint))
-    return start
 
 
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> LogSink | None:

@@ -350,7 +350,7 @@ class Runner:
             if prior is not None:
                 self._start_check = StartCheck(prior, telemetry.time_ns)
         if self._start_check is not None:
-            self._start_check.moved(telemetry.time_ns, telemetry.vel_en_mps)
+            self._start_check.moved(telemetry)
         return view
 
     def _over_gap(

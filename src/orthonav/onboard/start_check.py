@@ -6,7 +6,7 @@ import numpy as np
 
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.state import SPEED_MPS
-from orthonav.records import Fix, Prior
+from orthonav.records import Fix, Prior, Telemetry
 from orthonav.track.motion import usual_velocity_std_mps
 
 SIGMAS = 3.0
@@ -24,15 +24,17 @@ class StartCheck:
         self._moved_en_m, self._free_m = np.zeros(2), 0.0
         self._found: tuple[int, float] | None = None
 
-    def moved(self, time_ns: int, vel_en_mps: tuple[float, float] | None) -> None:
-        """Pass the time of every view, and the reported velocity where it is known."""
-        seconds = max(time_ns - self._time_ns, 0) / 1e9
-        self._time_ns = max(time_ns, self._time_ns)
-        if vel_en_mps is None or not np.isfinite(vel_en_mps).all():
+    def moved(self, telemetry: Telemetry) -> None:
+        """Pass the telemetry of every view."""
+        seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
+        self._time_ns = max(telemetry.time_ns, self._time_ns)
+        velocity = telemetry.vel_en_mps
+        if velocity is None or not np.isfinite(velocity).all():
             self._free_m += SPEED_MPS * seconds
             return
-        self._moved_en_m += np.array(vel_en_mps) * seconds
-        self._free_m += SIGMAS * usual_velocity_std_mps(math.hypot(*vel_en_mps)) * seconds
+        std_mps = telemetry.vel_std_mps or usual_velocity_std_mps(math.hypot(*velocity))
+        self._moved_en_m += np.array(velocity) * seconds
+        self._free_m += SIGMAS * std_mps * seconds
 
     def off_m(self, fix: Fix, age_s: float = 0.0) -> float:
         """Distance of the start from that which a confident fix implies, metres; 0 where it is
