@@ -744,9 +744,99 @@ def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
     assert flight.health().level is Level.FAILED
 
 
+def test_inputs_that_are_missing_come_and_go_are_said(flight):
+    flight.views(30)  # four seconds more
+    said = flight.said.lines
+    assert "autopilot 1/1 PX4 heard on udpin:1" in said and "camera 320x240, 10.0 Hz" in said
+    assert not flight.said.with_word("waiting")
+    status = flight.said.with_word("; health OK")[-1]
+    assert status.startswith("tracking 48.000000, 2.000000 +- 2.0 m, confidence 0.97; ")
+    flight.talks = False
+    for _ in range(200):  # neither images nor messages for twenty seconds
+        flight.time.go(0.1)
+        flight.runner.step(0)
+    assert len(flight.said.with_word("camera lost")) == 1
+    assert flight.said.with_word("heartbeat lost: nothing heard from autopilot 1/1")
+    for missing in ("images from 0", "autopilot 1/1 on udpin:1"):
+        assert 2 <= len(flight.said.with_word(f"waiting for {missing}")) <= 3
+    flight.talks = True
+    flight.views(60)
+    assert len(flight.said.with_word("autopilot 1/1 PX4 heard")) == 2
+    assert len(flight.said.with_word("camera 320x240, 10.0 Hz")) == 2
+
+
+def test_before_the_first_heartbeat_it_is_waited_for(begin, monkeypatch):
+    monkeypatch.setattr(Flight, "hear", lambda *_: None)
+    flight = begin()
+    flight.talks = False
+    flight.views(50)  # a quarter of a second each, with the wait for telemetry
+    waiting = flight.said.with_word("waiting")
+    assert waiting == ["waiting for heartbeat on udpin:1, which cannot be opened"] * 2
+    assert len(flight.said.with_word("view 000001: no_telemetry: not reported")) == 1
+
+
+def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flight):
+    said = flight.said
+    flight.locator.state_name = "coasting"
+    flight.views(5)
+    assert "tracking -> coasting: views do not show the map" in said.warnings[-1]
+    flight.locator.state_name = "tracking"
+    flight.views(5)
+    assert said.lines[-1].startswith("coasting -> tracking: 48.000000, 2.000000 +- 2.0 m")
+    flight.locator.outcome = lambda view: fix(heading_deg=view.telemetry.yaw_deg + 35)
+    flight.views(80)
+    assert said.with_word("heading_mismatch") == [
+        "DEGRADED: heading_mismatch (check the compass and --mount-deg, or use --heading unknown)"
+    ]
+    del flight.locator.outcome
+    flight.locator.outcome = FakeLocator().outcome
+    flight.views(80)
+    assert "health OK" in said.lines
+    flight.runner._publisher.close()
+    summary = said.lines[-1]
+    assert summary.startswith(
+        "end: 200 views, 194 sent, 6 withheld: coasting 5, no_telemetry 1; latency median 50"
+    )
+    assert summary.endswith("first position 0.1 s after the first view")
+
+
+def test_a_start_that_is_contradicted_degrades_for_a_while(begin):
+    """First by the diagnosis, then by the track, and half a minute later no more."""
+
+    class Localizer:
+        def locate(self, view, *, heading_known):
+            assert view.telemetry.prior is None or heading_known
+            return fix(48.02, 2.0, heading_deg=30.0)
+
+    locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
+    diagnosis = TelemetryDiagnosis(Localizer(), 0.9, lambda work: work(), has_start=True)
+    flight = begin(locator, diagnosis=diagnosis, start=lambda: Prior(48.0, 2.0, 100.0))
+    flight.views(40)
+    assert flight.reasons() == {"searching"}
+    flight.views(60)
+    assert flight.reasons() == {"searching", "start_mismatch"}
+    locator.state_name, locator.outcome = "tracking", lambda *_: fix(48.02, 2.0, heading_deg=30.0)
+    flight.views(20)
+    assert flight.reasons() == {"start_mismatch"}
+    assert flight.written()[-1]["start_off_m"] == pytest.approx(2224, abs=10)
+    assert flight.said.with_word("start_mismatch (the ground contradicts the start position, 2,22")
+    flight.views(310)
+    assert flight.reasons() == set()
+
+
+def test_a_start_within_its_deviation_and_the_motion_since_is_right(begin):
+    locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
+    flight = begin(locator, start=lambda: Prior(48.0, 2.0, 100.0))
+    flight.views(100)  # ten seconds at up to 30 m/s
+    locator.state_name, locator.outcome = "tracking", lambda *_: fix(48.005, 2.0, heading_deg=30.0)
+    flight.views(20)  # 556 m north
+    assert flight.reasons() == set()
+
+
 # From here on with a map, over UDP.
 
-SPEED_MPS, HEADING, EVERY_S = 14.0, 60.0, 0.5
+STEP_M, HEADING, EVERY_S = 14.0, 60.0, 0.5
+ALONG = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
 COUNT = 20
 PACED = Path(__file__).parent / "paced.py"
 
@@ -757,10 +847,9 @@ def flown(made_once, make_ortho, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fly")
     _, path, frame = known_map(made_once, make_ortho)
     rng = np.random.default_rng(0)
-    along = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
     seen, truth = [], {}
     for number in range(COUNT):
-        place = np.array([-120.0, -80.0]) + number * SPEED_MPS * along
+        place = np.array([-120.0, -80.0]) + number * STEP_M * ALONG
         grey = rendered(GROUND, place, (HEADING, 0.0, 0.0), AGL_M, CAMERA)
         grey = np.clip(0.75 * grey + 30 + rng.normal(0, 6, grey.shape), 0, 255).astype(np.uint8)
         telemetry = Telemetry(round(number * EVERY_S * S), HEADING, 0.0, 0.0, AGL_M)
@@ -1036,8 +1125,13 @@ def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(fl
 
 
 def test_a_start_that_the_ground_contradicts_is_named(flown, run, paced, tmp_path):
-    path, folder, frame, truth = flown
+    path, recorded, frame, truth = flown
     first, lines = next(iter(truth.values())), tmp_path / "lines.jsonl"
+    folder = shutil.copytree(recorded, tmp_path / "flight")
+    names, *rows = (folder / "telemetry.csv").read_text().splitlines()
+    east, north = (STEP_M / EVERY_S * each for each in ALONG)
+    rows = [names + ",vel_east_mps,vel_north_mps", *(f"{row},{east},{north}" for row in rows)]
+    (folder / "telemetry.csv").write_text("\n".join(rows))
 
     def mismatches(*off_m):
         lines.unlink(missing_ok=True)
@@ -1051,7 +1145,7 @@ def test_a_start_that_the_ground_contradicts_is_named(flown, run, paced, tmp_pat
         return [line for line in done.err.splitlines() if "start_mismatch" in line]
 
     assert mismatches(3.0, -3.0) == []
-    (line,) = mismatches(-170.0, -210.0)
+    (line,) = mismatches(250.0, 200.0)
     assert "the ground contradicts the start position" in line
 
 

@@ -181,7 +181,9 @@ class Runner:
         self._log(lambda sink: sink.options(dict(self.options.logged_options)))
         self._notifier.notify("READY=1", "STATUS=waiting for images")
         try:
-            while not stopping.is_set() and not self._newest.is_over:
+            is_over = False
+            while not stopping.is_set() and not is_over:
+                is_over = self._newest.is_over  # then only the last health is left
                 try:
                     self.step(0.1)
                 except Exception:  # the flight continues with the next view
@@ -198,7 +200,7 @@ class Runner:
         image = self._newest.take(timeout_s)
         result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
-        if now_ns >= self._tick_ns:
+        if now_ns >= self._tick_ns or self._newest.is_over:
             self._tick_ns = now_ns + TICK_NS
             self._tick(now_ns)
         return result

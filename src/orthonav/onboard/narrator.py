@@ -14,7 +14,7 @@ import numpy as np
 
 from orthonav.onboard.cameras import NewestImage
 from orthonav.onboard.console import Console
-from orthonav.onboard.health import Health, HealthReporter, Level
+from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.telemetry import Clocks
 from orthonav.publish.estimate import error_ellipse
@@ -77,7 +77,8 @@ class Narrator:
         self._status_ns = clocks.mono_ns() + self._interval_ns
         self._reminded: dict[str, int] = {}
         self._camera, self._autopilot = _CameraWatch(console), _AutopilotWatch(console)
-        self._reporter, self._is_faulty = HealthReporter(), False
+        self._faults: tuple[str, ...] = ()
+        self._faults_ns = 0
         self._result: ViewResult | None = None
         self._counts, self._before = Counter[str](), Counter[str]()
         self._explained: set[str] = set()
@@ -153,16 +154,15 @@ class Narrator:
         """Say a change of the health, apart from what other lines say."""
         hidden = _SAID_BY_OTHERS
         if self._inputs.link is not None and not self._autopilot.is_heard:
-            hidden = {*hidden, "no_telemetry"}
-        shown = [each for each in plain["reasons"] if each not in hidden]
-        level = Level[plain["health"]] if shown else Level.OK
-        if not self._reporter.due(Health(level, tuple(shown)), now_ns):
+            hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
+        shown = tuple(each for each in plain["reasons"] if each not in hidden)
+        if shown == self._faults or now_ns < self._faults_ns:
             return
+        self._faults, self._faults_ns = shown, now_ns + STATUSTEXT_INTERVAL_NS
         if shown:
             self._console.warn(f"{plain['health']}: {', '.join(self._fault(plain, shown))}")
-        elif self._is_faulty:
-            self._console.say(f"health {': '.join([plain['health'], *plain['reasons'][:1]])}")
-        self._is_faulty = bool(shown)
+        elif plain["health"] == Level.OK.name:
+            self._console.say("health OK")
 
     def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
         """The reasons of the health, each with its meaning when it comes for the first time."""
