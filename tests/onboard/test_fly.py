@@ -1,8 +1,10 @@
 """The flight loop: every fault of a flight, and a flight over UDP from end to end."""
 
+import contextlib
 import json
 import math
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -10,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -1147,6 +1150,80 @@ def test_a_start_that_the_ground_contradicts_is_named(flown, run, paced, tmp_pat
     assert mismatches(3.0, -3.0) == []
     (line,) = mismatches(250.0, 200.0)
     assert "the ground contradicts the start position" in line
+
+
+def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_stdout(flown, run):
+    path, folder, _, _ = flown
+    command = ("fly", path, folder, "--recorded-telemetry", "--dry-run", "--pace", "10")
+    done = run(*command, "--jsonl", "-", "--deadline-ms", "60000")
+    views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
+    assert done.code == 0 and views
+    texts = [line[12:] for line in done.err.splitlines()]
+    assert texts[:6] == [
+        f"map: {path}, 0.40 km2, 1 m per pixel, level ground",
+        f"autopilot: recorded telemetry of {folder}",
+        "sends: JSON lines to stdout; positions of confidence 0.9 or more",
+        "start: anywhere on the map",
+        "GNSS: not used",
+        f"camera: 320x240 px, 77 x 62 deg (flight.json); images from {folder}, played at 10 times "
+        "real time",
+    ]
+    assert any(text.startswith("searching -> tracking: 46.") for text in texts)
+    withheld = Counter(each["withheld"] for each in views)
+    found = withheld.pop(None)
+    told = f"end: {len(views)} views, {found} with a position (none is sent)"
+    assert texts[-1].startswith(f"{told}, {withheld.total()} withheld: ")
+    done = run(*command, "--quiet")
+    lines = done.err.splitlines()
+    assert done.code == 0 and all("WARNING: " in line for line in lines)
+    done = run(*command, "--jsonl", "-", "--gnss", "watch")
+    assert (done.code, done.out) == (1, "") and "gnss.csv" in done.err.splitlines()[-1]
+
+
+def test_the_console_of_a_flight_beside_an_autopilot(flown, autopilot, monkeypatch, run, tmp_path):
+    path, folder, _, _ = flown
+    lines = tmp_path / "lines.jsonl"
+    autopilot.mute = True
+    talks = threading.Timer(1.5, lambda: setattr(autopilot, "mute", False))
+    held = pace_by(lines, lambda: autopilot.mute)
+    monkeypatch.setattr(cameras, "own_pace", held)
+    talks.start()
+    url = f"udpin:{autopilot.port}"
+    done = run(
+        *("fly", path, folder, "--autopilot", url, "--send", "gps-input", "--jsonl", lines),
+        *("--deadline-ms", "60000", "--telemetry-wait-ms", "10000"),
+    )
+    assert done.code == 0
+    texts = [line[12:] for line in done.err.splitlines()]
+    assert f"sends: GPS_INPUT, JSON lines to {lines}; positions of confidence 0.9 or more" in texts
+    waited, heard = f"waiting for heartbeat on {url}", f"autopilot 1/1 PX4 heard on {url}"
+    tracked = next(text for text in texts if "-> tracking" in text)
+    assert texts.index(waited) < texts.index(heard) < texts.index(tracked)
+    sent = sum(bool(line["sent"]) for line in views_in(lines)[0])
+    assert sent and texts[-1].startswith(f"end: {COUNT} views, {sent} sent, ")
+
+
+@pytest.mark.parametrize("how", ["nobody reads", "full", "closed"])
+def test_a_stderr_that_takes_nothing_delays_no_flight(flown, tmp_path, how):
+    path, folder, _, _ = flown
+    lines = tmp_path / "lines.jsonl"
+    reader, writer = os.pipe()
+    if how == "nobody reads":
+        os.close(reader)
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError, BrokenPipeError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    options = ("--recorded-telemetry", "--pace", "10", "--jsonl", lines, "--deadline-ms", "60000")
+    command = (sys.executable, "-m", "orthonav", "fly", path, folder, *options)
+    script = f"exec {shlex.join(map(str, command))}{' 2>&-' if how == 'closed' else ''}"
+    done = subprocess.run(["sh", "-c", script], stderr=writer, timeout=60, check=False)
+    assert done.returncode == 0
+    assert '"health"' in lines.read_text() and '"frame"' in lines.read_text()
+    os.close(writer)
+    if how != "nobody reads":
+        os.close(reader)
 
 
 def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():
