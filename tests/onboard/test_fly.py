@@ -778,6 +778,16 @@ def test_before_the_first_heartbeat_it_is_waited_for(begin, monkeypatch):
     assert len(flight.said.with_word("view 000001: no_telemetry: not reported")) == 1
 
 
+def test_a_second_autopilot_is_said_once(flight):
+    other = Autopilot(system=2)
+    for _ in range(30):
+        flight.hear(other.heartbeat())
+        flight.view()
+    said = "autopilot 2/1 heard on udpin:1, not used (see --system-id)"
+    assert flight.said.with_word("autopilot 2/1") == [said]
+    assert flight.said.lines.count("autopilot 1/1 PX4 heard on udpin:1") == 1
+
+
 def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flight):
     said = flight.said
     flight.locator.state_name = "coasting"

@@ -14,7 +14,7 @@ import numpy as np
 
 from orthonav.onboard.cameras import NewestImage
 from orthonav.onboard.console import Console
-from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, Level
+from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, HealthLimits, Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.telemetry import Clocks
 from orthonav.publish.estimate import error_ellipse
@@ -27,8 +27,9 @@ REMIND_S = 10.0
 """Interval of lines about a missing input."""
 RATE_S = 2.0
 """The rate of a camera is counted over so much time."""
-LOST_S = 3.0
+LOST_S = HealthLimits().image_age_s
 """A camera without an image for so long is lost."""
+LINK_LOST_S = HealthLimits().link_age_s
 _MOST_AGES = 100_000
 _KINDS = {Autopilot.PX4: " PX4", Autopilot.ARDUPILOT: " ArduPilot", None: ""}
 _STATES = {
@@ -92,6 +93,7 @@ class Narrator:
     ) -> None:
         """Note one view, and say where the state of the track changed."""
         now_ns = self._clocks.mono_ns()
+        self._watch(now_ns)
         self._begun_ns = self._begun_ns or now_ns
         reason = self._reason(result, sent, withheld)
         self._counts["views"] += 1
@@ -108,10 +110,7 @@ class Narrator:
     def health(self, plain: Mapping[str, Any]) -> None:
         """Say what changed since the last second, and the status where it is due."""
         now_ns = self._clocks.mono_ns()
-        if self._inputs.link is not None:
-            waits = self._autopilot.waits(self._inputs.link, self._inputs.url, plain["reasons"])
-            self._remind(waits, now_ns)
-        self._remind(self._camera.waits(self._inputs, now_ns), now_ns)
+        self._watch(now_ns)
         self._say_faults(plain, now_ns)
         counts = plain["counts"]
         self._dropped = counts.get("late", 0) + counts.get("replaced", 0)
@@ -144,6 +143,12 @@ class Narrator:
         say = self._console.warn if before == "tracking" else self._console.say
         say(f"{change}: {text}")
 
+    def _watch(self, now_ns: int) -> None:
+        """Say which inputs came or went, and which are missing."""
+        if self._inputs.link is not None:
+            self._remind(self._autopilot.waits(self._inputs.link, self._inputs.url), now_ns)
+        self._remind(self._camera.waits(self._inputs, now_ns), now_ns)
+
     def _remind(self, waits: str | None, now_ns: int) -> None:
         """Say what is missing, and again while it is."""
         if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
@@ -156,7 +161,8 @@ class Narrator:
         if self._inputs.link is not None and not self._autopilot.is_heard:
             hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
         shown = tuple(each for each in plain["reasons"] if each not in hidden)
-        if shown == self._faults or now_ns < self._faults_ns:
+        is_new = not self._explained.issuperset(shown)
+        if shown == self._faults or not (is_new or now_ns >= self._faults_ns):
             return
         self._faults, self._faults_ns = shown, now_ns + STATUSTEXT_INTERVAL_NS
         if shown:
@@ -232,15 +238,22 @@ class _AutopilotWatch:
     """Says when an autopilot comes and goes. Mutable."""
 
     def __init__(self, console: Console) -> None:
-        self._console, self.is_heard = console, False
+        self._console, self.is_heard, self._others = console, False, 0
 
-    def waits(self, link: AutopilotLink, url: str | None, reasons: Sequence[str]) -> str | None:
+    def waits(self, link: AutopilotLink, url: str | None) -> str | None:
         """Note the status of the link; what is waited for, None where telemetry comes."""
         status = link.status()
+        for each in status.others[self._others :]:
+            ids = f"{each.system_id}/{each.component_id}"
+            self._console.say(f"autopilot {ids} heard on {url}, not used (see --system-id)")
+        self._others = len(status.others)
         if status.target is None:
-            return f"heartbeat on {url}" + ("" if status.is_open else ", which cannot be opened")
+            why = "" if status.is_open else ", which cannot be opened"
+            if status.damaged:
+                why += "; messages are damaged, or not signed with this key"
+            return f"heartbeat on {url}{why}"
         ids = f"{status.target.system_id}/{status.target.component_id}"
-        is_heard = "link_down" not in reasons
+        is_heard = status.heard_age_s <= LINK_LOST_S
         if self.is_heard and not is_heard:
             self._console.warn(f"heartbeat lost: nothing heard from autopilot {ids} on {url}")
         elif is_heard and not self.is_heard:
