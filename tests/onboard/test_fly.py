@@ -753,7 +753,7 @@ def test_inputs_that_are_missing_come_and_go_are_said(flight):
     assert "autopilot 1/1 PX4 heard on udpin:1" in said and "camera 320x240, 10.0 Hz" in said
     assert not flight.said.with_word("waiting")
     status = flight.said.with_word("; health OK")[-1]
-    assert status.startswith("tracking 48.000000, 2.000000 +- 2.0 m, confidence 0.97; ")
+    assert status.startswith("tracking 48.000000, 2.000000 +- 2.0 m; ")
     flight.talks = False
     for _ in range(200):  # neither images nor messages for twenty seconds
         flight.time.go(0.1)

@@ -83,6 +83,7 @@ class Narrator:
         self._result: ViewResult | None = None
         self._counts, self._before = Counter[str](), Counter[str]()
         self._explained: set[str] = set()
+        self._meant: set[str] = set()
         self._ages_ms: deque[float] = deque(maxlen=_MOST_AGES)
         self._begun_ns: int | None = None
         self._first_s: float | None = None
@@ -161,7 +162,7 @@ class Narrator:
         if self._inputs.link is not None and not self._autopilot.is_heard:
             hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
         shown = tuple(each for each in plain["reasons"] if each not in hidden)
-        is_new = not self._explained.issuperset(shown)
+        is_new = not self._meant.issuperset(shown)
         if shown == self._faults or not (is_new or now_ns >= self._faults_ns):
             return
         self._faults, self._faults_ns = shown, now_ns + STATUSTEXT_INTERVAL_NS
@@ -173,8 +174,8 @@ class Narrator:
     def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
         """The reasons of the health, each with its meaning when it comes for the first time."""
         for reason in shown:
-            meaning = "" if reason in self._explained else _meaning(reason, plain)
-            self._explained.add(reason)
+            meaning = "" if reason in self._meant else _meaning(reason, plain)
+            self._meant.add(reason)
             yield f"{reason} ({meaning})" if meaning else reason
 
     def _status(self, plain: Mapping[str, Any]) -> str:
@@ -192,7 +193,7 @@ class Narrator:
     def _summary(self) -> str:
         parts = [_counted(self._counts, self._inputs.sends)]
         if self._dropped:
-            parts.append(f"{self._dropped} images dropped (too slow)")
+            parts.append(f"images dropped as too late: {self._dropped}")
         if self._ages_ms:
             median, p99 = np.percentile(list(self._ages_ms), [50, 99])
             parts.append(f"latency median {median:.0f} ms, p99 {p99:.0f} ms")
@@ -278,10 +279,7 @@ def _place_text(outcome: Fix | NoFix) -> str:
     if isinstance(outcome, NoFix):
         return f"{outcome.reason}: {outcome.detail}"
     std_m = error_ellipse(outcome.cov_en_m2)[0]
-    return (
-        f"{outcome.lat_deg:.6f}, {outcome.lon_deg:.6f} +- {std_m:.1f} m, "
-        f"confidence {outcome.confidence:.2f}"
-    )
+    return f"{outcome.lat_deg:.6f}, {outcome.lon_deg:.6f} +- {std_m:.1f} m"
 
 
 def _counted(counts: Counter[str], sends: bool) -> str:
