@@ -111,7 +111,7 @@ class Flight:
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
         messages = MessageOptions(kinds)
         self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
-        inputs = Inputs(self.newest, "images from 0", self.link, "udpin:1", sends=True)
+        inputs = Inputs(self.newest, "images from 0", True, self.link, "udpin:1", True)
         publisher = Publisher(
             self.gate,
             clocks,

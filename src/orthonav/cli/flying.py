@@ -96,7 +96,8 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         gnss = made(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     newest = NewestImage()
     sends = not options.dry_run and (link is not None or graph is not None)
-    inputs = Inputs(newest, awaited(options), link, options.autopilot, sends)
+    is_live = options.ros2 or cameras.is_live(options.source)
+    inputs = Inputs(newest, awaited(options), is_live, link, options.autopilot, sends)
     narrator = Narrator(console, clocks, inputs)
     publisher = _publisher(options, clocks, link, least, graph, narrator)
     if link is not None:

@@ -56,14 +56,15 @@ _SAID_BY_OTHERS = {*_STATES, "no_camera", "link_down"}
 class Inputs:
     """What a flight waits for.
 
-    `newest`: images of the camera, which come from `images`; None: their source says itself what it
-    waits for.
+    `newest`: images of the camera. `images`: where they come from; None: their source says itself
+    what it waits for. `is_live`: whether they come from a camera, which can be lost.
     `link`, `url`: connection to the autopilot, where there is one.
     `sends`: whether positions are sent to an autopilot or to ROS 2.
     """
 
     newest: NewestImage
     images: str | None
+    is_live: bool
     link: AutopilotLink | None
     url: str | None
     sends: bool
@@ -129,7 +130,7 @@ class Narrator:
             return None
         if isinstance(result.outcome, NoFix) and withheld in (None, "no_fix"):
             return result.outcome.reason
-        return withheld or ("link_down" if self._inputs.sends else None)
+        return withheld or ("not_sent" if self._inputs.sends else None)
 
     def _explain(self, result: ViewResult) -> None:
         """Say the reason of a view without a position in full, once for each reason."""
@@ -183,8 +184,8 @@ class Narrator:
         self._before = self._counts.copy()
         if self._result is None:
             return f"no view yet; health {plain['health']}"
-        outcome = self._result.outcome
-        place = f" {_place_text(outcome)}" if isinstance(outcome, Fix) else ""
+        outcome, is_place = self._result.outcome, self._result.state in ("tracking", "coasting")
+        place = f" {_place_text(outcome)}" if is_place and isinstance(outcome, Fix) else ""
         parts = [f"{plain['state']}{place}", _counted(since, self._inputs.sends)]
         if plain["age_p50_ms"]:
             parts.append(f"latency {plain['age_p50_ms']:.0f} ms, p95 {plain['age_p95_ms']:.0f} ms")
@@ -218,7 +219,7 @@ class _CameraWatch:
         newest = inputs.newest
         taken, outages, size = newest.taken, newest.outages, newest.size_px
         is_gone = outages > self._outages or now_ns - self._seen_ns > LOST_S * 1e9
-        if self._since is not None and is_gone and not newest.ended:
+        if self._since is not None and is_gone and inputs.is_live:
             self._console.warn("camera lost: no image any more")
             self._since = self._size = None
         self._outages = outages
