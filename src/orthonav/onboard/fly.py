@@ -615,11 +615,10 @@ class Runner:
         check = self._start_check
         if check is None:
             return 0.0
-        found_m = check.found_off_m(now_ns)
-        if found_m is not None:
-            return found_m
-        place = None if self._diagnosis is None else self._diagnosis.place(now_ns)
-        return 0.0 if place is None else check.off_m(*place)
+        place = None if self._diagnosis is None else self._diagnosis.place
+        if place is not None:
+            check.diagnosed(*place, now_ns)
+        return check.off_m(now_ns)
 
     def _latency_reason(self) -> str | None:
         """Reason why the latency of the camera cannot be used."""

@@ -313,17 +313,14 @@ class TelemetryDiagnosis:
 
     def mismatch(self, now_ns: int) -> tuple[float, float]:
         """Recent finding as `mismatch` gives it; zeros where there is none."""
-        found = self._recent(now_ns)
-        return (0.0, 0.0) if found is None else mismatch(*found[1:])
+        if self._found is None or now_ns - self._found[0] > DIAGNOSIS_VALID_S * 1e9:
+            return 0.0, 0.0
+        return mismatch(*self._found[1:])
 
-    def place(self, now_ns: int) -> tuple[Fix, float] | None:
-        """Recently found position and its age (s), for comparison with the start only."""
-        found = self._recent(now_ns)
-        return None if found is None else (found[1], (now_ns - found[0]) / 1e9)
-
-    def _recent(self, now_ns: int) -> tuple[int, Fix, Telemetry] | None:
-        found = self._found
-        return found if found and now_ns - found[0] <= DIAGNOSIS_VALID_S * 1e9 else None
+    @property
+    def place(self) -> tuple[Fix, int] | None:
+        """The last position found and the time of its view, for comparison with the start only."""
+        return None if self._found is None else (self._found[1], self._found[0])
 
 
 def _in_a_thread(work: Callable[[], None]) -> None:

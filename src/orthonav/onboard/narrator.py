@@ -49,7 +49,7 @@ _FAULTS = {
     "slow": "positions are late; see --budget-ms and --threads",
 }
 """What a reason of the health means, where its name does not say so."""
-_SAID_BY_OTHERS = {*_STATES, "no_camera", "link_down"}
+_SAID_BY_OTHERS = {*_STATES, "no_camera", "camera_lost", "link_down"}
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Narrator:
         self._reminded: dict[str, int] = {}
         self._camera, self._autopilot = _CameraWatch(console), _AutopilotWatch(console)
         self._faults: tuple[str, ...] = ()
-        self._faults_ns = 0
+        self._faults_ns, self._is_faulty = 0, False
         self._result: ViewResult | None = None
         self._counts, self._before = Counter[str](), Counter[str]()
         self._explained: set[str] = set()
@@ -163,14 +163,16 @@ class Narrator:
         if self._inputs.link is not None and not self._autopilot.is_heard:
             hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
         shown = tuple(each for each in plain["reasons"] if each not in hidden)
+        if self._is_faulty and plain["health"] == Level.OK.name:
+            self._is_faulty = False
+            self._console.say("health OK")
         is_new = not self._meant.issuperset(shown)
         if shown == self._faults or not (is_new or now_ns >= self._faults_ns):
             return
         self._faults, self._faults_ns = shown, now_ns + STATUSTEXT_INTERVAL_NS
+        self._is_faulty |= bool(shown)
         if shown:
             self._console.warn(f"{plain['health']}: {', '.join(self._fault(plain, shown))}")
-        elif plain["health"] == Level.OK.name:
-            self._console.say("health OK")
 
     def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
         """The reasons of the health, each with its meaning when it comes for the first time."""
