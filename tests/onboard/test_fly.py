@@ -905,8 +905,9 @@ def test_the_lowest_height_can_be_given(flown, tmp_path):
     path, folder, _, _ = flown
     for height, reasons in ((f"{AGL_M + 1}", {"too_low"}), (f"{AGL_M - 1}", set())):
         lines = tmp_path / f"{height}.jsonl"
-        options = ("--recorded-telemetry", "--pace", "1000", "--jsonl", str(lines))
-        assert main(["fly", str(path), str(folder), *options, "--min-agl-m", height]) == 0
+        options = ("--recorded-telemetry", "--pace", "1000", "--deadline-ms", "60000")
+        more = ("--jsonl", str(lines), "--min-agl-m", height)
+        assert main(["fly", str(path), str(folder), *options, *more]) == 0
         _, results = views_in(lines)
         found = {each.outcome.reason for each in results if isinstance(each.outcome, NoFix)}
         assert found & {"too_low"} == reasons
