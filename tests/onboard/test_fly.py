@@ -1,9 +1,10 @@
 """The flight loop: every fault of a flight, and a flight over UDP from end to end."""
 
-import argparse
+import contextlib
 import json
 import math
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -34,19 +36,18 @@ from fake_autopilot import (
 from paced import pace_by
 
 from orthonav.cli import main
-from orthonav.errors import CameraError, MapChangedError, MapFileError, VariantError
+from orthonav.errors import CameraError, MapChangedError, MapFileError
 from orthonav.flight.fixes import result_from_json
 from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.flight.heights import FlownHeights
 from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
@@ -79,6 +80,25 @@ class BoundedLog:
         return [arguments for called, arguments in self.calls if called == name]
 
 
+class Said:
+    """A console that keeps what it is told."""
+
+    is_terminal = True
+
+    def __init__(self):
+        self.lines, self.warnings = [], []
+
+    def say(self, text):
+        self.lines.append(text)
+
+    def warn(self, text):
+        self.warnings.append(text)
+        self.say(text)
+
+    def with_word(self, word):
+        return [line for line in self.lines if word in line]
+
+
 class Flight:
     """A runner with fake parts and a fake clock: one view every tenth of a second."""
 
@@ -90,15 +110,16 @@ class Flight:
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
         messages = MessageOptions(kinds)
-        self.lines = tmp_path / "lines.jsonl"
+        self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
+        inputs = Inputs(self.newest, "images from 0", True, self.link, "udpin:1", True)
         publisher = Publisher(
             self.gate,
             clocks,
             messenger=Messenger(messages, self.gate, self.link.send, clocks),
             link=self.link,
-            lines=[JsonOut(self.lines)],
+            lines=[JsonOut(self.lines), Narrator(self.said, clocks, inputs)],
         )
-        self.locator, self.newest, self.log = locator or FakeLocator(), NewestImage(), BoundedLog()
+        self.locator, self.log = locator or FakeLocator(), BoundedLog()
         rest = {name: options.pop(name) for name in ("diagnosis", "start") if name in options}
         options = FlyOptions(**options)
         self.runner = Runner(
@@ -726,9 +747,111 @@ def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
     assert flight.health().level is Level.FAILED
 
 
+def test_inputs_that_are_missing_come_and_go_are_said(flight):
+    flight.views(30)  # four seconds more
+    said = flight.said.lines
+    assert "autopilot 1/1 PX4 heard on udpin:1" in said and "camera 320x240, 10.0 Hz" in said
+    assert not flight.said.with_word("waiting")
+    status = flight.said.with_word("; health OK")[-1]
+    assert status.startswith("tracking 48.000000, 2.000000 +- 2.0 m; ")
+    flight.talks = False
+    for _ in range(200):  # neither images nor messages for twenty seconds
+        flight.time.go(0.1)
+        flight.runner.step(0)
+    assert len(flight.said.with_word("camera lost")) == 1
+    assert flight.said.with_word("heartbeat lost: nothing heard from autopilot 1/1")
+    for missing in ("images from 0", "autopilot 1/1 on udpin:1"):
+        assert 2 <= len(flight.said.with_word(f"waiting for {missing}")) <= 3
+    flight.talks = True
+    flight.views(60)
+    assert len(flight.said.with_word("autopilot 1/1 PX4 heard")) == 2
+    assert len(flight.said.with_word("camera 320x240, 10.0 Hz")) == 2
+
+
+def test_before_the_first_heartbeat_it_is_waited_for(begin, monkeypatch):
+    monkeypatch.setattr(Flight, "hear", lambda *_: None)
+    flight = begin()
+    flight.talks = False
+    flight.views(50)  # a quarter of a second each, with the wait for telemetry
+    waiting = flight.said.with_word("waiting")
+    assert waiting == ["waiting for heartbeat on udpin:1, which cannot be opened"] * 2
+    assert len(flight.said.with_word("view 000001: no_telemetry: not reported")) == 1
+
+
+def test_a_second_autopilot_is_said_once(flight):
+    other = Autopilot(system=2)
+    for _ in range(30):
+        flight.hear(other.heartbeat())
+        flight.view()
+    said = "autopilot 2/1 heard on udpin:1, not used (see --system-id)"
+    assert flight.said.with_word("autopilot 2/1") == [said]
+    assert flight.said.lines.count("autopilot 1/1 PX4 heard on udpin:1") == 1
+
+
+def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flight):
+    said = flight.said
+    flight.locator.state_name = "coasting"
+    flight.views(5)
+    assert "tracking -> coasting: views do not show the map" in said.warnings[-1]
+    flight.locator.state_name = "tracking"
+    flight.views(5)
+    assert said.lines[-1].startswith("coasting -> tracking: 48.000000, 2.000000 +- 2.0 m")
+    flight.locator.outcome = lambda view: fix(heading_deg=view.telemetry.yaw_deg + 35)
+    flight.views(80)
+    assert said.with_word("heading_mismatch") == [
+        "DEGRADED: heading_mismatch (check the compass and --mount-deg, or use --heading unknown)"
+    ]
+    del flight.locator.outcome
+    flight.locator.outcome = FakeLocator().outcome
+    flight.views(80)
+    assert "health OK" in said.lines
+    flight.runner._publisher.close()
+    summary = said.lines[-1]
+    assert summary.startswith(
+        "end: 200 views, 194 sent, 6 withheld: coasting 5, no_telemetry 1; latency median 50"
+    )
+    assert summary.endswith("first position 0.1 s after the first view")
+
+
+def test_a_start_that_is_contradicted_degrades_for_a_while(begin):
+    """First by the diagnosis, then by the track, and half a minute later no more."""
+
+    class Localizer:
+        def locate(self, view, *, heading_known):
+            assert view.telemetry.prior is None or heading_known
+            return fix(48.02, 2.0, heading_deg=30.0)
+
+    locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
+    diagnosis = TelemetryDiagnosis(Localizer(), 0.9, lambda work: work(), has_start=True)
+    flight = begin(locator, diagnosis=diagnosis, start=lambda: Prior(48.0, 2.0, 100.0))
+    flight.views(40)
+    assert flight.reasons() == {"searching"}
+    flight.views(60)
+    assert flight.reasons() == {"searching", "start_mismatch"}
+    flight.views(700)  # by now it may have come there from the start, as far as its speed goes
+    assert flight.reasons() == {"searching", "start_mismatch"}
+    locator.state_name, locator.outcome = "tracking", lambda *_: fix(48.02, 2.0, heading_deg=30.0)
+    flight.views(20)
+    assert flight.reasons() == {"start_mismatch"}
+    assert flight.written()[-1]["start_off_m"] == pytest.approx(2224, abs=10)
+    assert flight.said.with_word("start_mismatch (the ground contradicts the start position, 2,22")
+    flight.views(310)
+    assert flight.reasons() == set()
+
+
+def test_a_start_within_its_deviation_and_the_motion_since_is_right(begin):
+    locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
+    flight = begin(locator, start=lambda: Prior(48.0, 2.0, 100.0))
+    flight.views(100)  # ten seconds at up to 30 m/s
+    locator.state_name, locator.outcome = "tracking", lambda *_: fix(48.005, 2.0, heading_deg=30.0)
+    flight.views(20)  # 556 m north
+    assert flight.reasons() == set()
+
+
 # From here on with a map, over UDP.
 
-SPEED_MPS, HEADING, EVERY_S = 14.0, 60.0, 0.5
+STEP_M, HEADING, EVERY_S = 14.0, 60.0, 0.5
+ALONG = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
 COUNT = 20
 PACED = Path(__file__).parent / "paced.py"
 
@@ -739,10 +862,9 @@ def flown(made_once, make_ortho, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fly")
     _, path, frame = known_map(made_once, make_ortho)
     rng = np.random.default_rng(0)
-    along = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
     seen, truth = [], {}
     for number in range(COUNT):
-        place = np.array([-120.0, -80.0]) + number * SPEED_MPS * along
+        place = np.array([-120.0, -80.0]) + number * STEP_M * ALONG
         grey = rendered(GROUND, place, (HEADING, 0.0, 0.0), AGL_M, CAMERA)
         grey = np.clip(0.75 * grey + 30 + rng.normal(0, 6, grey.shape), 0, 255).astype(np.uint8)
         telemetry = Telemetry(round(number * EVERY_S * S), HEADING, 0.0, 0.0, AGL_M)
@@ -783,8 +905,9 @@ def test_the_lowest_height_can_be_given(flown, tmp_path):
     path, folder, _, _ = flown
     for height, reasons in ((f"{AGL_M + 1}", {"too_low"}), (f"{AGL_M - 1}", set())):
         lines = tmp_path / f"{height}.jsonl"
-        options = ("--recorded-telemetry", "--pace", "1000", "--jsonl", str(lines))
-        assert main(["fly", str(path), str(folder), *options, "--min-agl-m", height]) == 0
+        options = ("--recorded-telemetry", "--pace", "1000", "--deadline-ms", "60000")
+        more = ("--jsonl", str(lines), "--min-agl-m", height)
+        assert main(["fly", str(path), str(folder), *options, *more]) == 0
         _, results = views_in(lines)
         found = {each.outcome.reason for each in results if isinstance(each.outcome, NoFix)}
         assert found & {"too_low"} == reasons
@@ -992,24 +1115,128 @@ def test_invalid_options_end_with_one_line(flown, run, tmp_path):
     assert done.code == 2 and "LAT,LON,STD_M" in done.err
 
 
-def test_a_start_far_from_the_map_is_named_and_a_swap_too(flown, caplog):
-    from orthonav.cli.flying import _given_start
-
-    localizer = Localizer(open_map(flown[0]))
-    lat, lon = localizer.sheet.frame.lat_deg, localizer.sheet.frame.lon_deg
+def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(flown, run, tmp_path):
+    path, folder, frame, _ = flown
+    lines = tmp_path / "lines.jsonl"
+    options = ("--recorded-telemetry", "--pace", "1000", "--jsonl", lines)
 
     def start(*values):
-        caplog.clear()
-        return _given_start(argparse.Namespace(start=values), localizer), caplog.text
+        text = ",".join(map(str, values))
+        return run("fly", path, folder, *options, f"--start={text}")
 
-    assert start(lat, lon, 50.0) == (Prior(lat, lon, 50.0), "")
-    assert _given_start(argparse.Namespace(start=None), localizer) is None
-    assert "km from the map; check the map and the positions\n" in start(lat + 1, lon, 50.0)[1]
-    assert "seem to be swapped" in start(lon, lat, 50.0)[1]
-    with pytest.raises(VariantError, match=r"got 120,46,50; latitude and longitude seem"):
-        start(120.0, 46.0, 50.0)
-    with pytest.raises(VariantError, match="above 0 m"):
-        start(lat, lon, 0.0)
+    lat, lon = frame.lat_deg, frame.lon_deg
+    for values, words in {
+        (lat + 0.05, lon, 50): "5.2 km from the map, more than 3 km and 3 times its deviation",
+        (lon, lat, 50): "; latitude and longitude seem to be swapped",
+        (120, 46, 50): "got 120,46,50; latitude and longitude seem to be swapped",
+        (lat, lon, 0): "above 0 m",
+    }.items():
+        done = start(*values)
+        assert (done.code, done.err.count("\n")) == (2, 1) and words in done.err
+        assert not lines.exists()
+    done = start(lat + 0.02, lon, 50)
+    assert done.code == 0 and "WARNING: --start is 2 km from the map; check" in done.err
+    done = start(lat + 0.05, lon, 2000)
+    assert done.code == 0 and "WARNING: --start is 5 km from the map; check" in done.err
+
+
+def test_a_start_that_the_ground_contradicts_is_named(flown, run, paced, tmp_path):
+    path, recorded, frame, truth = flown
+    first, lines = next(iter(truth.values())), tmp_path / "lines.jsonl"
+    folder = shutil.copytree(recorded, tmp_path / "flight")
+    names, *rows = (folder / "telemetry.csv").read_text().splitlines()
+    east, north = (STEP_M / EVERY_S * each for each in ALONG)
+    rows = [names + ",vel_east_mps,vel_north_mps", *(f"{row},{east},{north}" for row in rows)]
+    (folder / "telemetry.csv").write_text("\n".join(rows))
+
+    def mismatches(*off_m):
+        lines.unlink(missing_ok=True)
+        lat, lon = frame.latlon_from_en(first + off_m)
+        paced(lines)
+        done = run(
+            *("fly", path, folder, "--recorded-telemetry", "--deadline-ms", "60000"),
+            *("--jsonl", lines, f"--start={lat},{lon},5"),
+        )
+        assert done.code == 0 and "-> tracking" in done.err
+        return [line for line in done.err.splitlines() if "start_mismatch" in line]
+
+    assert mismatches(3.0, -3.0) == []
+    (line,) = mismatches(250.0, 200.0)
+    assert "the ground contradicts the start position" in line
+
+
+def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_stdout(flown, run):
+    path, folder, _, _ = flown
+    command = ("fly", path, folder, "--recorded-telemetry", "--dry-run", "--pace", "10")
+    done = run(*command, "--jsonl", "-", "--deadline-ms", "60000")
+    views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
+    assert done.code == 0 and views
+    texts = [line[12:] for line in done.err.splitlines()]
+    assert texts[:6] == [
+        f"map: {path}, 0.40 km2, 1 m per pixel, level ground",
+        f"autopilot: recorded telemetry of {folder}",
+        "sends: JSON lines to stdout; positions of confidence 0.9 or more",
+        "start: anywhere on the map",
+        "GNSS: not used",
+        f"camera: 320x240 px, 77 x 62 deg (flight.json); images from {folder}, played at 10 times "
+        "real time",
+    ]
+    assert any(text.startswith("searching -> tracking: 46.") for text in texts)
+    withheld = Counter(each["withheld"] for each in views)
+    found = withheld.pop(None)
+    told = f"end: {len(views)} views, {found} with a position (none is sent)"
+    assert texts[-1].startswith(f"{told}, {withheld.total()} withheld: ")
+    done = run(*command, "--quiet")
+    lines = done.err.splitlines()
+    assert done.code == 0 and all("WARNING: " in line for line in lines)
+    done = run(*command, "--jsonl", "-", "--gnss", "watch")
+    assert (done.code, done.out) == (1, "") and "gnss.csv" in done.err.splitlines()[-1]
+
+
+def test_the_console_of_a_flight_beside_an_autopilot(flown, autopilot, monkeypatch, run, tmp_path):
+    path, folder, _, _ = flown
+    lines = tmp_path / "lines.jsonl"
+    autopilot.mute = True
+    talks = threading.Timer(1.5, lambda: setattr(autopilot, "mute", False))
+    held = pace_by(lines, lambda: autopilot.mute)
+    monkeypatch.setattr(cameras, "own_pace", held)
+    talks.start()
+    url = f"udpin:{autopilot.port}"
+    done = run(
+        *("fly", path, folder, "--autopilot", url, "--send", "gps-input", "--jsonl", lines),
+        *("--deadline-ms", "60000", "--telemetry-wait-ms", "10000"),
+    )
+    assert done.code == 0
+    texts = [line[12:] for line in done.err.splitlines()]
+    assert f"sends: GPS_INPUT, JSON lines to {lines}; positions of confidence 0.9 or more" in texts
+    waited, heard = f"waiting for heartbeat on {url}", f"autopilot 1/1 PX4 heard on {url}"
+    tracked = next(text for text in texts if "-> tracking" in text)
+    assert texts.index(waited) < texts.index(heard) < texts.index(tracked)
+    sent = sum(bool(line["sent"]) for line in views_in(lines)[0])
+    assert sent and texts[-1].startswith(f"end: {COUNT} views, {sent} sent, ")
+
+
+@pytest.mark.parametrize("how", ["nobody reads", "full", "closed"])
+def test_a_stderr_that_takes_nothing_delays_no_flight(flown, tmp_path, how):
+    path, folder, _, _ = flown
+    lines = tmp_path / "lines.jsonl"
+    reader, writer = os.pipe()
+    if how == "nobody reads":
+        os.close(reader)
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError, BrokenPipeError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    options = ("--recorded-telemetry", "--pace", "10", "--jsonl", lines, "--deadline-ms", "60000")
+    command = (sys.executable, "-m", "orthonav", "fly", path, folder, *options)
+    script = f"exec {shlex.join(map(str, command))}{' 2>&-' if how == 'closed' else ''}"
+    done = subprocess.run(["sh", "-c", script], stderr=writer, timeout=60, check=False)
+    assert done.returncode == 0
+    assert '"health"' in lines.read_text() and '"frame"' in lines.read_text()
+    os.close(writer)
+    if how != "nobody reads":
+        os.close(reader)
 
 
 def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():

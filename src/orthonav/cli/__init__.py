@@ -125,7 +125,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
-        return _failed(_with_options(_one_line(error), options), verbose)
+        _failed(_with_options(_one_line(error), options), verbose)
+        return error.exit_code
     except KeyboardInterrupt:
         return _failed("interrupted; nothing was written", False)
     except BrokenPipeError:

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.cli.common import search_plan
+from orthonav.cli.flying_console import awaited, camera_line, opened_console, plan_lines
+from orthonav.cli.flying_start import start_of
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
-from orthonav.cli.source import FAR_M, distance_from_map, far_text
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
@@ -23,17 +24,17 @@ from orthonav.flight.identity import Identity, Source
 from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
-from orthonav.geo.swapped import swapped_hint
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import MapFile, open_map
 from orthonav.onboard import cameras
 from orthonav.onboard.calibrate import MountCorrected, model_of
-from orthonav.onboard.cameras import CameraThread
+from orthonav.onboard.cameras import CameraThread, NewestImage
 from orthonav.onboard.fly import FlyOptions, LogSink, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
+from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import (
     KINDS,
     LOCAL,
@@ -45,17 +46,17 @@ from orthonav.onboard.outputs import (
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
-from orthonav.onboard.publisher import PositionOutput, Publisher
+from orthonav.onboard.publisher import PositionOutput, Publisher, ViewOutput
 from orthonav.onboard.run import Locator
 from orthonav.onboard.serials import require_newest
-from orthonav.onboard.state import boot_id, load, prior_of
+from orthonav.onboard.state import load
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.publish.local import Origin
 from orthonav.publish.mavlink import Signing, signing_timestamp
 from orthonav.publish.nmea import Quality
-from orthonav.records import CONFIDENT, Prior
+from orthonav.records import CONFIDENT
 from orthonav.sources.cameras import read_camera_file
 
 log = logging.getLogger(__name__)
@@ -67,12 +68,14 @@ the next ones late. An aircraft climbs through them."""
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
     """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
+    console = opened_console(options, clocks, stack)
     opened = _opened(options)
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
+    start = start_of(options, clocks, localizer)
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
@@ -81,7 +84,10 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
+    for line in plan_lines(options, opened, least):
+        console.say(line)
     camera = camera or source.wait_for_camera()
+    console.say(camera_line(options, camera))
     digest = opened.manifest.sha256
     gnss = None
     if options.gnss != "off":  # only where it is asked for
@@ -89,7 +95,12 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
         gnss = made(options, localizer.sheet.frame, digest, used, queue, least, clocks)
-    publisher = _publisher(options, clocks, link, least, graph, digest)
+    newest = NewestImage()
+    sends = not options.dry_run and (link is not None or graph is not None)
+    is_live = options.ros2 or cameras.is_live(options.source)
+    inputs = Inputs(newest, awaited(options), is_live, link, options.autopilot, sends)
+    narrator = Narrator(console, clocks, inputs)
+    publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera, digest)
@@ -97,7 +108,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         source.log_gnss = sink.gnss
     if gnss is not None and sink is not None and not options.ros2:
         gnss.log = sink.gnss  # with ROS 2 messages are logged as received
-    thread = CameraThread(source, stopping)
+    thread = CameraThread(source, stopping, newest)
     stack.callback(thread.stop)
     fly = FlyOptions(
         mount_deg=tuple(options.mount_deg),
@@ -116,7 +127,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         logged_options=_logged_options(options, mount),
     )
     return Runner(
-        thread.newest,
+        newest,
         camera,
         locator,
         publisher,
@@ -124,8 +135,10 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         clocks,
         link=link,
         sink=sink,
-        diagnosis=TelemetryDiagnosis(localizer, least),
-        start=_start(options, clocks, localizer),
+        diagnosis=TelemetryDiagnosis(
+            localizer, least, has_start=bool(options.start or options.state)
+        ),
+        start=start,
         notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
@@ -269,6 +282,7 @@ def _publisher(
     link: AutopilotLink | None,
     least: float,
     graph: PositionOutput | None,
+    narrator: Narrator,
     digest: str,
 ) -> Publisher:
     interval = {}
@@ -299,7 +313,7 @@ def _publisher(
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
         used = Identity(Source(options.map.name, digest))
-        lines = [
+        lines: list[ViewOutput] = [
             JsonOut(None if each == "-" else Path(each), identity=used) for each in options.jsonl
         ]
     except OSError as error:
@@ -311,7 +325,7 @@ def _publisher(
         messenger=messenger,
         link=link,
         nmea=nmea,
-        lines=lines,
+        lines=[*lines, narrator],
         graph=graph,
         min_confidence=least,
         min_std_m=options.min_std_m,
@@ -330,43 +344,6 @@ def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
             1 / PX4_VISION_S,
             min(rates),
         )
-
-
-def _start(
-    options: argparse.Namespace, clocks: Clocks, localizer: Localizer
-) -> Callable[[], Prior | None]:
-    """Function that gives the prior of the first view.
-
-    It is the saved position if that is recent, else `--start`, else None.
-    """
-    given = _given_start(options, localizer)
-    saved = load(options.state) if options.state else None
-
-    def prior() -> Prior | None:
-        if saved is None:
-            return given
-        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(saved, age_s, options.state_max_age_s) or given
-
-    return prior
-
-
-def _given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
-    """The position of `--start`; a warning where it is far from the map. Raises `VariantError`."""
-    if not options.start:
-        return None
-    start = Prior(*options.start)
-    place = start.lat_deg, start.lon_deg
-    if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and start.std_m > 0):
-        raise VariantError(
-            "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
-            f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
-            f"{swapped_hint(*place)}"
-        )
-    far_m, hint = distance_from_map(place, localizer)
-    if far_m > FAR_M:
-        log.warning("%s", far_text("--start is", far_m, hint))
-    return start
 
 
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> LogSink | None:

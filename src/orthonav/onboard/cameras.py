@@ -322,6 +322,7 @@ class NewestImage:
         self._condition = threading.Condition()
         self._picture: CameraImage | None = None
         self.taken = self.replaced = self.outages = 0
+        self.size_px: tuple[int, int] | None = None
         self.ended = False
 
     def put(self, image: CameraImage) -> None:
@@ -329,6 +330,8 @@ class NewestImage:
         with self._condition:
             self.replaced += self._picture is not None
             self.taken += 1
+            if image.grey is not None:
+                self.size_px = image.grey.shape[1], image.grey.shape[0]
             self._picture = image
             self._condition.notify()
 
@@ -386,8 +389,10 @@ def read_into(
 class CameraThread:
     """Reads a source into a `NewestImage` until it is stopped."""
 
-    def __init__(self, source: ImageSource, stopping: threading.Event) -> None:
-        self.newest, self._stopping = NewestImage(), stopping
+    def __init__(
+        self, source: ImageSource, stopping: threading.Event, newest: NewestImage | None = None
+    ) -> None:
+        self.newest, self._stopping = newest or NewestImage(), stopping
         arguments = self.newest, source, stopping.is_set, stopping.wait
         self._thread = threading.Thread(
             target=read_into, args=arguments, name="camera", daemon=True

@@ -39,6 +39,7 @@ from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
+from orthonav.onboard.start_check import StartCheck
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect, status_texts
@@ -154,6 +155,7 @@ class Runner:
         self._link, self._sink, self._diagnosis = link, sink, diagnosis
         self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
+        self._start_check: StartCheck | None = None
         self._notifier = notifier or Notifier("")
         self._gnss = gnss
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
@@ -179,7 +181,9 @@ class Runner:
         self._log(lambda sink: sink.options(dict(self.options.logged_options)))
         self._notifier.notify("READY=1", "STATUS=waiting for images")
         try:
-            while not stopping.is_set() and not self._newest.is_over:
+            is_over = False
+            while not stopping.is_set() and not is_over:
+                is_over = self._newest.is_over  # then only the last health is left
                 try:
                     self.step(0.1)
                 except Exception:  # the flight continues with the next view
@@ -196,7 +200,7 @@ class Runner:
         image = self._newest.take(timeout_s)
         result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
-        if now_ns >= self._tick_ns:
+        if now_ns >= self._tick_ns or self._newest.is_over:
             self._tick_ns = now_ns + TICK_NS
             self._tick(now_ns)
         return result
@@ -296,10 +300,7 @@ class Runner:
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency | None
     ) -> ViewResult:
         """Log, locate and publish a view."""
-        if self._start is not None:
-            prior, self._start = self._start(), None
-            telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
-            view = replace(view, telemetry=telemetry)
+        view = self._from_start(view)
         self._say_heights(view.telemetry)
         known = self._above_ground(view.telemetry)
         if isinstance(known, NoFix):
@@ -341,6 +342,18 @@ class Runner:
             found = result.state in (None, "tracking") and isinstance(outcome, Fix)
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
+
+    def _from_start(self, view: View) -> View:
+        """The view, the first one with the start position as its prior."""
+        telemetry = view.telemetry
+        if self._start is not None:
+            prior, self._start = self._start(), None
+            view = replace(view, telemetry=replace(telemetry, prior=prior or telemetry.prior))
+            if prior is not None:
+                self._start_check = StartCheck(prior, telemetry.time_ns)
+        if self._start_check is not None:
+            self._start_check.moved(telemetry)
+        return view
 
     def _over_gap(
         self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState
@@ -392,6 +405,8 @@ class Runner:
             return
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")
+        if self._start_check is not None:
+            self._start_check.confirmed(fix, self._confident_ns)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -515,8 +530,9 @@ class Runner:
         self._count_changes()
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
-        health = self.health = judge(self._snapshot(now_ns))
-        plain = self._plain(health)
+        seen = self._snapshot(now_ns)
+        health = self.health = judge(seen)
+        plain = self._plain(health, seen.start_off_m)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
         self._notifier.notify("WATCHDOG=1", f"STATUS={health.text()}")
@@ -588,10 +604,21 @@ class Runner:
             map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
+            start_off_m=self._start_off_m(now_ns),
             gnss=() if self._gnss is None else self._gnss.reasons,
             has_origin=has_origin,
             latency=self._latency_reason(),
         )
+
+    def _start_off_m(self, now_ns: int) -> float:
+        """Distance by which the track, or before it the diagnosis, contradicts the start."""
+        check = self._start_check
+        if check is None:
+            return 0.0
+        place = None if self._diagnosis is None else self._diagnosis.place
+        if place is not None:
+            check.diagnosed(*place, now_ns)
+        return check.off_m(now_ns)
 
     def _latency_reason(self) -> str | None:
         """Reason why the latency of the camera cannot be used."""
@@ -599,7 +626,7 @@ class Runner:
             return None
         return self._latency.current().reason
 
-    def _plain(self, health: Health) -> dict[str, Any]:
+    def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
         total = self.counter.total
         return {
             "health": health.level.name,
@@ -611,6 +638,7 @@ class Runner:
             "sent": dict(sorted(self._publisher.gate.sent.items())),
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
+            **({"start_off_m": round(start_off_m, 1)} if start_off_m else {}),
             **({} if self._gnss is None else {"gnss": self._gnss.plain()}),
             **({} if self._latency is None else self._latency.plain()),
         }

@@ -99,6 +99,7 @@ class Snapshot:
     `map_unchanged`: whether the file of the map's name is still the one that was opened.
     `map_intact`: whether the open map file was neither truncated nor rewritten.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
+    `start_off_m`: distance by which the ground contradicts the start position, 0 if it does not.
     `gnss`: reasons of the GNSS monitor.
     `has_origin`: whether the origin of the local frame is known, where messages need it.
     `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
@@ -117,6 +118,7 @@ class Snapshot:
     map_intact: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
+    start_off_m: float = 0.0
     gnss: tuple[str, ...] = ()
     has_origin: bool = True
     latency: str | None = None
@@ -139,6 +141,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
     degraded = {
         "heading_mismatch": abs(seen.heading_mismatch_deg) > limits.heading_deg,
         "height_mismatch": abs(seen.log_scale_mismatch) > limits.log_scale,
+        "start_mismatch": seen.start_off_m > 0,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
         "coasting": seen.state == "coasting" and seen.low_confidence_s > limits.coasting_s,
@@ -251,11 +254,12 @@ def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:
 
 
 class TelemetryDiagnosis:
-    """Finds out whether a wrong heading or height is the reason that no position is found.
+    """Finds out whether a wrong heading, height or start is the reason that no position is found.
 
-    While a track finds nothing, a view is located again with any heading, with half the height and
-    with twice the height, one hypothesis at a time. A confident fix shows which value is wrong; it
-    is never used as a position. It takes seconds on a large map, so it runs in a thread. Mutable.
+    While a track finds nothing, a view is located again on the whole map: with any heading, with
+    half the height and with twice the height, one hypothesis at a time. A confident fix shows which
+    value is wrong; it is never used as a position. It takes seconds on a large map, so it runs in a
+    thread. Mutable.
     """
 
     HYPOTHESES = ((False, 1.0), (True, 0.5), (True, 2.0))  # heading known, factor of the height
@@ -265,14 +269,18 @@ class TelemetryDiagnosis:
         localizer: Localizer,
         min_confidence: float,
         start: Callable[[Callable[[], None]], None] | None = None,
+        *,
+        has_start: bool = False,
     ) -> None:
-        """`start` runs a function, by default in a thread."""
+        """`start` runs a function, by default in a thread. `has_start`: the track begins at a
+        start position, so the telemetry as reported is a hypothesis too."""
         self._localizer, self._least = localizer, min_confidence
         self._start = start or _in_a_thread
+        self._hypotheses = ((True, 1.0), *self.HYPOTHESES) if has_start else self.HYPOTHESES
         self._busy = False
         self._since_ns: int | None = None
         self._number = 0
-        self._found: tuple[int, float, float] | None = None
+        self._found: tuple[int, Fix, Telemetry] | None = None
 
     def observe(self, view: View, found: bool, now_ns: int) -> None:
         """Pass every view and whether the track has a position; some views are tried again."""
@@ -283,7 +291,7 @@ class TelemetryDiagnosis:
         if self._busy or now_ns - self._since_ns < DIAGNOSIS_INTERVAL_S * 1e9:
             return
         self._since_ns = now_ns
-        heading_known, factor = self.HYPOTHESES[self._number % len(self.HYPOTHESES)]
+        heading_known, factor = self._hypotheses[self._number % len(self._hypotheses)]
         self._number += 1
         telemetry = view.telemetry
         assumed = replace(view, telemetry=replace(telemetry, agl_m=telemetry.agl_m * factor))
@@ -292,7 +300,7 @@ class TelemetryDiagnosis:
             try:
                 outcome = self._localizer.locate(assumed, heading_known=heading_known)
                 if isinstance(outcome, Fix) and outcome.confidence >= self._least:
-                    self._found = (now_ns, *mismatch(outcome, telemetry))
+                    self._found = now_ns, outcome, telemetry
             except MapFileError as error:
                 log.warning("diagnosis of telemetry failed: %s", error)
             except Exception:  # the flight does not depend on it
@@ -307,7 +315,12 @@ class TelemetryDiagnosis:
         """Recent finding as `mismatch` gives it; zeros where there is none."""
         if self._found is None or now_ns - self._found[0] > DIAGNOSIS_VALID_S * 1e9:
             return 0.0, 0.0
-        return self._found[1:]
+        return mismatch(*self._found[1:])
+
+    @property
+    def place(self) -> tuple[Fix, int] | None:
+        """The last position found and the time of its view, for comparison with the start only."""
+        return None if self._found is None else (self._found[1], self._found[0])
 
 
 def _in_a_thread(work: Callable[[], None]) -> None:

@@ -45,6 +45,7 @@ HEARTBEAT_NS, TIMESYNC_NS = 10**9, 10**9
 RESIGN_NS = 10 * 10**9
 """Interval at which signature timestamps are set to the current time."""
 _MOST_READS = 200
+_MOST_OTHERS = 10
 _BOARD, _NO_AUTOPILOT, _AUTOPILOT_COMPONENT = 18, 8, 1
 _KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
 _DOWNWARD = 25
@@ -65,6 +66,8 @@ class LinkStatus:
     `jumps`: number of clock jumps since the start.
     `errors`: number of failures of the port since the start.
     `target`, `kind`: ids and type of the autopilot; None until its first heartbeat.
+    `others`: autopilots that were heard and are not used.
+    `damaged`: number of messages that could not be decoded, or were not signed as asked.
     """
 
     is_open: bool
@@ -75,6 +78,8 @@ class LinkStatus:
     errors: int
     target: Target | None
     kind: Autopilot | None
+    others: tuple[Target, ...]
+    damaged: int
 
 
 class AutopilotLink:
@@ -112,6 +117,7 @@ class AutopilotLink:
         self._transport: Transport | None = None
         self._retry_ns, self._failures = 0, 0
         self.target: Target | None = None
+        self._others: list[Target] = []
         self.kind: Autopilot | None = None
         self.origin: Origin | None = None
         self.armed: bool | None = None
@@ -199,6 +205,8 @@ class AutopilotLink:
                 errors=self.counts["error"],
                 target=self.target,
                 kind=self.kind,
+                others=tuple(self._others),
+                damaged=self.counts["damaged"],
             )
 
     def signing_now(self) -> int | None:
@@ -279,16 +287,18 @@ class AutopilotLink:
 
     def _is_autopilot(self, message: Message) -> bool:
         """Whether a message comes from the autopilot; its first heartbeat sets the target."""
-        system_id = message.get_srcSystem()
-        if self.target is not None:
-            return bool(
-                system_id == self.target.system_id
-                and message.get_srcComponent() == self.target.component_id
-            )
+        system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
+        if self.target is not None and system_id == self.target.system_id:
+            return bool(component_id == self.target.component_id)
         heartbeat = message.get_type() == "HEARTBEAT" and message.autopilot != _NO_AUTOPILOT
-        if not heartbeat or self._wanted not in (None, system_id) or system_id == 0:
+        if not heartbeat or system_id == 0:
             return False
-        self.target = Target(system_id, message.get_srcComponent() or _AUTOPILOT_COMPONENT)
+        heard = Target(system_id, component_id or _AUTOPILOT_COMPONENT)
+        if self.target is not None or self._wanted not in (None, system_id):
+            if heard not in self._others and len(self._others) < _MOST_OTHERS:
+                self._others.append(heard)
+            return False
+        self.target = heard
         self._packer = None
         self._due = dict.fromkeys(self._due, 0)  # send a heartbeat and TIMESYNC at once
         return True

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.outputs import JsonOut, Messenger, NmeaOut
+from orthonav.onboard.outputs import Messenger, NmeaOut
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.correlation import FilterCovariance
 from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
@@ -14,6 +14,21 @@ from orthonav.publish.gate import Gate
 from orthonav.records import CONFIDENT, ViewResult
 
 log = logging.getLogger(__name__)
+
+
+class ViewOutput(Protocol):
+    """Takes every view, and the health: lines of JSON, the console. Raises `OSError`."""
+
+    def view(
+        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
+    ) -> None:
+        """Take one view: its age at the end, the messages sent, why none was."""
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """Take the health."""
+
+    def close(self) -> None:
+        """Close the output."""
 
 
 class PositionOutput(Protocol):
@@ -42,7 +57,7 @@ class Publisher:
         messenger: Messenger | None = None,
         link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
-        lines: Sequence[JsonOut] = (),
+        lines: Sequence[ViewOutput] = (),
         graph: PositionOutput | None = None,
         min_confidence: float = CONFIDENT,
         min_std_m: float = 0.0,
