@@ -45,8 +45,9 @@ class MissionItem:
     """A mission item.
 
     `command`: MAV_CMD. `frame`: MAV_FRAME, the reference of `height_m`. `lat_deg`, `lon_deg`:
-    position, None if it has none. `number`: of the item in its file. `pattern`: number shared by all
-    items of one survey or corridor, which is flown as a whole. `band_m`: search band between items of one pattern.
+    position, None if it has none. `number`: of the item in its file. `pattern`: number shared by
+    all items of one survey or corridor, which is flown as a whole. `band_m`: search band between
+    items of one pattern.
     """
 
     command: int
