@@ -206,8 +206,8 @@ BROKEN = {
     "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
     "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
     "short subtitles": (short_film, "telemetry ends"),
-    "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "ROS recording cannot be"),
-    "bag cut": (lambda folder: truncated(bag(folder / "b", "bag")), "ROS recording cannot be"),
+    "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "recording was cut short"),
+    "bag cut": (lambda folder: truncated(bag(folder / "b", "bag")), "rosbag reindex"),
     "no flight": (lambda folder: folder_of(folder / "f") / "frames", "no time in EXIF"),
 }
 

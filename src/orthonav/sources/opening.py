@@ -5,13 +5,15 @@ from functools import partial
 from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
+from orthonav.files import require_file
 from orthonav.flight import FlightFolder, open_flight, read_truth
 from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.flightlog import is_flight_log, open_flight_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.photos import open_photos, photo_paths
 from orthonav.sources.recording import Recording, SourceView, fitted, with_options
-from orthonav.sources.ros import bag_suffix, open_ros
+from orthonav.sources.ros import open_ros
+from orthonav.sources.ros_files import METADATA, bag_suffix, storage_files
 from orthonav.sources.video import open_video
 
 _VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")
@@ -43,20 +45,10 @@ def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
 def source_kind(path: Path) -> str:
     """`flight`, `photos`, `video`, `ros` or `log`, by content. Raises `FlightError` for others."""
     if path.is_dir():
-        if (path / "flight.json").exists() or (path / "telemetry.csv").exists():
-            return "flight"
-        if (path / "metadata.yaml").exists():
-            return "ros"
-        if is_flight_log(path):
-            return "log"
-        if photo_paths(path):
-            return "photos"
-        raise FlightError(
-            "expected a flight folder (flight.json), photographs, a ROS 2 bag (metadata.yaml) or a "
-            f"flight log: {path}"
-        )
+        return _folder_kind(path)
     if path.stat().st_size == 0:
         raise FlightError(f"source is empty: {path}")
+    require_file(path, "source")
     if is_flight_log(path):
         return "log"
     if bag_suffix(path) is not None:
@@ -66,6 +58,23 @@ def source_kind(path: Path) -> str:
     raise FlightError(
         "expected a video (MP4, MOV, AVI, MKV, MPEG) or a ROS recording (.bag, .db3, .mcap); a "
         f"log of an autopilot belongs to --telemetry: {path}"
+    )
+
+
+def _folder_kind(path: Path) -> str:
+    if (path / "flight.json").exists() or (path / "telemetry.csv").exists():
+        return "flight"
+    if (path / METADATA).exists():
+        return "ros"
+    if is_flight_log(path):
+        return "log"
+    if storage_files(path):
+        return "ros"
+    if photo_paths(path):
+        return "photos"
+    raise FlightError(
+        "expected a flight folder (flight.json), photographs, a ROS 2 bag (.mcap, .db3) or a "
+        f"flight log: {path}"
     )
 
 
