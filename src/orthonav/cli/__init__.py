@@ -65,6 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+        logging.getLogger("PIL").setLevel(logging.WARNING)  # else every tag of every photograph
         # Where the home cannot be written it keeps its fonts elsewhere: nothing to be done.
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         _print_any_letter()

@@ -11,7 +11,13 @@ from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.flightlog import is_flight_log, open_flight_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.photos import open_photos, photo_paths
-from orthonav.sources.recording import Recording, SourceView, fitted, with_options
+from orthonav.sources.recording import (
+    Recording,
+    SourceView,
+    fitted,
+    time_warnings,
+    with_options,
+)
 from orthonav.sources.ros import open_ros
 from orthonav.sources.ros_files import METADATA, bag_suffix, storage_files
 from orthonav.sources.video import open_video
@@ -109,7 +115,7 @@ def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
         note=folder.note,
         expected=len(folder.views),
         stream=partial(_flight_views, folder, truth, options),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *time_warnings(view.telemetry.time_ns for view in folder.views)),
     )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, lfs_pointer
 from orthonav.flight import read_image
 from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
@@ -28,6 +28,7 @@ from orthonav.sources.recording import (
     jump_warnings,
     known_at,
     rounded,
+    time_warnings,
     warnings_of,
     with_mean_velocities,
     with_options,
@@ -84,6 +85,8 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
         warnings += doubts
         warnings += _height_warnings([one.photo for one in taken], options)
         warnings += jump_warnings([(one.time_ns, one.photo.latlon_deg) for one in taken])
+    warnings += _doubts(taken)
+    warnings += time_warnings(one.time_ns for one in taken)
     views = partial(_views, folder, taken, track, options)
     return Recording(
         kind="photos",
@@ -95,6 +98,18 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
         warnings=tuple(filter(None, [*warnings, note])),
         take_off_latlon_deg=None if track is None else track.take_off_latlon_deg,
     )
+
+
+def _doubts(taken: Sequence[_DatedPhoto]) -> list[str]:
+    """Warnings about values that cannot be used, with the number of photographs and an example."""
+    doubted = [one for one in taken if one.photo.doubts]
+    if not doubted:
+        return []
+    first = doubted[0]
+    return [
+        f"values of {len(doubted)} of {len(taken)} photographs cannot be used, such as "
+        f"{first.photo.doubts[0]}: {first.path.name}"
+    ]
 
 
 def _height_warnings(photos: Sequence[Photo], options: SourceOptions) -> list[str]:
@@ -115,13 +130,15 @@ def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], lis
     if not paths:
         raise FlightError(f"folder has no photographs ({', '.join(SUFFIXES)}): {folder}")
     found: list[tuple[Path, Photo]] = []
-    unread = []
+    unread: list[Path] = []
+    pointer = None
     for path in paths:
         try:
             found.append((path, read_photo(path)))
         except FlightError as error:
             log.info("%s", error)
             unread.append(path)
+            pointer = pointer or _pointer(path)
     found, odd = _of_one_size(found)
     timed = [one for one in found if one[1].time_ns is not None]
     untimed = [path for path, photo in found if photo.time_ns is None]
@@ -131,7 +148,7 @@ def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], lis
     warnings = [
         f"{len(bad)} of {len(paths)} photographs left out, {why}, the first: {bad[0].name}"
         for bad, why in (
-            (unread, "not readable"),
+            (unread, pointer or "not readable"),
             (odd, "of another size than most"),
             (untimed, "no time in EXIF"),
         )
@@ -150,6 +167,12 @@ def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], lis
         for path, photo in timed
     ]
     return sorted(taken, key=lambda one: (one.time_ns, one.path)), warnings
+
+
+def _pointer(path: Path) -> str | None:
+    """What to do about a file that is a pointer of Git LFS."""
+    with path.open("rb") as stream:
+        return lfs_pointer(stream.read(64))
 
 
 def _of_one_size(

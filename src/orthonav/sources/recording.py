@@ -1,6 +1,7 @@
 """A recorded flight that is read view by view."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from orthonav.geo.frames import distances_m
 from orthonav.records import Prior, Telemetry
 from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.track import RecordedTrack
+from orthonav.sources.track import RecordedTrack, measured
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
@@ -71,7 +72,11 @@ class Recording:
 def with_options(
     telemetry: Telemetry, truth_latlon_deg: tuple[float, float] | None, options: SourceOptions
 ) -> Telemetry:
-    """The telemetry with the prior and the level camera that the options ask for."""
+    """The telemetry with the prior and the level camera that the options ask for.
+
+    A height above ground of 0 was not measured.
+    """
+    telemetry = replace(telemetry, agl_m=measured(telemetry.agl_m))
     if options.prior_std_m is not None and truth_latlon_deg is not None:
         prior = Prior(*truth_latlon_deg, options.prior_std_m)
         telemetry = replace(telemetry, prior=prior)
@@ -144,6 +149,18 @@ def jump_warnings(
     return [
         f"recorded position jumps {len(jumps)} times, the first by {apart_m[first] / 1000:.1f} km "
         f"{seconds[: first + 1].sum():.1f} s after the beginning: check it before it is used"
+    ]
+
+
+def time_warnings(times_ns: Iterable[int]) -> list[str]:
+    """Warning about views that have the time of another one; empty without one."""
+    counted = Counter(times_ns)
+    equal = sum(count for count in counted.values() if count > 1)
+    if not equal:
+        return []
+    return [
+        f"{equal} of {counted.total()} views have the same time as another one: they are in the "
+        "order of their names, and a track, which needs the time of each view, is of little use"
     ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from orthonav.errors import FlightError
 from orthonav.sources.attitude import GIMBAL_TILT_STD_DEG, enu_from_gimbal_camera
-from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
+from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles, measured
 
 MAX_BYTES = 500_000_000
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
@@ -153,6 +153,7 @@ def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> S
     altitude = fields.get("abs_alt", fields.get("altitude", math.nan))
     if not (abs(lat) <= 90 and abs(lon) <= 360):
         lat = lon = math.nan
+    height, altitude = measured(height), measured(altitude)
     return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
 
 
