@@ -12,8 +12,10 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 
 from orthonav.cli.needs import require_extras
@@ -21,6 +23,9 @@ from orthonav.errors import OrthonavError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 """Last words of option names that are units."""
+
+_CLOCK_S = 0.01
+"""How far the times of files lag behind the clock."""
 
 COMMANDS = {
     "demo": "generate an area, build a map, simulate a flight, localize it and report",
@@ -57,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
+    options, started_s = argparse.Namespace(), time.time()
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
             return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
@@ -76,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OrthonavError as error:
         return _failed(_one_line(error), verbose)
     except KeyboardInterrupt:
-        return _failed("interrupted; nothing was written", False)
+        return _failed(f"interrupted; {_written(options, started_s)}", False)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -91,6 +97,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _failed("out of memory", verbose)
     return status or 0
+
+
+def _written(options: argparse.Namespace, since_s: float) -> str:
+    """Which of the paths among the options were written since a time; outputs appear when whole."""
+    paths = [value for value in vars(options).values() if isinstance(value, Path)]
+    paths += [Path(f"{path}.work") for path in paths]
+    paths += [Path(each.partition("=")[2]) for each in getattr(options, "export", [])]
+    new = [path for path in paths if path.exists() and path.stat().st_mtime > since_s - _CLOCK_S]
+    return f"written: {', '.join(map(str, new))}" if new else "nothing was written"
 
 
 def _print_any_letter() -> None:

@@ -57,6 +57,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="fixes.jsonl", help="file to write"
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.add_argument(
+        "--no-diagnosis",
+        dest="diagnosis",
+        action="store_false",
+        help="where few views are confident, do not try other headings and heights to find out why",
+    )
     _add_views(parser.add_argument_group("placing views"))
     _add_track(parser.add_argument_group("tracking"))
     _add_outputs(parser.add_argument_group("further outputs"))
