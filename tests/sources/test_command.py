@@ -202,7 +202,7 @@ BROKEN = {
     "nothing": (lambda folder: folder / "none", "does not exist"),
     "empty file": (lambda folder: written(folder / "a.mp4", b""), "source is empty"),
     "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "flight log:"),
-    "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected a video"),
+    "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected photographs"),
     "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
     "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
     "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "recording was cut short"),

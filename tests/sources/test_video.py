@@ -245,7 +245,7 @@ BROKEN = {
     "no frames": "cannot be opened|has no frame",
     "cut": r"cut short: \d+ of 30 frames",
     "empty": "source is empty",
-    "another kind": "expected a video",
+    "another kind": "expected photographs",
     "no blocks": "expected a PX4 log",
     "empty subtitles": "telemetry log is empty",
     "subtitles of a film": "neither position nor gimbal angles",

@@ -3,6 +3,7 @@
 import argparse
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,12 @@ from orthonav.cli.common import add_search, print_json, progress, search_plan
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
+from orthonav.cli.positions import (
+    check_destination,
+    positions_to_plain,
+    summary_stream,
+    write_positions,
+)
 from orthonav.cli.setups import Counts, SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
@@ -50,11 +57,16 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "flight",
         type=Path,
+        nargs="+",
         metavar="SOURCE",
         help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="fixes.jsonl", help="file to write"
+        "--out",
+        type=Path,
+        metavar="fixes.jsonl",
+        help="file to write; - writes to stdout; without it the positions of photographs named "
+        "one by one are printed",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.add_argument(
@@ -166,6 +178,7 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Localize and write one line per view."""
+    check_destination(options)
     if options.atlas:
         _on_atlas(options)
     else:
@@ -177,7 +190,6 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.fixes import write_results
     from orthonav.flight.mount import MountedFlight
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
@@ -230,7 +242,7 @@ def _on_map(options: argparse.Namespace) -> None:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
-        write_results(options.out, results)
+        write_positions(options, results)
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
@@ -267,7 +279,6 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.fixes import write_results
     from orthonav.onboard.run import localize_flight
 
     asked = [
@@ -306,7 +317,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    write_results(options.out, results)
+    write_positions(options, results)
     export_all(exports, results, None)
     _print_summary(options, results, accept)
 
@@ -327,7 +338,7 @@ def _print_summary(
     latencies = latencies[np.isfinite(latencies)]
     median_ms = float(np.median(latencies)) if latencies.size else None
     plain = {
-        "fixes": str(options.out),
+        "fixes": None if options.out is None else str(options.out),
         "views": counts.views,
         "n_confident": counts.confident,
         "n_low_confidence": counts.low,
@@ -339,18 +350,20 @@ def _print_summary(
         **changes_to_plain(options, changed),
     }
     if options.json:
-        print_json(plain)
+        print_json(plain | positions_to_plain(options, results))
         return
+    say = partial(print, file=summary_stream(options))
     least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
-    print(
+    say(
         f"{counts.views} views: {counts.confident} confident ({least}), {counts.low} of low "
         f"confidence, {counts.none} without a position; median {median_ms or 0:.1f} ms per view"
     )
     for line in advice:
-        print(f"! {line}")
+        say(f"! {line}")
     for each in options.export:
-        print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
+        say(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
-    print(f"written to {options.out}{guesses}")
+    if options.out is not None:
+        say(f"written to {options.out}{guesses}")
     for line in changes_text(options, changed):
-        print(line)
+        say(line)

@@ -61,6 +61,8 @@ class Photo:
     """Camera and lens."""
     software: str
     """Programs that wrote the file; of a camera its firmware."""
+    agl_m: float = math.nan
+    """Height above ground, where a table states it."""
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
 

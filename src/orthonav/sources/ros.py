@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
-from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
@@ -21,6 +20,7 @@ from orthonav.sources.recording import (
     SourceView,
     check_overlap,
     fitted,
+    given_camera,
     known_at,
     warnings_of,
     with_mean_velocities,
@@ -44,7 +44,9 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
     with opened(path) as (reader, doubts):
         topics = find_topics(reader, options.topics, path)
         size, first_ns, last_ns = _first_image(reader, topics, path)
-        camera = fitted(_camera(reader, topics, options, path), *size, str(path))
+        camera = given_camera(options, *size, str(path)) or fitted(
+            _camera(reader, topics, path), *size, str(path)
+        )
         if options.telemetry is not None:
             track = read_log(options.telemetry, options.mount_deg)
         else:
@@ -84,9 +86,7 @@ def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, in
     raise FlightError(f"no image of {topics.image.topic} can be read ({reason}): {path}")
 
 
-def _camera(reader: Any, topics: Topics, options: SourceOptions, path: Path) -> Camera:
-    if options.camera is not None:
-        return read_camera_file(options.camera)
+def _camera(reader: Any, topics: Topics, path: Path) -> Camera:
     info = topics.roles.get("camera_info")
     if info is None:
         raise CameraError(f"no camera_info for the images; give --camera FILE: {path}")

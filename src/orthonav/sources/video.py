@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
-from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.logs import log_kind, read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
-    fitted,
+    given_camera,
     known_at,
     warnings_of,
     with_mean_velocities,
@@ -47,9 +46,11 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if width < 1 or height < 1 or not capture.grab():
             raise FlightError(f"video has no frame: {path}")
-    if options.camera is None:
-        raise CameraError(f"the camera of a video is unknown; give --camera FILE: {path}")
-    camera = fitted(read_camera_file(options.camera), width, height, str(path))
+    camera = given_camera(options, width, height, str(path))
+    if camera is None:
+        raise CameraError(
+            f"the camera of a video is unknown; give --camera FILE or --fov-deg: {path}"
+        )
     last_ns = round((frames - 1) / fps * 1e9) if fps > 0 and frames > 0 else 0
     track, telemetry_path, warnings = _track(path, last_ns, options)
     return Recording(
