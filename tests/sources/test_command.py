@@ -281,6 +281,26 @@ def test_a_photograph_that_was_turned_in_an_editor_is_placed(run, tmp_path, came
     assert result.outcome.heading_deg == pytest.approx(200, abs=1)
 
 
+def test_one_photograph_is_placed_and_printed(run, tmp_path):
+    path = tmp_path / "photo.png"
+    Image.fromarray(seen(0)).save(path)
+    one = ("localize", MAP, path, "--agl-m", 160, "--fov-deg", 43.6)
+    code, out, err = run(*one, "--heading", "unknown")
+    assert code == 0 and "looks straight down is assumed" in err
+    lat, lon = map(float, re.search(r"position +([\d.]+), ([\d.]+) ", out).groups())
+    assert np.abs(np.subtract((lat, lon), PLACE) * [111e3, 76e3]).max() < 3
+    assert re.search(r"heading +(19|20)\.\d deg", out) and re.search(r"height +1[56]\d\.", out)
+    code, out, err = run(*one, "--heading", "unknown", "--out", "-")
+    (line,) = map(json.loads, out.splitlines())
+    assert code == 0 and line["frame"] == "photo.png" and "1 views: " in err
+    unknown = run(*one)
+    assert "none: not a number: yaw_deg (missing_telemetry); give --heading unknown" in unknown.out
+    plain = json.loads(run(*one, "--heading", "unknown", "--json").out)
+    assert plain["fixes"] is None and plain["positions"][0]["lat_deg"] == pytest.approx(lat)
+    refused = run("localize", MAP, tmp_path)
+    assert refused[0] == 1 and "give --out FILE, or --out - for stdout" in refused[2]
+
+
 def add_gps(path, gps):
     """Write GPS tags into a PNG, which keeps the rest."""
     with Image.open(path) as written:

@@ -19,6 +19,7 @@ from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
 from orthonav.cli.positions import (
+    STDOUT,
     check_destination,
     positions_to_plain,
     summary_stream,
@@ -363,7 +364,7 @@ def _print_summary(
     for each in options.export:
         say(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
-    if options.out is not None:
+    if options.out not in (None, STDOUT):
         say(f"written to {options.out}{guesses}")
     for line in changes_text(options, changed):
         say(line)

@@ -12,6 +12,12 @@ if TYPE_CHECKING:
     from orthonav.records import Fix, ViewResult
 
 STDOUT = Path("-")
+_HINTS = (
+    ("yaw_deg", "give --heading unknown"),
+    ("agl_m", "give --agl-m"),
+    ("pitch_deg", "give --looks-down"),
+)
+"""What to do about a value that is missing."""
 
 
 def check_destination(options: argparse.Namespace) -> None:
@@ -65,7 +71,8 @@ def position_text(result: "ViewResult") -> str:
     if isinstance(outcome, Fix):
         lines = _lines(outcome, result.is_confident)
     else:
-        lines = [("position", f"none: {outcome.detail} ({outcome.reason})")]
+        hints = [f"; {hint}" for name, hint in _HINTS if name in outcome.detail]
+        lines = [("position", f"none: {outcome.detail} ({outcome.reason}){''.join(hints)}")]
     return "\n".join([result.frame, *(f"  {name:<11}{text}" for name, text in lines)])
 
 

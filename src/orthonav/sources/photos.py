@@ -100,7 +100,7 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
         note="; ".join(filter(None, [f"photographs of {folder.name}", *_table_note(chosen), note])),
         expected=len(taken),
         stream=views if track is None else lambda: with_mean_velocities(views(), track),
-        warnings=tuple(filter(None, [*warnings, note])),
+        warnings=tuple(filter(None, [*warnings, "" if options.fov_deg else note])),
         take_off_latlon_deg=None if track is None else track.take_off_latlon_deg,
     )
 
