@@ -7,7 +7,7 @@ import pytest
 from recorders import camera_file, dji_subtitle, picture, subtitles, video
 
 from orthonav.errors import CameraError, FlightError
-from orthonav.flight import open_flight, read_image
+from orthonav.flight import open_flight, read_image, read_truth
 from orthonav.sources import SourceOptions, import_flight, open_source
 from orthonav.sources.attitude import (
     ASSUMED_TILT_STD_DEG,
@@ -265,11 +265,13 @@ def test_damaged_video_is_one_error_and_nothing_written(recorded, tmp_path, name
 
 def test_views_after_the_end_of_the_subtitles_have_no_telemetry(recorded, tmp_path):
     texts = [dji_subtitle(n) for n in range(12)]
-    subtitles(recorded.with_suffix(".SRT"), texts)
+    srt = subtitles(recorded.with_suffix(".SRT"), [*texts, "[latitude: 46.5] [longitude: 2.51234]"])
+    srt.write_text(srt.read_text()[:-6])  # a number is cut
     recording = open_source(recorded, options(recorded, rate_hz=2.0))
     assert "telemetry ends 1.7 s before the video of 2.9 s" in recording.warnings[0]
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.complete, done.with_truth) == (6, 3, 3)
+    assert {lon for _, lon in read_truth(tmp_path / "flight/truth.csv").values()} == {2.5}
 
 
 def test_a_video_needs_a_camera(recorded, tmp_path):

@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _written(options: argparse.Namespace, since_s: float) -> str:
     """Which of the paths among the options were written since a time; outputs appear when whole."""
     paths = [value for value in vars(options).values() if isinstance(value, Path)]
-    paths += [Path(f"{path}.work") for path in paths]
+    paths += [Path(f"{path}{kept}") for path in paths for kept in (".work", ".tiles")]
     paths += [Path(each.partition("=")[2]) for each in getattr(options, "export", [])]
     new = [path for path in paths if path.exists() and path.stat().st_mtime > since_s - _CLOCK_S]
     return f"written: {', '.join(map(str, new))}" if new else "nothing was written"

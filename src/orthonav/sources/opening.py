@@ -7,7 +7,6 @@ from pathlib import Path
 from orthonav.errors import FlightError, MissingFileError
 from orthonav.files import require_file
 from orthonav.flight import FlightFolder, open_flight, read_truth
-from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.flightlog import is_flight_log, open_flight_log
 from orthonav.sources.image_table import is_image_table
 from orthonav.sources.options import SourceOptions
@@ -16,7 +15,7 @@ from orthonav.sources.photos import open_photos
 from orthonav.sources.recording import (
     Recording,
     SourceView,
-    fitted,
+    given_camera,
     time_warnings,
     with_options,
 )
@@ -110,10 +109,8 @@ def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
     """A flight folder as a recording; truth may become the prior, the camera may be replaced."""
     if options.telemetry is not None:
         raise FlightError(f"a flight folder has its own telemetry; omit --telemetry: {folder.path}")
-    camera = folder.camera
-    if options.camera is not None:
-        given = read_camera_file(options.camera)
-        camera = fitted(given, camera.width_px, camera.height_px, str(folder.path))
+    own = folder.camera
+    camera = given_camera(options, own.width_px, own.height_px, str(folder.path)) or own
     path, truth, warnings = folder.path / "truth.csv", {}, []
     try:
         truth = read_truth(path) if path.exists() else {}

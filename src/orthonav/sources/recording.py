@@ -165,7 +165,8 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
         return []
     return [
         f"{equal} of {counted.total()} views have the same time as another one: they are in the "
-        "order of their names, and a track, which needs the time of each view, is of little use"
+        "order of their names, and a track over them is of little use, because it needs the time "
+        "of each"
     ]
 
 

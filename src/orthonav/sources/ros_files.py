@@ -143,6 +143,12 @@ def _is_cut(path: Path) -> bool:
 
 def _whole(named: Path, path: Path, warnings: list[str]) -> "Path | _CutMcap":
     """The file, with an end where it has none."""
+    journal = named.with_name(f"{named.name}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        warnings.append(
+            f"bag was not closed, and what is only in {journal.name} is not read; write it into "
+            f"the bag first: sqlite3 {named.name} 'pragma wal_checkpoint(truncate)': {path}"
+        )
     if not _is_cut(named):
         return named
     complete = complete_bytes(named)

@@ -45,7 +45,8 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
         shift_us = _utc_shift_us(gps)
         attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
         if attitude is None:
-            raise FlightError(f"PX4 log has no attitude (vehicle_attitude): {path}")
+            damaged = "" if log.damaged_us is None else ", and is damaged"
+            raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")
         position = _position(gps, topics, shift_us)
         return RecordedTrack(
             attitude=attitude,

@@ -29,7 +29,7 @@ def left_out_text(left_out: Sequence[str]) -> str:
     """A sentence that names what a route leaves out."""
     more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
     return (
-        f"{len(left_out)} positions are not part of the route, so the map may not cover them: "
+        "positions that are not part of the route, so the map may not cover them: "
         f"{', '.join(left_out[:MAX_NAMED])}{more}"
     )
 
