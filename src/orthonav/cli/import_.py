@@ -18,6 +18,7 @@ EVERYDAY = (
     "--time-offset-s",
     "--mount-deg",
     "--rate-hz",
+    "--agl-m",
     "--dem",
     "--json",
 )

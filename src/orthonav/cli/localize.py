@@ -45,6 +45,8 @@ EVERYDAY = (
     "--mount",
     "--atlas",
     "--camera",
+    "--fov-deg",
+    "--agl-m",
     "--dem",
     "--json",
 )
