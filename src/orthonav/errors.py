@@ -87,6 +87,19 @@ class StorageError(OrthonavError, OSError):
     """The place where an atlas lies cannot be reached, read or written: address, credentials."""
 
 
+_LFS_STARTS = (
+    b"version https://git-lfs.github.com/spec/",
+    b"version https://hawser.github.com/spec/",
+)
+
+
+def lfs_pointer(head: bytes) -> str | None:
+    """What is wrong with a file that begins like this, if it is a pointer of Git LFS."""
+    if not head.startswith(_LFS_STARTS):
+        return None
+    return "is a Git LFS pointer, not the file itself; run `git lfs pull` in its repository"
+
+
 def described(error: BaseException) -> str:
     """What went wrong, in words for a message, at most 120 characters.
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from orthonav.errors import MissingFileError, OutputError
+from orthonav.errors import MissingFileError, OutputError, lfs_pointer
 
 Progress = Callable[[str, float], None]
 """Receives the stage of a long task and the share of it that is done, 0 to 1."""
@@ -167,11 +167,21 @@ def with_paths(record: object, *names: str) -> None:
 
 
 def require_file(path: Path, what: str) -> Path:
-    """Return `path` if it is an existing file, else raise `MissingFileError` naming `what`."""
+    """Return `path` if it is an existing file, else raise `MissingFileError` naming `what`.
+
+    A pointer of Git LFS is not the file.
+    """
     path = Path(path)
     if not path.is_file():
         kind = "is a folder, not a file" if path.is_dir() else "does not exist"
         raise MissingFileError(f"{what} {kind}: {path}")
+    try:
+        with path.open("rb") as stream:
+            pointer = lfs_pointer(stream.read(64))
+    except OSError:
+        return path  # the reader says why
+    if pointer:
+        raise MissingFileError(f"{what} {pointer}: {path}")
     return path
 
 

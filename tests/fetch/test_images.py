@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from orthonav.fetch.client import BadReplyError, HttpReply
+from orthonav.fetch.client import BadReplyError, HttpReply, bad_status
 from orthonav.fetch.images import decode, image_or_absent
 
 RNG = np.random.default_rng(0)
@@ -140,3 +140,9 @@ def test_damaged_bytes_raise_nothing_else(noise, cut, whole):
         except BadReplyError:
             continue
         assert found in (None, body)
+
+
+def test_an_error_never_holds_the_bytes_of_a_picture():
+    text = str(bad_status(reply(JPEG, status=500, kind="image/jpeg")))
+    assert text == f"HTTP 500 ({len(JPEG)} bytes that are not text)"
+    assert "Dienst gestört" in str(bad_status(reply("Dienst gestört".encode(), status=500)))

@@ -252,6 +252,20 @@ def test_archives_of_many_members_or_with_a_password_are_refused(read):
         read(bytes(locked), "a.kmz")
 
 
+def test_positions_beside_lines_are_named(read, caplog):
+    point = "<Point><coordinates>2.5,46.5</coordinates></Point>"
+    assert read(kml_of(("Way", line()), ("Farm", point)), "a.kml").left_out == ("point Farm",)
+    beside = wpml_of(wayline()).replace("<Document>", f"<Document><Placemark>{point}</Placemark>")
+    assert read(beside, "a.wpml").left_out == ("placemark (no index)",)
+    gpx = (
+        '<gpx><wpt lat="1" lon="2"><name>Farm</name></wpt><rte><rtept lat="1" lon="2"/></rte>'
+        '<trk><trkseg><trkpt lat="1" lon="2"/></trkseg></trk></gpx>'
+    )
+    assert read(gpx, "a.gpx").left_out == ("waypoint Farm", "track (no name)")
+    assert "waypoint Farm, track (no name)" in caplog.text
+    assert read(kml_of(("Way", line())), "b.kml").left_out == ()
+
+
 def test_spaces_in_coordinates_take_linear_time(tmp_path):
     """The time of a search for spaces around commas would grow with the square of their number."""
     path = tmp_path / "a.kml"

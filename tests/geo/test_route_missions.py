@@ -216,10 +216,42 @@ def test_older_waypoint_files_have_no_home(read):
         (WPL.replace("47.40", "north"), "line 5, column 9 must be a number"),
         (WPL.replace("47.40", "nan"), "line 5, column 9 must be a number"),
         (WPL.replace("47.40", "470"), "a latitude within 90"),
-        (WPL.replace("\t82\t", "\t82.5\t"), "line 7: frame and command must be whole"),
+        (WPL.replace("\t82\t", "\t82.5\t"), "line 7: number, frame and command must be whole"),
         (WPL.replace("4\t0\t10", "4\t0\t1"), "MAV_FRAME 1"),
     ],
 )
 def test_invalid_waypoint_files_are_refused(read, text, message):
     with pytest.raises(RouteError, match=message):
         read(text, "a.waypoints")
+
+
+LOST = """QGC WPL 110
+0\t1\t0\t16\t0\t0\t0\t0\t47.39\t8.54\t488\t1
+1\t0\t3\t0\t0\t0\t0\t0\t47.40\t8.55\t60\t1
+2\t0\t3\t16\t0\t0\t0\t0\t47.40\t8.55\t60\t1
+3\t0\t3\t34\t30\t0\t0\t0\t47.41\t8.56\t60\t1
+4\t0\t3\t201\t0\t0\t0\t0\t47.6\t8.6\t0\t1
+5\t0\t3\t203\t0\t0\t0\t0\t1\t0\t0\t1
+6\t0\t3\t30001\t0\t0\t0\t0\t47.42\t8.57\t60\t1
+7\t0\t0\t20\t0\t0\t0\t0\t0\t0\t0\t1
+8\t0\t3\t16\t0\t0\t0\t0\t47.5\t8.5\t60\t1
+"""
+
+
+def test_positions_that_are_left_out_of_a_mission_are_named(read, caplog):
+    route = read(LOST, "a.waypoints")
+    assert route.waypoints == (A, B, (47.39, 8.54)), "an orbit is flown, a camera's target is not"
+    assert route.left_out == (
+        "item 1 (command 0)",
+        "item 6 (command 30001)",
+        "item 8 (command 16) after the return",
+    )
+    assert "positions that are not part of the route" in caplog.text
+    assert "item 1 (command 0), item 6" in caplog.text
+    assert read(plan(simple(16, A, 50), simple(0, B, 50))).left_out == ("item 2 (command 0)",)
+    with pytest.raises(RouteError, match=r"left out are item 1 \(command 0\)"):
+        read(plan(simple(0, B, 50)))
+
+
+def test_the_first_item_of_a_waypoint_file_is_home_only_where_it_is_number_0(read):
+    assert read(LOST.replace("\n0\t1", "\n1\t1"), "a.txt").waypoints == ((47.39, 8.54), A, B)

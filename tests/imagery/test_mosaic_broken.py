@@ -6,8 +6,10 @@ import textwrap
 
 import numpy as np
 import pytest
+import rasterio
 import rasterio.shutil
-from geotiffs import SIZE, read, sheet_of, smooth_scene, write
+from geotiffs import LAMBERT, SIZE, read, sheet_of, smooth_scene, write
+from rasterio.control import GroundControlPoint
 from rasterio.drivers import raster_driver_extensions
 from rasterio.transform import Affine
 
@@ -24,8 +26,8 @@ def ortho(tmp_path):
     return tmp_path / "ortho.tif"
 
 
-def refused(path, message):
-    with pytest.raises(ImageryError, match=message) as caught:
+def refused(path, message, error=ImageryError):
+    with pytest.raises(error, match=message) as caught:
         Mosaic.open([path])
     assert str(caught.value).endswith(str(path))
 
@@ -48,6 +50,22 @@ def test_a_file_that_is_no_image(ortho, content):
 
 def test_no_coordinate_reference_system(ortho):
     refused(write(ortho, SCENE, crs=None), "no coordinate reference system.*gdal_edit.py")
+
+
+@pytest.mark.parametrize("assigned", [False, True])
+def test_ground_control_points_only(ortho, assigned):
+    corners = [(0, 0), (0, SIZE), (SIZE, 0), (SIZE, SIZE)]
+    points = [GroundControlPoint(row, col, 7e5 + col, 66e5 - row) for row, col in corners]
+    write(ortho, SCENE, transform=Affine.identity(), gcps=points)
+    if assigned:
+        with rasterio.open(ortho, "r+") as data:
+            data.crs = LAMBERT
+    refused(ortho, "4 ground control points only.*gdalwarp -tps")
+
+
+def test_a_pointer_of_git_lfs(ortho):
+    ortho.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    refused(ortho, "Git LFS pointer.*git lfs pull", MissingFileError)
 
 
 def test_no_geotransform(ortho):

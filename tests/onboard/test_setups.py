@@ -140,3 +140,11 @@ def test_a_constant_and_a_varying_heading_read_differently():
     assert "from view to view; check the heading column" in setup_text([found], on_map=True)[0]
     alone = replace(found, setup=Setup("as reported"))
     assert "the set-up is right" in setup_text([alone], on_map=True)[0]
+
+
+def test_the_search_ends_when_it_is_told_to(registering, views):
+    turned = [reported(view, yaw_deg=(view.telemetry.yaw_deg + 180) % 360) for view in views]
+    assert tried(registering, turned, stop=lambda: True) == []
+    asked = iter([False, True, True, True])
+    (found,) = tried(registering, turned, stop=lambda: next(asked))
+    assert (found.setup.name, found.views) == ("any heading", 1)

@@ -10,7 +10,7 @@ import pytest
 from bags import Messages, record
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from recorders import START_S, camera_file, dji, packet, photo, place, subtitles, tlog, video
+from recorders import START_S, camera_file, dji, packet, photo, place, tlog, video
 
 from orthonav.flight import FlightWriter, open_flight, read_image
 from orthonav.flight.fixes import read_results
@@ -182,6 +182,12 @@ def test_doubtful_input_causes_a_warning(run, tmp_path):
     assert reasons == ["missing_telemetry", "bad_image", "missing_telemetry"]
 
 
+def test_verbose_says_nothing_of_every_tag(run, tmp_path):
+    photographs(tmp_path / "photos")
+    code, _, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight", "-v")
+    assert code == 0 and "tag:" not in err and len(err.splitlines()) < 20
+
+
 def truncated(path):
     path.write_bytes(path.read_bytes()[:700])
     return path
@@ -192,22 +198,15 @@ def written(path, data):
     return path
 
 
-def short_film(folder):
-    path = video(folder / "a.mkv")
-    subtitles(folder / "a.srt", ["[latitude: 46.5] [longitude: 2.5]"] * 9)
-    return path
-
-
 BROKEN = {
     "nothing": (lambda folder: folder / "none", "does not exist"),
     "empty file": (lambda folder: written(folder / "a.mp4", b""), "source is empty"),
     "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "flight log:"),
-    "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected a video"),
+    "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected photographs"),
     "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
     "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
-    "short subtitles": (short_film, "telemetry ends"),
-    "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "ROS recording cannot be"),
-    "bag cut": (lambda folder: truncated(bag(folder / "b", "bag")), "ROS recording cannot be"),
+    "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "recording was cut short"),
+    "bag cut": (lambda folder: truncated(bag(folder / "b", "bag")), "rosbag reindex"),
     "no flight": (lambda folder: folder_of(folder / "f") / "frames", "no time in EXIF"),
 }
 
@@ -280,6 +279,26 @@ def test_a_photograph_that_was_turned_in_an_editor_is_placed(run, tmp_path, came
     off = np.subtract((result.outcome.lat_deg, result.outcome.lon_deg), PLACE)
     assert np.abs(off * [111e3, 76e3]).max() < 2
     assert result.outcome.heading_deg == pytest.approx(200, abs=1)
+
+
+def test_one_photograph_is_placed_and_printed(run, tmp_path):
+    path = tmp_path / "photo.png"
+    Image.fromarray(seen(0)).save(path)
+    one = ("localize", MAP, path, "--agl-m", 160, "--fov-deg", 43.6)
+    code, out, err = run(*one, "--heading", "unknown")
+    assert code == 0 and "looks straight down is assumed" in err
+    lat, lon = map(float, re.search(r"position +([\d.]+), ([\d.]+) ", out).groups())
+    assert np.abs(np.subtract((lat, lon), PLACE) * [111e3, 76e3]).max() < 3
+    assert re.search(r"heading +(19|20)\.\d deg", out) and re.search(r"height +1[56]\d\.", out)
+    code, out, err = run(*one, "--heading", "unknown", "--out", "-")
+    (line,) = map(json.loads, out.splitlines())
+    assert code == 0 and line["frame"] == "photo.png" and "1 views: " in err
+    unknown = run(*one)
+    assert "none: not a number: yaw_deg (missing_telemetry); give --heading unknown" in unknown.out
+    plain = json.loads(run(*one, "--heading", "unknown", "--json").out)
+    assert plain["fixes"] is None and plain["positions"][0]["lat_deg"] == pytest.approx(lat)
+    refused = run("localize", MAP, tmp_path)
+    assert refused[0] == 1 and "give --out FILE, or --out - for stdout" in refused[2]
 
 
 def add_gps(path, gps):

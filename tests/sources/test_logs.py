@@ -161,6 +161,17 @@ def test_damage_between_messages_costs_only_those(kind, log):
     assert track.span_ns()[0] == pytest.approx(START_S * 10**9, abs=10**7)
 
 
+def test_the_time_from_which_a_log_of_px4_is_damaged_is_named(tmp_path):
+    log = ulog(tmp_path / "a.ulg", px4_topics())
+    assert read_log(log, DOWN).warnings == ()
+    data = log.read_bytes()
+    log.write_bytes(data[: int(len(data) * 0.5)] + bytes(int(len(data) * 0.5)))
+    track = read_log(log, DOWN)
+    last_s = (track.span_ns()[1] - track.span_ns()[0]) / 1e9
+    (warning,) = track.warnings
+    assert f"damaged from {last_s:.1f} s" in warning and 1 < last_s < 9
+
+
 def test_a_log_that_was_cut_tells_what_came_before(kind, log):
     data = log.read_bytes()
     log.write_bytes(data[: len(data) // 2])

@@ -234,12 +234,21 @@ def test_impossible_exif_is_missing(tmp_path, more):
 
 @pytest.mark.parametrize(
     "text, value",
-    [("+45.50", 45.5), ("1.2e-05", 1.2e-5), ("123/100", None), ("1,5", None), ("n/a", None)],
+    [
+        ("+45.50", 45.5),
+        ("1.2e-05", 1.2e-5),
+        ("-9000/100", -90.0),
+        (" 1,5 ", 1.5),
+        ("1/0", None),
+        ("1.2.3", None),
+        ("n/a", None),
+    ],
 )
-def test_only_whole_values_of_xmp_are_read(text, value):
+def test_whole_values_of_xmp_are_read_and_others_named(text, value):
     expected = {} if value is None else {"Camera:Yaw": value}
-    assert Xmp.of(f'<a Camera:Yaw="{text}"/>').values == expected
-    assert Xmp.of(f"<Camera:Yaw>{text}</Camera:Yaw>").values == expected
+    unread = (f"Camera:Yaw='{text}'",) if value is None else ()
+    for packet_of in (f'<a Camera:Yaw="{text}"/>', f"<Camera:Yaw>{text}</Camera:Yaw>"):
+        assert Xmp.of(packet_of).values == expected and Xmp.of(packet_of).unread == unread
 
 
 # Photographs that an editor has written.

@@ -19,7 +19,7 @@ from recorders import (
     place,
 )
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.flight import open_flight, read_image, read_truth
 from orthonav.records import Prior
 from orthonav.sources import SourceOptions, import_flight, open_source
@@ -211,6 +211,64 @@ def test_missing_metadata_stays_missing(tmp_path):
     options = SourceOptions(ground_alt_m=290.0, looks_down=True)
     telemetry = next(open_source(tmp_path / "q", options).views).telemetry
     assert telemetry.missing() == ["yaw_deg"] and telemetry.agl_m == 110.0
+
+
+def test_angles_as_fractions_or_with_a_comma(tmp_path):
+    for number, (yaw, pitch) in enumerate([("-9000/100", "-85/1"), ("-90,00", "-85,0")]):
+        xmp = packet(GimbalYawDegree=yaw, GimbalPitchDegree=pitch, GimbalRollDegree="0/1")
+        read = read_photo(photo(tmp_path / f"{number}.jpg", xmp=xmp))
+        assert attitude(read) == pytest.approx((270, 5, 0), abs=1e-6)
+
+
+def test_values_that_cannot_be_used_are_counted_with_an_example(tmp_path):
+    """The heading of the aircraft does not stand in for one of the gimbal that cannot be read."""
+    xmp = dji().replace('GimbalYawDegree="+30.00"', 'GimbalYawDegree="30 deg"')
+    photo(tmp_path / "p/a.jpg", xmp=xmp)
+    photo(tmp_path / "p/b.jpg", "2023:11:14 22:13:21", xmp=dji())
+    recording = open_source(tmp_path / "p")
+    assert (
+        "values of 1 of 2 photographs cannot be used, such as unreadable value "
+        "drone-dji:GimbalYawDegree='30 deg': a.jpg" in recording.warnings
+    )
+    first, second = (view.telemetry.yaw_deg for view in recording.views)
+    assert math.isnan(first) and second == pytest.approx(30)
+
+
+@pytest.mark.parametrize("more", [{1: None}, {3: None}, {1: "\0"}, {1: None, 3: None}])
+def test_a_position_without_a_hemisphere_is_not_guessed(tmp_path, more):
+    gps = {tag: value for tag, value in (place(46.5, 2.5) | more).items() if value is not None}
+    photo(tmp_path / "p/a.jpg", gps=gps)
+    recording = open_source(tmp_path / "p")
+    assert next(recording.views).truth_latlon_deg is None
+    assert any("GPS position without N or S, or without E" in each for each in recording.warnings)
+
+
+def test_a_height_of_0_was_not_measured(tmp_path):
+    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5), xmp=dji(height=0.0))
+    recording = open_source(tmp_path / "p")
+    assert next(recording.views).telemetry.missing() == ["agl_m"]
+    assert recording.warnings[0].startswith("no height above ground was recorded")
+
+
+def test_equal_times_are_named_at_import_and_afterwards(tmp_path):
+    for name in "abc":
+        photo(tmp_path / f"p/{name}.jpg", xmp=dji())
+    recording = open_source(tmp_path / "p")
+    import_flight(recording, tmp_path / "flight")
+    for each in (recording, open_source(tmp_path / "flight")):
+        assert sum("3 of 3 views have the same time" in text for text in each.warnings) == 1
+
+
+def test_pointers_of_git_lfs_are_named(tmp_path):
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p/a.jpg").write_text(pointer)
+    with pytest.raises(FlightError, match="Git LFS pointer"):
+        open_source(tmp_path / "p")
+    for name in ("a.mp4", "a.bag", "a.mcap"):
+        (tmp_path / name).write_text(pointer)
+        with pytest.raises(MissingFileError, match="git lfs pull"):
+            open_source(tmp_path / name)
 
 
 def test_damaged_photographs_are_left_out_with_a_warning(folder, tmp_path):

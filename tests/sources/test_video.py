@@ -7,7 +7,7 @@ import pytest
 from recorders import camera_file, dji_subtitle, picture, subtitles, video
 
 from orthonav.errors import CameraError, FlightError
-from orthonav.flight import open_flight, read_image
+from orthonav.flight import open_flight, read_image, read_truth
 from orthonav.sources import SourceOptions, import_flight, open_source
 from orthonav.sources.attitude import (
     ASSUMED_TILT_STD_DEG,
@@ -232,7 +232,6 @@ def broken(recorded, how):
         "cut": lambda: recorded.write_bytes(data[: len(data) * 2 // 3]),
         "empty": lambda: recorded.write_bytes(b""),
         "another kind": lambda: recorded.write_bytes(b"plain words, and no video\n" * 99),
-        "fewer blocks": lambda: subtitles(srt, [dji_subtitle(n) for n in range(12)]),
         "no blocks": lambda: srt.write_text("words\n\nand words\n"),
         "empty subtitles": lambda: srt.write_bytes(b""),
         "subtitles of a film": lambda: subtitles(srt, ["- Who goes there?", "- A friend."] * 15),
@@ -246,8 +245,7 @@ BROKEN = {
     "no frames": "cannot be opened|has no frame",
     "cut": r"cut short: \d+ of 30 frames",
     "empty": "source is empty",
-    "another kind": "expected a video",
-    "fewer blocks": "telemetry ends 1.7 s before the video",
+    "another kind": "expected photographs",
     "no blocks": "expected a PX4 log",
     "empty subtitles": "telemetry log is empty",
     "subtitles of a film": "neither position nor gimbal angles",
@@ -263,6 +261,17 @@ def test_damaged_video_is_one_error_and_nothing_written(recorded, tmp_path, name
     with pytest.raises(FlightError, match=BROKEN[how]) as caught:
         import_flight(open_source(recorded, options(recorded, **more)), tmp_path / "flight")
     assert "\n" not in str(caught.value) and names_in(tmp_path) == before
+
+
+def test_views_after_the_end_of_the_subtitles_have_no_telemetry(recorded, tmp_path):
+    texts = [dji_subtitle(n) for n in range(12)]
+    srt = subtitles(recorded.with_suffix(".SRT"), [*texts, "[latitude: 46.5] [longitude: 2.51234]"])
+    srt.write_text(srt.read_text()[:-6])  # a number is cut
+    recording = open_source(recorded, options(recorded, rate_hz=2.0))
+    assert "telemetry ends 1.7 s before the video of 2.9 s" in recording.warnings[0]
+    done = import_flight(recording, tmp_path / "flight")
+    assert (done.views, done.complete, done.with_truth) == (6, 3, 3)
+    assert {lon for _, lon in read_truth(tmp_path / "flight/truth.csv").values()} == {2.5}
 
 
 def test_a_video_needs_a_camera(recorded, tmp_path):

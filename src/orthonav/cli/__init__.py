@@ -12,8 +12,10 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 
 from orthonav.cli.needs import require_extras
@@ -21,6 +23,9 @@ from orthonav.errors import OrthonavError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 """Last words of option names that are units."""
+
+_CLOCK_S = 0.01
+"""How far the times of files lag behind the clock."""
 
 GROUPS = {
     "prepare a map": {
@@ -108,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Read once, when OpenCV is loaded: a few bytes must not become a picture of gigabytes.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
     arguments = list(sys.argv[1:] if argv is None else argv)
-    verbose, options = False, argparse.Namespace()
+    verbose, options, started_s = False, argparse.Namespace(), time.time()
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
             return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
@@ -117,6 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+        logging.getLogger("PIL").setLevel(logging.WARNING)  # else every tag of every photograph
         # Where the home cannot be written it keeps its fonts elsewhere: nothing to be done.
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         _print_any_letter()
@@ -128,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _failed(_with_options(_one_line(error), options), verbose)
         return error.exit_code
     except KeyboardInterrupt:
-        return _failed("interrupted; nothing was written", False)
+        return _failed(f"interrupted; {_written(options, started_s)}", False)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -143,6 +149,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _failed("out of memory", verbose)
     return status or 0
+
+
+def _written(options: argparse.Namespace, since_s: float) -> str:
+    """Which of the paths among the options were written since a time; outputs appear when whole."""
+    paths = [value for value in vars(options).values() if isinstance(value, Path)]
+    paths += [Path(f"{path}{kept}") for path in paths for kept in (".work", ".tiles")]
+    paths += [Path(each.partition("=")[2]) for each in getattr(options, "export", [])]
+    new = [path for path in paths if path.exists() and path.stat().st_mtime > since_s - _CLOCK_S]
+    return f"written: {', '.join(map(str, new))}" if new else "nothing was written"
 
 
 def _print_any_letter() -> None:

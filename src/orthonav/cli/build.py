@@ -6,10 +6,15 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
+if TYPE_CHECKING:
+    from orthonav.mapfile import Manifest
+
+LEAST_SHIFT_M = 0.3
+"""Drift of a plate that is named: a pixel of the finest orthophotos of countries."""
 log = logging.getLogger(__name__)
 
 EVERYDAY = (
@@ -46,6 +51,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="TIF",
         help="orthophoto of the same area at another date, from which confidence and covariance "
         "are calibrated; it does not become part of the map; may be repeated",
+    )
+    imagery.add_argument(
+        "--epoch",
+        type=float,
+        metavar="YEAR",
+        help="decimal year of the flights, such as 2026.5, to which orthophotos in NAD83, ETRS89 "
+        "or GDA94 are moved with their tectonic plate (default: they are taken as WGS 84)",
     )
     add_dem(imagery, "which gives the map a terrain layer")
     area = parser.add_argument_group("area (default: all imagery)")
@@ -149,14 +161,37 @@ def run(options: argparse.Namespace) -> int:
         dem=options.dem,
         dem_datum=options.dem_datum,
         device=options.device,
+        epoch=options.epoch,
         **recipe_of(options),
     )
     with progress(options) as shown:
         result = build_map(request, shown, reporter(options))
+    plates = _plates(result.manifest) if options.epoch is None else []
     plain = summary(result.manifest, result.size_bytes, options.out)
     plain["build_s"] = round(time.perf_counter() - start, 3)
     if options.json:
-        print_json(plain)
-    else:
-        print(summary_text(plain))
+        print_json(plain | {"plates": plates})
+        return 0
+    print(summary_text(plain))
+    for each in plates:
+        print(
+            f"{each['crs']:.60} is taken as WGS 84, from which its tectonic plate has moved it by "
+            f"{each['shift_m']:.1f} m; --epoch {each['epoch']:.1f} corrects this"
+        )
     return 0
+
+
+def _plates(manifest: "Manifest") -> list[dict[str, Any]]:
+    """Systems of the orthophotos that their tectonic plate has moved away from WGS 84 by now."""
+    from orthonav.imagery.plates import plate_shift_m
+
+    now = time.gmtime()
+    year = round(now.tm_year + now.tm_yday / 366, 1)
+    sheet = manifest.sheets[0].frame
+    systems = {str(each["crs"]) for each in manifest.imagery}
+    shifts = {crs: plate_shift_m(crs, sheet.lat_deg, sheet.lon_deg, year) for crs in systems}
+    return [
+        {"crs": crs, "shift_m": round(shift_m, 2), "epoch": year}
+        for crs, shift_m in sorted(shifts.items())
+        if shift_m >= LEAST_SHIFT_M
+    ]

@@ -18,6 +18,7 @@ EVERYDAY = (
     "--time-offset-s",
     "--mount-deg",
     "--rate-hz",
+    "--agl-m",
     "--dem",
     "--json",
 )
@@ -28,8 +29,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         type=Path,
+        nargs="+",
         metavar="SOURCE",
-        help="folder of photographs, video, ROS 1 or 2 bag, MCAP file, or flight folder",
+        help="photographs (a folder, files, or a CSV of images by file name), video, ROS 1 or 2 "
+        "bag, MCAP file, or flight folder",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="folder to write"

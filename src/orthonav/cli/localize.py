@@ -17,9 +17,15 @@ from orthonav.cli.common import add_search, beside, print_json, progress, search
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
+from orthonav.cli.positions import (
+    check_destination,
+    positions_to_plain,
+    write_positions,
+)
 from orthonav.cli.setups import Counts, SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
+from orthonav.files import is_stdout
 
 if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
@@ -37,6 +43,8 @@ EVERYDAY = (
     "--mount",
     "--atlas",
     "--camera",
+    "--fov-deg",
+    "--agl-m",
     "--dem",
     "--json",
 )
@@ -50,17 +58,24 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "flight",
         type=Path,
+        nargs="+",
         metavar="SOURCE",
         help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
     )
     parser.add_argument(
         "--out",
         type=Path,
-        required=True,
         metavar="fixes.jsonl",
-        help="file to write; -: stdout, and the summary on stderr",
+        help="file to write; -: stdout, and the summary on stderr; without it the positions of "
+        "photographs named one by one are printed",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.add_argument(
+        "--no-diagnosis",
+        dest="diagnosis",
+        action="store_false",
+        help="where few views are confident, do not try other headings and heights to find out why",
+    )
     _add_views(parser.add_argument_group("placing views"))
     _add_track(parser.add_argument_group("tracking"))
     _add_outputs(parser.add_argument_group("further outputs"))
@@ -164,6 +179,7 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Localize and write one line per view."""
+    check_destination(options)
     if options.atlas:
         _on_atlas(options)
     else:
@@ -175,7 +191,6 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.fixes import write_results
     from orthonav.flight.identity import FlightDigest, Identity, Source
     from orthonav.flight.mount import MountedFlight
     from orthonav.localizer.tracker import Tracker
@@ -230,7 +245,7 @@ def _on_map(options: argparse.Namespace) -> None:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
-        write_results(options.out, results, Identity(used, digest.source(options.flight)))
+        write_positions(options, results, Identity(used, digest.source(options.flight)))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
@@ -267,7 +282,6 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.fixes import write_results
     from orthonav.flight.identity import FlightDigest, Identity
     from orthonav.onboard.run import localize_flight
 
@@ -311,7 +325,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    write_results(options.out, results, Identity(flight=digest.source(options.flight)))
+    write_positions(options, results, Identity(flight=digest.source(options.flight)))
     export_all(exports, results, None)
     _print_summary(options, results, accept)
 
@@ -346,7 +360,7 @@ def _print_counts(
     latencies = latencies[np.isfinite(latencies)]
     median_ms = float(np.median(latencies)) if latencies.size else None
     plain = {
-        "fixes": str(options.out),
+        "fixes": None if options.out is None else str(options.out),
         "views": counts.views,
         "n_confident": counts.confident,
         "n_low_confidence": counts.low,
@@ -359,7 +373,7 @@ def _print_counts(
         **changes_to_plain(options, changed),
     }
     if options.json:
-        print_json(plain)
+        print_json(plain | positions_to_plain(options, results))
         return
     least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
     named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
@@ -374,6 +388,7 @@ def _print_counts(
     for each in options.export:
         print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
-    print(f"written to {options.out}{guesses}")
+    if options.out is not None and not is_stdout(options.out):
+        print(f"written to {options.out}{guesses}")
     for line in changes_text(options, changed):
         print(line)

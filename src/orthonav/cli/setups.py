@@ -2,11 +2,13 @@
 
 import argparse
 import math
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from orthonav.cli.build import reporter
 from orthonav.cli.source import FAR_M, far_from_map, far_text
 
 if TYPE_CHECKING:
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from orthonav.records import Telemetry, ViewResult
     from orthonav.sources import Recording, SourceView
 
+BUDGET_S = 15.0
+"""After so long no further view is placed: the search for another set-up takes at most 20 s."""
 _SCATTERED_DEG = 20.0
 """Headings that differ by a constant scatter less about it: compasses err by some degrees."""
 
@@ -110,7 +114,6 @@ class SetupAdvice:
         Both are empty where enough views are confident.
         """
         from orthonav.geo.headings import RADIANS, seem_radians
-        from orthonav.onboard.setups import try_setups
 
         options, counts = self._options, Counts.of(results)
         known = options.heading == "known"
@@ -121,21 +124,41 @@ class SetupAdvice:
             return [*lines, far_text("the recorded positions are", *self._nearest)], []
         if counts.low and not any(_states(result, accept) for result in results):
             return [*lines, _SILENT.format(criterion=accept.criterion)], []
-        if not self._low.views:
+        if not self._low.views or not options.diagnosis:
             return lines, []
+        try:
+            tried, ended = self._tried(accept, shown)
+        except KeyboardInterrupt:  # skips the search; the results are written
+            return [*lines, "the search for another set-up was interrupted"], []
+        if ended:
+            lines.append(f"the search for another set-up was ended after {BUDGET_S:.0f} s")
+        if tried:
+            lines += setup_text(tried, on_map=self._nearest is not None)
+        return lines, [
+            {"setup": each.setup.name, "views": each.views, "confident": each.confident}
+            for each in tried
+        ]
+
+    def _tried(self, accept: "Acceptance", shown: "Progress") -> "tuple[list[Tried], bool]":
+        """The set-ups that were tried, and whether the time for it ran out."""
+        from orthonav.onboard.setups import try_setups
+
+        options, end_s = self._options, time.monotonic() + BUDGET_S
+        reporter(options)(
+            "few views are confident: trying other set-ups on some of them for up to "
+            f"{BUDGET_S:.0f} s (Ctrl-C or --no-diagnosis skips this)"
+        )
         tried = try_setups(
             self._localizer,
             self._low.views,
             accept.accepts,
             use_prior=options.prior == "telemetry",
-            heading_known=known,
+            heading_known=options.heading == "known",
             tracked=bool(options.track or options.smooth),
+            stop=lambda: time.monotonic() > end_s,
             progress=lambda share: shown("set-ups", share),
         )
-        return [*lines, *setup_text(tried, on_map=self._nearest is not None)], [
-            {"setup": each.setup.name, "views": each.views, "confident": each.confident}
-            for each in tried
-        ]
+        return tried, time.monotonic() > end_s
 
 
 def _states(result: "ViewResult", accept: "Acceptance") -> bool:

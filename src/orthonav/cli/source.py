@@ -43,7 +43,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         "--telemetry",
         type=Path,
         metavar="LOG",
-        help="log to join by time: PX4 .ulg, ArduPilot .bin or .tlog, DJI .srt, .csv",
+        help="log to join by time: PX4 .ulg, ArduPilot .bin or .tlog, DJI .srt, .csv; or a .csv of "
+        "images by file name",
     )
     group.add_argument(
         "--time-offset-s",
@@ -81,6 +82,14 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="MM",
         help="longer side of the sensor of photographs, for the focal length",
+    )
+    group.add_argument(
+        "--fov-deg",
+        type=float,
+        help="field of view across the width of the images, where the camera is not known",
+    )
+    group.add_argument(
+        "--agl-m", type=float, help="height above ground of all views, in place of a recorded one"
     )
     group.add_argument(
         "--ground-alt-m",
@@ -147,7 +156,7 @@ def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
 
 
 def open_source(
-    path: Path, options: argparse.Namespace, *, over_terrain: bool = False
+    path: Path | list[Path], options: argparse.Namespace, *, over_terrain: bool = False
 ) -> "Recording":
     """The open recording of the command line; its warnings are logged.
 
@@ -166,6 +175,8 @@ def open_source(
         prior_std_m=options.prior_std_m,
         sensor_width_mm=options.sensor_width_mm,
         ground_alt_m=options.ground_alt_m,
+        agl_m=options.agl_m,
+        fov_deg=options.fov_deg,
         looks_down=options.looks_down,
         over_terrain=over_terrain,
         skip_bad_images=getattr(options, "skip_bad_images", False),

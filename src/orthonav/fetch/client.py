@@ -302,8 +302,10 @@ def _over(max_bytes: int) -> BadReplyError:
 
 
 def excerpt(reply: HttpReply) -> str:
-    """The beginning of an answer as text on one line, for an error."""
+    """The beginning of an answer as text on one line, for an error; of other content its size."""
     text = reply.body[: 4 * _EXCERPT_CHARACTERS].decode("utf-8", errors="replace")
+    if "\0" in text or 10 * text.count("\ufffd") > len(text):
+        return f"{len(reply.body)} bytes that are not text"
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return words[:_EXCERPT_CHARACTERS]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingFileError, RouteError, described
+from orthonav.errors import MissingFileError, RouteError, described, lfs_pointer
 from orthonav.geo.frames import distances_m
 from orthonav.geo.routes.delimited import read_delimited
 from orthonav.geo.routes.geojson import read_geojson, routes_of
@@ -20,7 +20,7 @@ from orthonav.geo.routes.gpx import read_gpx
 from orthonav.geo.routes.kml import read_kml, read_kmz
 from orthonav.geo.routes.presets import PREFIX, preset
 from orthonav.geo.routes.qgc_plan import is_plan, plan_route, read_plan
-from orthonav.geo.routes.record import Height, Route
+from orthonav.geo.routes.record import Height, Route, left_out_text
 from orthonav.geo.routes.values import json_object
 from orthonav.geo.routes.wpl import is_wpl, read_wpl
 from orthonav.geo.routes.wpml import read_wpml
@@ -80,22 +80,34 @@ def read_route(path: Path) -> Route:
     if str(path).startswith(PREFIX):
         return preset(str(path))
     path, name = _name_apart(Path(path))
-    if not path.is_file():
-        raise MissingFileError(f"route file does not exist: {path}")
-    if path.stat().st_size > MAX_ROUTE_BYTES:
-        raise RouteError(f"route file is larger than {MAX_ROUTE_BYTES // 10**6} MB: {path}")
+    data = _bytes_of(path)
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise RouteError(f"route must be one of {', '.join(_READERS)}, got '{path.suffix}': {path}")
     try:
-        found = _READERS[suffix](path.read_bytes())
-        return _chosen(found, name, first=suffix in (".geojson", ".json"))
+        found = _READERS[suffix](data)
+        route = _chosen(found, name, first=suffix in (".geojson", ".json"))
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
     except _BROKEN as error:
         raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
+    if route.left_out:
+        log.warning("%s: %s", left_out_text(route.left_out), path)
+    return route
+
+
+def _bytes_of(path: Path) -> bytes:
+    if not path.is_file():
+        raise MissingFileError(f"route file does not exist: {path}")
+    if path.stat().st_size > MAX_ROUTE_BYTES:
+        raise RouteError(f"route file is larger than {MAX_ROUTE_BYTES // 10**6} MB: {path}")
+    try:
+        data = path.read_bytes()
     except OSError as error:
         raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
+    if pointer := lfs_pointer(data):
+        raise MissingFileError(f"route file {pointer}: {path}")
+    return data
 
 
 def _name_apart(path: Path) -> tuple[Path, str | None]:

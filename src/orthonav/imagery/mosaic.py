@@ -15,6 +15,7 @@ from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.folder import sources_in
 from orthonav.imagery.lattice import Lattice, lattices_of
+from orthonav.imagery.plates import at_epoch
 from orthonav.imagery.raster import GDAL_OPTIONS, GreyPixels, Pixels, SheetRaster
 from orthonav.imagery.source import Source, open_sources
 from orthonav.imagery.stretch import ContrastStretch, sample_stretches
@@ -33,10 +34,11 @@ class Mosaic:
     stretches: tuple[ContrastStretch | None, ...]
 
     @classmethod
-    def open(cls, paths: Sequence[Path]) -> "Mosaic":
+    def open(cls, paths: Sequence[Path], epoch: float | None = None) -> "Mosaic":
         """Inspect files, and all orthophotos of folders, the newest first; nothing stays open.
 
-        Raises as `open_source` and `sources_in` do.
+        `epoch`: decimal year at which positions in systems of plates are those of WGS 84; None:
+        they are taken as they are. Raises as `open_source`, `sources_in` and `at_epoch` do.
         """
         if not paths:
             raise ImageryError("no orthophoto was given")
@@ -49,6 +51,8 @@ class Mosaic:
             else:
                 files.append(path)
         sources += open_sources(files)[0]
+        if epoch is not None:
+            sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):
             return cls(tuple(sources), sample_stretches(sources))
 

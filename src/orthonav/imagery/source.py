@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import ImageryError, MissingFileError
+from orthonav.errors import ImageryError
 from orthonav.extras import missing_extra
+from orthonav.files import require_file
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.names import date_of, system_of, tab_transform
 
@@ -160,8 +161,7 @@ def open_sources(
 
 
 def _opened(path: Path, folder: Path | None) -> list[Source]:
-    if not path.is_file():
-        raise MissingFileError(f"orthophoto does not exist: {path}")
+    require_file(path, "orthophoto")
     try:
         with rasterio.open(path) as dataset:
             tables = list(dataset.subdatasets) if dataset.count == 0 else []
@@ -178,6 +178,8 @@ def _opened(path: Path, folder: Path | None) -> list[Source]:
 
 def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     names = _names_of(path, folder)
+    if reason := unwarped(path, dataset):
+        raise UnfitError(f"orthophoto {reason}: {path}")
     if folder is not None and dataset.crs is None and _transform(path, dataset).is_identity:
         raise UnfitError(f"raster has no georeference: {path}")
     system = _system(path, dataset, names)
@@ -217,6 +219,20 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
+    )
+
+
+def unwarped(path: Path, dataset: Any) -> str | None:
+    """What a raster is placed by, if not by a geotransform, and how to warp it; else None."""
+    points = len(dataset.gcps[0])
+    if not _transform(path, dataset).is_identity or not (points or dataset.rpcs):
+        return None
+    found, option = ("rational polynomials", "-rpc")
+    if points:
+        found, option = f"{points} ground control points", "-tps"
+    return (
+        f"is placed by {found} only, which are no grid; warp it first: gdalwarp {option} "
+        f"'{path.name}' warped.tif"
     )
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.caches import ByteCache
-from orthonav.errors import ImageryError, MissingFileError
+from orthonav.errors import ImageryError
 from orthonav.extras import missing_extra
+from orthonav.files import require_file
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.ground import HIGHEST_M, LOWEST_M, bilinear
 
@@ -29,6 +30,7 @@ try:
 
     from orthonav.imagery.datum import VerticalDatum, geoid, horizontal_and_vertical
     from orthonav.imagery.quiet import quiet
+    from orthonav.imagery.source import unwarped
 except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 
@@ -199,9 +201,7 @@ def open_dem(path: Path, datum: str | None = None) -> Dem:
     `datum`: what its heights count from, where the file does not state it (`datum.OPTION`).
     Raises `MissingFileError` or `ImageryError`.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"terrain file does not exist: {path}")
+    path = require_file(Path(path), "terrain file")
     try:
         with quiet(), rasterio.Env(**_OPTIONS):
             return _inspected(path, rasterio.open(path), datum)
@@ -210,6 +210,8 @@ def open_dem(path: Path, datum: str | None = None) -> Dem:
 
 
 def _inspected(path: Path, data: Any, given: str | None) -> Dem:
+    if reason := unwarped(path, data):
+        raise ImageryError(f"terrain file {reason}: {path}")
     if data.crs is None:
         raise ImageryError(f"terrain file has no coordinate reference system: {path}")
     if data.count != 1 or data.dtypes[0] in ("uint8", "int8"):

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError, MissingFileError
+from orthonav.files import require_file
 from orthonav.flight import decode_image, open_flight
 from orthonav.onboard.arrival import Arrival, ArrivalWatch
 from orthonav.onboard.telemetry import Clocks, VehicleState
@@ -256,6 +257,7 @@ def recorded_images(path: Path, rate_hz: float | None) -> Iterator[RecordedImage
         return _images(path, rate_hz or FOLDER_RATE_HZ)
     if not path.is_file():
         raise MissingFileError(f"no such camera, stream, folder or file: {path}")
+    require_file(path, "video")
     capture = _capture(str(path.resolve()))
     if not capture.isOpened():
         raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")

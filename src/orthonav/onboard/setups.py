@@ -141,13 +141,15 @@ def try_setups(
     use_prior: bool,
     heading_known: bool,
     tracked: bool = False,
+    stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Tried]:
     """What each change of the set-up does to the views, in the order in which they were tried.
 
-    `accepts` says whether an outcome is confident. The first change that explains it ends
-    the search; at most ten are tried, each on at most `SAMPLE` views. `tracked`: the views were
-    judged as a track, so they are first placed one by one as reported.
+    `stop` is asked before each view and ends the search: the last change may then have been tried
+    on fewer views, and may be missing. `accepts` says whether an outcome is confident. The first
+    change that explains it ends the search; at most ten are tried, each on at most `SAMPLE` views.
+    `tracked`: the views were judged as a track, so they are first placed one by one as reported.
     """
     setups = [
         setup
@@ -157,10 +159,12 @@ def try_setups(
     found: list[Tried] = []
     for number, setup in enumerate(setups):
         fixes: list[tuple[View, Fix]] = []
+        placed = 0
         for i, view in enumerate(views):
             progress((number + i / len(views)) / len(setups))
-            if i == _GIVE_UP and not fixes:
+            if stop() or (i == _GIVE_UP and not fixes):
                 break
+            placed += 1
             outcome = localizer.locate(
                 setup.changed(view),
                 prior=view.telemetry.prior if use_prior and not setup.without_prior else None,
@@ -168,8 +172,9 @@ def try_setups(
             )
             if isinstance(outcome, Fix) and accepts(outcome):
                 fixes.append((view, outcome))
-        found.append(_tried(setup, len(views), fixes))
-        if found[-1].explains:
+        if placed:
+            found.append(_tried(setup, placed if stop() else len(views), fixes))
+        if stop() or found[-1].explains:
             break
     progress(1.0)
     return found

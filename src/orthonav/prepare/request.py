@@ -87,6 +87,7 @@ class BuildRequest:
     dem: Path | None = None
     dem_datum: str | None = None
     dem_needed: bool = True
+    epoch: float | None = None
     device: str = "auto"
     cells: bool = False
 
@@ -132,8 +133,8 @@ class BuildInputs:
         check_device(request.device)
         if not request.other_dates:
             check_positives(recipe, representation)
-        mosaic = Mosaic.open(request.orthos)
-        other_dates = tuple(Mosaic.open([path]) for path in request.other_dates)
+        mosaic = Mosaic.open(request.orthos, request.epoch)
+        other_dates = tuple(Mosaic.open([path], request.epoch) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
         inputs += [] if request.dem is None else [request.dem]
         if request.out.exists() and any(request.out.samefile(path) for path in inputs):

@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingFileError, VariantError
+from orthonav.errors import VariantError
 from orthonav.extras import needed
+from orthonav.files import require_file
 
 VARIABLE = "ORTHONAV_EDGES"
 PROBE_PX, LARGEST_MARGIN_PX = 96, 32
@@ -86,9 +87,7 @@ class LearnedEdges:
 
 def _read(path: str) -> bytes:
     """The file, up to a limit; raises `MissingFileError` or `VariantError`."""
-    if not Path(path).is_file():
-        raise MissingFileError(f"edge network does not exist or is no file: {path}")
-    with Path(path).open("rb") as stream:
+    with require_file(Path(path), "edge network").open("rb") as stream:
         data = stream.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:
         raise VariantError(f"edge network is larger than {LARGEST_BYTES >> 20} MiB: {path}")

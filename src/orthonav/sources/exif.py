@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthonav.sources.focal import Optics
 from orthonav.sources.guard import needed, reading
 from orthonav.sources.makernotes import read_maker_notes
+from orthonav.sources.track import measured
 from orthonav.sources.xmp import Xmp
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
@@ -60,6 +61,10 @@ class Photo:
     """Camera and lens."""
     software: str
     """Programs that wrote the file; of a camera its firmware."""
+    agl_m: float = math.nan
+    """Height above ground, where a table states it."""
+    doubts: tuple[str, ...] = ()
+    """Values that are there and cannot be used: what is wrong with each."""
 
 
 def read_photo(path: Path) -> Photo:
@@ -85,6 +90,11 @@ def read_photo(path: Path) -> Photo:
         time_ns, zone_known = _time(tags, more, gps)
     latlon, alt = _place(gps)
     body_yaw = xmp.body_yaw_deg()
+    if math.isnan(body_yaw) and not xmp.unread:
+        body_yaw = notes.body_yaw_deg
+    doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
+    if latlon is None and _lacks_references(gps):
+        doubts.append("GPS position without N or S, or without E or W")
     return Photo(
         width_px=width,
         height_px=height,
@@ -94,13 +104,14 @@ def read_photo(path: Path) -> Photo:
         alt_m=alt,
         gimbal_deg=xmp.gimbal_deg() or notes.gimbal_deg,
         rotation=xmp.rotation(make),
-        body_yaw_deg=body_yaw if math.isfinite(body_yaw) else notes.body_yaw_deg,
+        body_yaw_deg=body_yaw,
         home_m=xmp.home_m(),
         amsl_m=xmp.first("sensefly:AltitudeAMSL"),
         hae_m=xmp.hae_m(),
         vel_en_mps=xmp.velocity_en_mps(),
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
+        doubts=tuple(doubts),
     )
 
 
@@ -170,15 +181,29 @@ def _gps_time(gps: dict[int, Any]) -> datetime | None:
 
 def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float]:
     """Latitude and longitude in degrees, and altitude (tags 1 to 6)."""
-    alt = _number(gps.get(6)) * (-1 if gps.get(5) in (1, b"\x01") else 1)
+    alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, b"\x01") else 1))
     try:
         lat, lon = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
-        south, west = (str(gps[tag]).upper().strip("\0 ") in ("S", "W") for tag in (1, 3))
     except (KeyError, ValueError, TypeError, ZeroDivisionError):
         return None, alt
+    if _lacks_references(gps):
+        return None, alt
+    south, west = (_reference(gps, tag) in ("S", "W") for tag in (1, 3))
     lat, lon = -lat if south else lat, -lon if west else lon
     sound = abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0)
     return ((lat, lon) if sound else None), alt
+
+
+def _reference(gps: dict[int, Any], tag: int) -> str:
+    value = gps.get(tag, "")
+    text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
+    return text.upper().strip("\0 ")[:1]
+
+
+def _lacks_references(gps: dict[int, Any]) -> bool:
+    """Whether latitude or longitude have no sign: no N, S, E or W."""
+    placed = 2 in gps and 4 in gps
+    return placed and not (_reference(gps, 1) in tuple("NS") and _reference(gps, 3) in tuple("EW"))
 
 
 def _number(value: Any) -> float:

@@ -30,7 +30,6 @@ from orthonav.flight.logged import (
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
 from orthonav.records import ViewResult
-from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.mcap_chunks import (
     Chunk,
     LastChunk,
@@ -42,7 +41,7 @@ from orthonav.sources.mcap_chunks import (
     profile_of,
 )
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import Grey, Recording, SourceView, fitted, with_options
+from orthonav.sources.recording import Grey, Recording, SourceView, given_camera, with_options
 
 MAX_VIEWS = 500_000
 """Ten a second for 14 hours; a small damaged file can claim far more."""
@@ -98,10 +97,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     camera = _camera(index.session, path)
     replayable = _replayable(index, path)
     images = _LoggedImages(index.pictures, camera)
-    used = camera
-    if options.camera is not None:
-        given = read_camera_file(options.camera)
-        used = fitted(given, camera.width_px, camera.height_px, str(path))
+    used = given_camera(options, camera.width_px, camera.height_px, str(path)) or camera
     _warn_of_gaps(index, replayable)
     run, version = index.session.get("run"), index.session.get("version")
     return LoggedFlight(

@@ -93,6 +93,56 @@ def chunks(path: Path, walk: Walk) -> Iterator[Chunk]:
         walk.lost_bytes = max(0, size - at)
 
 
+def complete_bytes(path: Path) -> int:
+    """Bytes of a file up to the end of its last complete record of data."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, io.SEEK_END)
+        at = len(MAGIC)
+        while at + _RECORD_BYTES <= size:
+            stream.seek(at)
+            head = stream.read(_RECORD_BYTES)
+            length = int.from_bytes(head[1:], "little")
+            ended = head[0] in (0, _DATA_END, _FOOTER)
+            if ended or length > size - at - _RECORD_BYTES:
+                break
+            at += _RECORD_BYTES + length
+    return min(at, size)
+
+
+def partial_records(path: Path, offset: int) -> bytes:
+    """The complete records in a chunk at `offset` that was cut off, uncompressed; else nothing."""
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        head = stream.read(_RECORD_BYTES)
+        if head[:1] != bytes([_CHUNK]):
+            return b""
+        body = stream.read(MAX_CHUNK_BYTES)
+    named = 32 + int.from_bytes(body[28:32], "little")
+    plain = _begun(body[32:named], body[named + 8 :])
+    at = 0
+    while at + _RECORD_BYTES <= len(plain) and plain[at] in (_SCHEMA, _CHANNEL, _MESSAGE):
+        last = at + _RECORD_BYTES + int.from_bytes(plain[at + 1 : at + _RECORD_BYTES], "little")
+        if last > len(plain):
+            break
+        at = last
+    return plain[:at]
+
+
+def _begun(kind: bytes, data: bytes) -> bytes:
+    """As much of the compressed `data` as is there."""
+    try:
+        if kind == b"lz4":
+            decompressor = needed("lz4.frame", WHAT).LZ4FrameDecompressor()
+            return bytes(decompressor.decompress(data, max_length=MAX_CHUNK_BYTES))
+        if kind == b"zstd":
+            zstandard = needed("zstandard", WHAT)
+            decompressor = zstandard.ZstdDecompressor(max_window_size=2 * MAX_CHUNK_BYTES)
+            return bytes(decompressor.stream_reader(data).read(MAX_CHUNK_BYTES))
+    except Exception:  # of either library, about damaged data
+        return b""
+    return data if kind == b"" else b""
+
+
 def chunk_at(path: Path, offset: int) -> bytes | None:
     """Content of the chunk at `offset`, None where it is damaged."""
     with path.open("rb") as stream:

@@ -12,6 +12,9 @@ KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
 
 
+MAX_FOV_DEG = 150.0
+
+
 @dataclass(frozen=True)
 class SourceOptions:
     """How a recording is read. Raises `FlightError` for invalid values."""
@@ -36,6 +39,10 @@ class SourceOptions:
     """Longer side of the sensor, for the focal length of photographs."""
     ground_alt_m: float | None = None
     """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
+    agl_m: float | None = None
+    """Height above ground of all views, in place of a recorded one."""
+    fov_deg: float | None = None
+    """Field of view across the width of the image, where there is no camera file."""
     looks_down: bool = False
     """Whether the camera looked straight down where pitch and roll were not recorded."""
     over_terrain: bool = False
@@ -45,10 +52,16 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         with_paths(self, "camera", "telemetry")
-        for name in ("rate_hz", "prior_std_m", "sensor_width_mm"):
+        for name in ("rate_hz", "prior_std_m", "sensor_width_mm", "agl_m", "fov_deg"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise FlightError(f"{name} must be above 0, got {value}")
+        if self.fov_deg is not None and self.fov_deg > MAX_FOV_DEG:
+            raise FlightError(f"fov_deg must be at most {MAX_FOV_DEG:g}, got {self.fov_deg:g}")
+        if self.fov_deg is not None and self.camera is not None:
+            raise FlightError("give a camera file or a field of view, not both")
+        if self.agl_m is not None and self.ground_alt_m is not None:
+            raise FlightError("give a height above ground or an altitude of the ground, not both")
         numbers = (self.time_offset_s, *self.mount_deg, self.ground_alt_m or 0.0)
         if not all(math.isfinite(number) for number in numbers):
             raise FlightError("time offset, mount and ground altitude must be finite numbers")

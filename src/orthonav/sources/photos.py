@@ -9,32 +9,33 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, lfs_pointer
 from orthonav.flight import read_image
 from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
-from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.exif import Photo, read_photo
 from orthonav.sources.focal import FocalLength, focal_length
+from orthonav.sources.image_table import ImageRow
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
+from orthonav.sources.photo_files import SUFFIXES, ChosenPhotos
 from orthonav.sources.photo_poses import PhotoPose, poses_of
 from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
-    fitted,
+    given_camera,
     height_warnings,
     jump_warnings,
     known_at,
     rounded,
+    time_warnings,
     warnings_of,
     with_mean_velocities,
     with_options,
 )
 from orthonav.sources.track import RecordedTrack
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _BY_NAME_NS = 10**9
 """Spacing of photographs without a time, which are ordered by name."""
 log = logging.getLogger(__name__)
@@ -49,27 +50,22 @@ class _DatedPhoto:
     photo: Photo
     pose: PhotoPose | None = None
     """None where a log has it."""
+    row: ImageRow | None = None
+    """What a table says of it."""
 
 
-def photo_paths(folder: Path) -> list[Path]:
-    """Photographs below a folder, hidden ones left out, by name."""
-    found = folder.rglob("*")
-    return sorted(
-        path
-        for path in found
-        if path.suffix.lower() in SUFFIXES
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
+def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
+    """The flight of photographs, by time: of a folder, of a table of images, or named one by one.
 
-
-def open_photos(folder: Path, options: SourceOptions) -> Recording:
-    """The flight of a folder of photographs, by time.
-
-    Raises `FlightError`, `CameraError` or `MissingExtraError`. Photographs that cannot be read,
-    have no time, or another size or focal length than most, are left out, with a warning.
+    Raises `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`. Photographs that
+    cannot be read, have no time, or another size or focal length than most, are left out, with a
+    warning.
     """
-    taken, warnings = _taken(folder, options)
-    if options.camera is None:
+    chosen = ChosenPhotos.of(sources, options)
+    if chosen.table is not None:
+        options = replace(options, telemetry=None)
+    folder, (taken, warnings) = chosen.folder, _taken(chosen, options)
+    if options.camera is None and options.fov_deg is None:
         taken, zoomed = _of_one_focal_length(taken, options)
         warnings += zoomed
     camera, note = _camera(taken[0], options)
@@ -80,25 +76,109 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
         warnings += warnings_of(track, options)
     else:
         poses, doubts = poses_of([one.photo for one in taken])
-        taken = [replace(one, pose=pose) for one, pose in zip(taken, poses, strict=True)]
+        taken = [
+            replace(one, pose=_pose_with_row(pose, one.row))
+            for one, pose in zip(taken, poses, strict=True)
+        ]
         warnings += doubts
+        level = sum(math.isnan(one.pose.pitch_deg) for one in taken if one.pose)
+        if chosen.singly and level:
+            options = replace(options, looks_down=True)
+            warnings.append(
+                f"pitch and roll of {level} of {len(taken)} photographs are not known: a camera "
+                "that looks straight down is assumed"
+            )
         warnings += _height_warnings([one.photo for one in taken], options)
         warnings += jump_warnings([(one.time_ns, one.photo.latlon_deg) for one in taken])
+    warnings += _doubts(taken)
+    warnings += time_warnings(one.time_ns for one in taken)
     views = partial(_views, folder, taken, track, options)
     return Recording(
         kind="photos",
-        path=folder,
+        path=folder if len(sources) > 1 else sources[0],
         camera=camera,
-        note="; ".join(filter(None, [f"photographs of {folder.name}", note])),
+        note="; ".join(filter(None, [f"photographs of {folder.name}", *_table_note(chosen), note])),
         expected=len(taken),
         stream=views if track is None else lambda: with_mean_velocities(views(), track),
-        warnings=tuple(filter(None, [*warnings, note])),
+        warnings=tuple(filter(None, [*warnings, "" if options.fov_deg else note])),
         take_off_latlon_deg=None if track is None else track.take_off_latlon_deg,
     )
 
 
+def _table_note(chosen: ChosenPhotos) -> list[str]:
+    return [] if chosen.table is None else [f"table {chosen.table.path.name}"]
+
+
+def _pose_with_row(pose: PhotoPose, row: ImageRow | None) -> PhotoPose:
+    """The attitude of a photograph, where a table states it by the table."""
+    if row is None:
+        return pose
+    if math.isfinite(row.pitch_deg):
+        tilt = {"pitch_deg": row.pitch_deg, "roll_deg": row.roll_deg}
+        pose = replace(pose, **tilt, tilt_std_deg=row.tilt_std_deg)
+    if math.isfinite(row.yaw_deg):
+        pose = replace(pose, yaw_deg=row.yaw_deg, yaw_std_deg=None)
+    return pose
+
+
+def _photo_with_row(photo: Photo, row: ImageRow) -> Photo:
+    """The metadata of a photograph with the time, the position and the heights of a table."""
+    if row.time_ns is not None:
+        photo = replace(photo, time_ns=row.time_ns, zone_known=True)
+    if row.has_height:
+        heights = {name: getattr(row, name) for name in ("agl_m", "home_m", "amsl_m", "hae_m")}
+        photo = replace(photo, **heights, alt_m=row.alt_m)
+    return replace(photo, latlon_deg=row.latlon_deg or photo.latlon_deg)
+
+
+def _with_rows(
+    found: list[tuple[Path, Photo]], chosen: ChosenPhotos
+) -> tuple[list[_DatedPhoto], list[str]]:
+    """Photographs with their rows of the table, and warnings about those without one.
+
+    Raises `FlightError` where no photograph has one.
+    """
+    if chosen.table is None:
+        return [_DatedPhoto(path, photo.time_ns or 0, photo) for path, photo in found], []
+    rows = [chosen.table.row(path.relative_to(chosen.folder).as_posix()) for path, _ in found]
+    without = [path.name for (path, _), row in zip(found, rows, strict=True) if row is None]
+    if len(without) == len(found):
+        raise FlightError(
+            f"table names none of the {len(found)} photographs, such as {without[0]}; it names "
+            f"{next(iter(chosen.table.rows))}: {chosen.table.path}"
+        )
+    warnings = list(chosen.table.warnings)
+    if without:
+        warnings.append(
+            f"{len(without)} of {len(found)} photographs left out, not in the table, the first: "
+            f"{without[0]}"
+        )
+    lost = len({row.order for row in chosen.table.rows.values()}) - len(found) + len(without)
+    if lost:
+        warnings.append(f"{lost} rows of the table have no photograph: {chosen.table.path}")
+    return [
+        _DatedPhoto(path, 0, _photo_with_row(photo, row), row=row)
+        for (path, photo), row in zip(found, rows, strict=True)
+        if row is not None
+    ], warnings
+
+
+def _doubts(taken: Sequence[_DatedPhoto]) -> list[str]:
+    """Warnings about values that cannot be used, with the number of photographs and an example."""
+    doubted = [one for one in taken if one.photo.doubts]
+    if not doubted:
+        return []
+    first = doubted[0]
+    return [
+        f"values of {len(doubted)} of {len(taken)} photographs cannot be used, such as "
+        f"{first.photo.doubts[0]}: {first.path.name}"
+    ]
+
+
 def _height_warnings(photos: Sequence[Photo], options: SourceOptions) -> list[str]:
     """Assumptions about the heights of photographs without a log."""
+    if all(math.isfinite(photo.agl_m) for photo in photos):
+        return []
     above_home = any(math.isfinite(photo.home_m) for photo in photos)
     usable = above_home or any(
         math.isfinite(value) for photo in photos for value in (photo.amsl_m, photo.hae_m)
@@ -109,47 +189,89 @@ def _height_warnings(photos: Sequence[Photo], options: SourceOptions) -> list[st
     return height_warnings(above_home, only_altitudes, options)
 
 
-def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], list[str]]:
+def _taken(chosen: ChosenPhotos, options: SourceOptions) -> tuple[list[_DatedPhoto], list[str]]:
     """The photographs that can be used, by time, and warnings."""
-    paths = photo_paths(folder)
+    folder, paths = chosen.folder, chosen.paths
     if not paths:
         raise FlightError(f"folder has no photographs ({', '.join(SUFFIXES)}): {folder}")
     found: list[tuple[Path, Photo]] = []
-    unread = []
+    unread: list[Path] = []
+    pointer = None
     for path in paths:
         try:
             found.append((path, read_photo(path)))
         except FlightError as error:
             log.info("%s", error)
             unread.append(path)
+            pointer = pointer or _pointer(path)
     found, odd = _of_one_size(found)
-    timed = [one for one in found if one[1].time_ns is not None]
-    untimed = [path for path, photo in found if photo.time_ns is None]
-    by_name = _by_name(found) if options.telemetry is None else []
-    if len(by_name) > len(timed):
-        timed, untimed = by_name, [one for one in untimed if one not in dict(by_name)]
-    warnings = [
-        f"{len(bad)} of {len(paths)} photographs left out, {why}, the first: {bad[0].name}"
-        for bad, why in (
-            (unread, "not readable"),
-            (odd, "of another size than most"),
-            (untimed, "no time in EXIF"),
-        )
-        if bad
-    ]
+    warnings = _left_out(paths, [(unread, pointer or "not readable"), (odd, ODD_SIZE)])
+    if not found:
+        raise FlightError(f"{'; '.join(warnings)}: {folder}")
+    dated, lost = _with_rows(found, chosen)
+    timed, untimed, undated = _in_time(dated, chosen, options)
+    warnings += lost + _left_out(paths, [([one.path for one in untimed], "no time in EXIF")])
     if not timed:
         raise FlightError(f"{'; '.join(warnings)}: {folder}")
-    if timed is by_name:
+    if undated and len(timed) > 1:
         warnings.append(
-            f"no time in EXIF of {len(timed)} photographs: ordered by name, one second apart"
+            f"no time in EXIF of {undated} photographs: ordered by name, one second apart"
         )
-    elif guessed := sum(not photo.zone_known for _, photo in timed):
+    elif not undated and (guessed := sum(not one.photo.zone_known for one in timed)):
         warnings.append(f"no time zone in EXIF of {guessed} photographs: UTC assumed")
-    taken = [
-        _DatedPhoto(path, (photo.time_ns or 0) + options.time_offset_ns, photo)
-        for path, photo in timed
+    timed = [
+        replace(one, time_ns=(one.photo.time_ns or 0) + options.time_offset_ns) for one in timed
     ]
-    return sorted(taken, key=lambda one: (one.time_ns, one.path)), warnings
+    return sorted(timed, key=lambda one: (one.time_ns, one.path)), warnings
+
+
+ODD_SIZE = "of another size than most"
+
+
+def _left_out(paths: Sequence[Path], why: Sequence[tuple[Sequence[Path], str]]) -> list[str]:
+    return [
+        f"{len(bad)} of {len(paths)} photographs left out, {reason}, the first: {bad[0].name}"
+        for bad, reason in why
+        if bad
+    ]
+
+
+def _in_time(
+    dated: list[_DatedPhoto], chosen: ChosenPhotos, options: SourceOptions
+) -> tuple[list[_DatedPhoto], list[_DatedPhoto], int]:
+    """Photographs with a time, those without one that are left out, and the number of those that
+    were given one by their order: where most have a pose but no time, and where they were named one
+    by one and one of them has none."""
+    timed = [one for one in dated if one.photo.time_ns is not None]
+    untimed = [one for one in dated if one.photo.time_ns is None]
+    if not untimed or options.telemetry is not None:
+        return timed, untimed, 0
+    if chosen.singly:
+        ordered = sorted(dated, key=lambda one: one.row.order if one.row else 0)
+        return _one_second_apart(ordered), [], len(dated)
+    posed = sorted(
+        (one for one in untimed if _has_pose(one.photo)), key=lambda one: _natural(one.path)
+    )
+    if len(posed) <= len(timed):
+        return timed, untimed, 0
+    return _one_second_apart(posed), [one for one in untimed if one not in posed], len(posed)
+
+
+def _has_pose(photo: Photo) -> bool:
+    return not (photo.gimbal_deg is None and photo.rotation is None and photo.latlon_deg is None)
+
+
+def _one_second_apart(ordered: Sequence[_DatedPhoto]) -> list[_DatedPhoto]:
+    return [
+        replace(one, photo=replace(one.photo, time_ns=number * _BY_NAME_NS))
+        for number, one in enumerate(ordered)
+    ]
+
+
+def _pointer(path: Path) -> str | None:
+    """What to do about a file that is a pointer of Git LFS."""
+    with path.open("rb") as stream:
+        return lfs_pointer(stream.read(64))
 
 
 def _of_one_size(
@@ -198,21 +320,6 @@ def _of_one_focal_length(
     ]
 
 
-def _by_name(found: Sequence[tuple[Path, Photo]]) -> list[tuple[Path, Photo]]:
-    """Photographs with a pose but without a time, in the order of their names."""
-    posed = [
-        (path, photo)
-        for path, photo in found
-        if photo.time_ns is None
-        and not (photo.gimbal_deg is None and photo.rotation is None and photo.latlon_deg is None)
-    ]
-    posed.sort(key=lambda one: _natural(one[0]))
-    return [
-        (path, replace(photo, time_ns=number * _BY_NAME_NS))
-        for number, (path, photo) in enumerate(posed)
-    ]
-
-
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Key that puts IMG_9 before IMG_10."""
     parts = re.split(r"(\d+)", str(path))
@@ -221,14 +328,17 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _camera(first: _DatedPhoto, options: SourceOptions) -> tuple[Camera, str]:
     width, height = first.photo.width_px, first.photo.height_px
-    if options.camera is not None:
-        return fitted(read_camera_file(options.camera), width, height, str(first.path)), ""
+    given = given_camera(options, width, height, str(first.path))
+    if given is not None:
+        return given, "" if options.camera else f"field of view {options.fov_deg:g} deg, as given"
     try:
         focal = focal_length(first.photo.optics, width, height, options.sensor_width_mm)
     except CameraError as error:
         raise CameraError(f"{error}: {first.path}") from error
     if focal is None:
-        raise CameraError(f"photograph has no focal length; give --camera FILE: {first.path}")
+        raise CameraError(
+            f"photograph has no focal length; give --camera FILE or --fov-deg: {first.path}"
+        )
     camera = Camera(width, height, focal.px, focal.px, width / 2, height / 2, focal_std=focal.std)
     return (
         camera,
@@ -258,7 +368,7 @@ def _views(
 def _own_telemetry(one: _DatedPhoto, options: SourceOptions) -> Telemetry:
     """Telemetry from the metadata of the photograph itself."""
     photo, pose = one.photo, one.pose or PhotoPose()
-    height = photo.home_m
+    height = photo.home_m if math.isnan(photo.agl_m) else photo.agl_m
     if math.isnan(height) and options.ground_alt_m is not None:
         height = photo.alt_m - options.ground_alt_m
     return Telemetry(

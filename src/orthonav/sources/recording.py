@@ -1,6 +1,7 @@
 """A recorded flight that is read view by view."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -13,14 +14,18 @@ from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
 from orthonav.records import Prior, Telemetry
 from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
+from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.track import RecordedTrack
+from orthonav.sources.track import RecordedTrack, measured
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
 LONG_GAP_NS = 1_000_000_000
 """After so long without a view a velocity at one time no longer says how far the aircraft flew: it
 may have turned."""
+FOV_STD = 0.05
+"""Standard deviation of a focal length by a field of view, as a share: such are rounded, and often
+those of another mode."""
 JUMP_M, JUMP_MPS = 500.0, 150.0
 """Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
 that this program is for flies slower, and logs round positions to some metres."""
@@ -71,7 +76,12 @@ class Recording:
 def with_options(
     telemetry: Telemetry, truth_latlon_deg: tuple[float, float] | None, options: SourceOptions
 ) -> Telemetry:
-    """The telemetry with the prior and the level camera that the options ask for."""
+    """The telemetry with the prior and the level camera that the options ask for.
+
+    A height above ground of 0 was not measured.
+    """
+    agl_m = telemetry.agl_m if options.agl_m is None else options.agl_m
+    telemetry = replace(telemetry, agl_m=measured(agl_m))
     if options.prior_std_m is not None and truth_latlon_deg is not None:
         prior = Prior(*truth_latlon_deg, options.prior_std_m)
         telemetry = replace(telemetry, prior=prior)
@@ -147,6 +157,19 @@ def jump_warnings(
     ]
 
 
+def time_warnings(times_ns: Iterable[int]) -> list[str]:
+    """Warning about views that have the time of another one; empty without one."""
+    counted = Counter(times_ns)
+    equal = sum(count for count in counted.values() if count > 1)
+    if not equal:
+        return []
+    return [
+        f"{equal} of {counted.total()} views have the same time as another one: they are in the "
+        "order of their names, and a track over them is of little use, because it needs the time "
+        "of each"
+    ]
+
+
 LEVEL_GROUND = (
     "height above ground is taken from the height above take-off: level ground is assumed"
 )
@@ -163,7 +186,7 @@ def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
     altitudes = track.altitude is not None
     if options.over_terrain and (known or track.amsl is not None or track.hae is not None):
         pass  # the terrain gives heights above ground
-    elif track.heights and track.home is not None:
+    elif track.heights and track.home is not None and options.agl_m is None:
         warnings.append(LEVEL_GROUND_IN_GAPS)
     else:
         warnings += height_warnings(track.home is not None, not known and altitudes, options)
@@ -178,6 +201,8 @@ def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
 
 def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
     """Assumptions about heights: of those above take-off, or where only altitudes are known."""
+    if options.agl_m is not None:
+        return []
     if above_home:
         return [LEVEL_GROUND]
     if not only_altitudes:
@@ -188,6 +213,22 @@ def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptio
             "give --ground-alt-m, in the same reference"
         ]
     return [f"height above ground is the recorded altitude minus {options.ground_alt_m:g} m"]
+
+
+def given_camera(
+    options: SourceOptions, width_px: int, height_px: int, where: str
+) -> Camera | None:
+    """The camera of the options for images of this size: of a file, or of a field of view.
+
+    Raises `MissingFileError` or `CameraError`.
+    """
+    if options.camera is not None:
+        return fitted(read_camera_file(options.camera), width_px, height_px, where)
+    if options.fov_deg is None:
+        return None
+    focal_px = width_px / 2 / math.tan(math.radians(options.fov_deg) / 2)
+    middle = width_px / 2, height_px / 2
+    return Camera(width_px, height_px, focal_px, focal_px, *middle, focal_std=FOV_STD)
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

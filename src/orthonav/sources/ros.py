@@ -3,8 +3,6 @@
 Messages: https://docs.ros.org/en/rolling/p/sensor_msgs/, axes: REP 103 and REP 105.
 """
 
-import contextlib
-import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,8 +13,6 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
-from orthonav.sources.cameras import read_camera_file
-from orthonav.sources.guard import needed, reading
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
@@ -24,26 +20,19 @@ from orthonav.sources.recording import (
     SourceView,
     check_overlap,
     fitted,
+    given_camera,
     known_at,
     warnings_of,
     with_mean_velocities,
 )
+from orthonav.sources.ros_files import opened
 from orthonav.sources.ros_images import camera_of_info, grey_of_message
-from orthonav.sources.ros_limits import bound_inflation, check_held
-from orthonav.sources.ros_topics import ParsableReader, Topics, find_topics
+from orthonav.sources.ros_topics import Topics, find_topics
 from orthonav.sources.ros_track import read_track, stamp_ns
 from orthonav.sources.track import RecordedTrack
 
-MAGICS = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
-
-
-def bag_suffix(path: Path) -> str | None:
-    """The suffix that fits the content of a file, None where it is not a bag."""
-    with path.open("rb") as stream:
-        head = stream.read(16)
-    return next((suffix for magic, suffix in MAGICS.items() if head.startswith(magic)), None)
 
 
 def open_ros(path: Path, options: SourceOptions) -> Recording:
@@ -52,10 +41,12 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
     Telemetry is read first, in one pass over its topics; images are read on request.
     Raises `FlightError`, `CameraError` or `MissingExtraError`.
     """
-    with _opened(path) as reader:
+    with opened(path) as (reader, doubts):
         topics = find_topics(reader, options.topics, path)
         size, first_ns, last_ns = _first_image(reader, topics, path)
-        camera = fitted(_camera(reader, topics, options, path), *size, str(path))
+        camera = given_camera(options, *size, str(path)) or fitted(
+            _camera(reader, topics, path), *size, str(path)
+        )
         if options.telemetry is not None:
             track = read_log(options.telemetry, options.mount_deg)
         else:
@@ -74,30 +65,9 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         stream=lambda: with_mean_velocities(
             _views(path, topics.image.topic, track, options), track
         ),
-        warnings=(*warnings, *warnings_of(track, options)),
+        warnings=(*doubts, *warnings, *warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """A reader of the recording, whatever its file is called."""
-    highlevel = needed("rosbags.highlevel", "ROS recordings")
-    typesys = needed("rosbags.typesys", "ROS recordings")
-    bound_inflation()
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(reading("ROS recording", path))
-        named = path
-        if path.is_file() and (suffix := bag_suffix(path)) not in (None, path.suffix):
-            folder = stack.enter_context(tempfile.TemporaryDirectory())
-            named = Path(folder) / f"recording{suffix}"  # the library goes by the suffix
-            named.symlink_to(path.resolve())
-        known = typesys.get_typestore(typesys.Stores.LATEST)  # for old bags without definitions
-        reader = highlevel.AnyReader([named], default_typestore=known)
-        reader.readers = [ParsableReader(each) for each in reader.readers]
-        stack.enter_context(reader)
-        check_held(reader.readers)
-        yield reader
 
 
 def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:
@@ -116,9 +86,7 @@ def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, in
     raise FlightError(f"no image of {topics.image.topic} can be read ({reason}): {path}")
 
 
-def _camera(reader: Any, topics: Topics, options: SourceOptions, path: Path) -> Camera:
-    if options.camera is not None:
-        return read_camera_file(options.camera)
+def _camera(reader: Any, topics: Topics, path: Path) -> Camera:
     info = topics.roles.get("camera_info")
     if info is None:
         raise CameraError(f"no camera_info for the images; give --camera FILE: {path}")
@@ -133,7 +101,7 @@ def _camera(reader: Any, topics: Topics, options: SourceOptions, path: Path) -> 
 def _views(
     path: Path, topic: str, track: RecordedTrack, options: SourceOptions
 ) -> Iterator[SourceView]:
-    with _opened(path) as reader:
+    with opened(path) as (reader, _):
         connections = [one for one in reader.connections if one.topic == topic]
         messages = reader.messages(connections=connections)
         for number, (connection, time_ns, raw) in enumerate(messages):

@@ -8,11 +8,13 @@ from pathlib import Path
 
 from orthonav.errors import FlightError
 from orthonav.sources.attitude import GIMBAL_TILT_STD_DEG, enu_from_gimbal_camera
-from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
+from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles, measured
 
 MAX_BYTES = 500_000_000
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
+_ENDS = (">", "]", ")")
+"""What blocks end with that are whole, besides the end of a line."""
 _TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
 _GPS = re.compile(
@@ -86,10 +88,14 @@ def _add(
 
 
 def blocks(data: bytes) -> Iterator[SubtitleBlock]:
-    """The blocks of an SRT file in order; those without a line of times are left out."""
+    """The blocks of an SRT file in order; those without a line of times are left out, and so is the
+    last one of a file that ends within it: its last number may be cut."""
     text = _decoded(data)
     latitude_first = _latitude_first(text)
-    for part in re.split(r"\n\s*\n", text.replace("\r\n", "\n")):
+    parts = re.split(r"\n\s*\n", text.replace("\r\n", "\n"))
+    if not text.endswith(("\n", *_ENDS)):
+        parts.pop()
+    for part in parts:
         times = _TIMES.search(part)
         if times:
             start, end = _ns(times.groups()[:4]), _ns(times.groups()[4:])
@@ -153,6 +159,7 @@ def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> S
     altitude = fields.get("abs_alt", fields.get("altitude", math.nan))
     if not (abs(lat) <= 90 and abs(lon) <= 360):
         lat = lon = math.nan
+    height, altitude = measured(height), measured(altitude)
     return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
 
 

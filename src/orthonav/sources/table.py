@@ -8,7 +8,13 @@ from orthonav.errors import FlightError
 from orthonav.flight.folder import number_of, time_ns_of
 from orthonav.geo.swapped import swapped_hint
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
-from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_of_angles
+from orthonav.sources.track import (
+    RecordedTrack,
+    Samples,
+    TimeSeries,
+    attitude_of_angles,
+    measured,
+)
 from orthonav.tables import TableError, TableRows
 
 NEEDED = ("time_s", "pitch_deg", "roll_deg")
@@ -24,6 +30,7 @@ _NAMES = {
     "tilt_std": ("tilt_std_deg",),
     "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
 }
+_HEIGHTS = ("height", "home", "amsl", "hae")
 
 
 def read_table(path: Path) -> RecordedTrack:
@@ -57,7 +64,10 @@ def read_table(path: Path) -> RecordedTrack:
                 if placed:
                     position.add(time_ns, *_position(row, rows.line, path), math.nan)
                 for name, columns in held.items():
-                    others[name].add(time_ns, *(number_of(row.get(column)) for column in columns))
+                    values = [number_of(row.get(column)) for column in columns]
+                    if name in _HEIGHTS:
+                        values = [measured(value) for value in values]
+                    others[name].add(time_ns, *values)
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
     return _track(attitude, position, others, path)

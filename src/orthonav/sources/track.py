@@ -285,5 +285,10 @@ def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
     return np.full(width, np.nan) if series is None else series.at(time_ns)
 
 
+def measured(height_m: float) -> float:
+    """A height, NaN for 0, which recorders write where they measured none."""
+    return math.nan if height_m == 0 else height_m
+
+
 def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None

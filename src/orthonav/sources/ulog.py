@@ -39,13 +39,14 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
     """
     core = needed("pyulog.core", "PX4 logs")
     with reading("PX4 log", path, silent=True), path.open("rb") as stream:
-        log = core.ULog(stream, _TOPICS)
+        log = _watched(core.ULog)(stream, _TOPICS)
         topics: dict[str, Columns] = {one.name: one.data for one in reversed(log.data_list)}
         gps = topics.get("vehicle_gps_position") or topics.get("sensor_gps") or {}
         shift_us = _utc_shift_us(gps)
         attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
         if attitude is None:
-            raise FlightError(f"PX4 log has no attitude (vehicle_attitude): {path}")
+            damaged = "" if log.damaged_us is None else ", and is damaged"
+            raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")
         position = _position(gps, topics, shift_us)
         return RecordedTrack(
             attitude=attitude,
@@ -56,7 +57,37 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
             position=position,
             velocity=_velocity(topics.get("vehicle_local_position", {}), shift_us),
             origin_ns=int(attitude.time_ns[0]),
+            warnings=_damage(log.damaged_us, int(attitude.time_ns[0]), shift_us),
         )
+
+
+def _watched(reader: type[Any]) -> type[Any]:
+    """The reader of pyulog, which notes the time of the message at which it finds corruption."""
+
+    class WatchedULog(reader):  # type: ignore[misc]
+        damaged_us: int | None = None
+
+        @property
+        def _file_corrupt(self) -> bool:
+            return self.damaged_us is not None
+
+        @_file_corrupt.setter
+        def _file_corrupt(self, found: bool) -> None:
+            if found and self.damaged_us is None:
+                self.damaged_us = getattr(self, "_last_timestamp", 0)
+
+    return WatchedULog
+
+
+def _damage(damaged_us: int | None, first_ns: int, shift_us: int) -> tuple[str, ...]:
+    """A warning about the time from which a log is damaged, after its first attitude."""
+    if damaged_us is None:
+        return ()
+    after_s = max(0.0, ((damaged_us + shift_us) * 1000 - first_ns) / 1e9)
+    return (
+        f"log is damaged from {after_s:.1f} s after its first attitude: views from then on may "
+        "lack telemetry",
+    )
 
 
 def _utc_shift_us(gps: Columns) -> int:

@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
-from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.logs import log_kind, read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
-    fitted,
+    given_camera,
     known_at,
     warnings_of,
     with_mean_velocities,
@@ -47,11 +46,13 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if width < 1 or height < 1 or not capture.grab():
             raise FlightError(f"video has no frame: {path}")
-    if options.camera is None:
-        raise CameraError(f"the camera of a video is unknown; give --camera FILE: {path}")
-    camera = fitted(read_camera_file(options.camera), width, height, str(path))
+    camera = given_camera(options, width, height, str(path))
+    if camera is None:
+        raise CameraError(
+            f"the camera of a video is unknown; give --camera FILE or --fov-deg: {path}"
+        )
     last_ns = round((frames - 1) / fps * 1e9) if fps > 0 and frames > 0 else 0
-    track, telemetry_path = _track(path, last_ns, options)
+    track, telemetry_path, warnings = _track(path, last_ns, options)
     return Recording(
         kind="video",
         path=path,
@@ -59,13 +60,15 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         note=f"video {path.name}, telemetry of {telemetry_path.name}",
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=lambda: with_mean_velocities(_views(path, track, options), track),
-        warnings=tuple(warnings_of(track, options)),
+        warnings=(*warnings, *warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
 
 
-def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[RecordedTrack, Path]:
-    """The telemetry of a video, and its file."""
+def _track(
+    path: Path, last_ns: int, options: SourceOptions
+) -> tuple[RecordedTrack, Path, list[str]]:
+    """The telemetry of a video, its file, and a warning where it ends early."""
     beside = [path.with_suffix(suffix) for suffix in SIDECARS]
     telemetry_path = options.telemetry or next((one for one in beside if one.is_file()), None)
     if telemetry_path is None:
@@ -75,13 +78,14 @@ def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[RecordedTr
     track = read_log(telemetry_path, options.mount_deg)
     start_ns = track.origin_ns + options.time_offset_ns
     check_overlap(track, start_ns, start_ns + last_ns, telemetry_path)
+    warnings: list[str] = []
     short_ns = start_ns + last_ns - end_ns(track)
     if log_kind(telemetry_path) in ("srt", "table") and short_ns > _SHORT_NS:
-        raise FlightError(
-            f"telemetry ends {short_ns / 1e9:.1f} s before the video of {last_ns / 1e9:.1f} s: "
-            f"{telemetry_path}"
+        warnings.append(
+            f"telemetry ends {short_ns / 1e9:.1f} s before the video of {last_ns / 1e9:.1f} s; "
+            f"views after its end have none: {telemetry_path}"
         )
-    return track, telemetry_path
+    return track, telemetry_path, warnings
 
 
 def _views(path: Path, track: RecordedTrack, options: SourceOptions) -> Iterator[SourceView]:

@@ -14,12 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.geo.camera import enu_from_camera
+from orthonav.sources.track import measured
 
 _VALUE = re.compile(
-    r"\b(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
-    r"([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d{1,2})?)\s*[\"'<]"
+    r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
 )
-"""Whole values only: the beginning of a fraction or of a decimal comma is another number."""
+_NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
+"""A number with a decimal point or comma, or a fraction."""
+_ANGLE_OR_PLACE = re.compile(
+    r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
+)
+"""Values that a view is worse off without."""
 _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
     r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
@@ -36,14 +42,23 @@ class Xmp:
     """UTC at exposure."""
     writer: str
     """Program that wrote the packet, empty where it is not named."""
+    unread: tuple[str, ...] = ()
+    """Angles, heights and positions that are not numbers, as name and value."""
 
     @classmethod
     def of(cls, packet: str | bytes) -> "Xmp":
         """The values in a packet, which may be empty."""
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
-        values = {f"{maker}:{name}": float(value) for maker, name, value in _VALUE.findall(text)}
+        texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(text)}
+        found = {name: _number(value) for name, value in texts.items()}
+        values = {name: value for name, value in found.items() if math.isfinite(value)}
+        unread = tuple(
+            f"{name}={texts[name]!r:.40}"
+            for name in found.keys() - values.keys()
+            if _ANGLE_OR_PLACE.match(name.partition(":")[2])
+        )
         writer = _WRITER.search(text)
-        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "")
+        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
 
     def first(self, *names: str) -> float:
         """The first of these values that is there, else NaN."""
@@ -66,7 +81,9 @@ class Xmp:
         return self._angles("drone-dji:Gimbal{}Degree") or self._angles("drone:Gimbal{}Degree")
 
     def body_yaw_deg(self) -> float:
-        """Heading of the aircraft."""
+        """Heading of the aircraft; NaN where a gimbal has another one that cannot be read."""
+        if any("Gimbal" in value for value in self.unread):
+            return math.nan
         return self.first("drone-dji:FlightYawDegree", "drone:FlightYawDegree")
 
     def rotation(self, make: str) -> NDArray[np.float64] | None:
@@ -92,7 +109,9 @@ class Xmp:
 
     def home_m(self) -> float:
         """Height above the place of take-off."""
-        return self.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
+        return measured(
+            self.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
+        )
 
     def hae_m(self) -> float:
         """Height above the ellipsoid: of RTK, or as senseFly writes it."""
@@ -103,6 +122,15 @@ class Xmp:
     def _angles(self, pattern: str) -> tuple[float, float, float] | None:
         yaw, pitch, roll = (self.first(pattern.format(name)) for name in ("Yaw", "Pitch", "Roll"))
         return (yaw, pitch, roll) if math.isfinite(yaw + pitch + roll) else None
+
+
+def _number(text: str) -> float:
+    """The number in a text, NaN where it is none."""
+    found = _NUMBER.fullmatch(text)
+    if found is None:
+        return math.nan
+    over, under = (float((part or "1").replace(",", ".")) for part in found.groups())
+    return over / under if under else math.nan
 
 
 def _exposed_ns(text: str) -> int | None:

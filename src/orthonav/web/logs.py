@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.errors import FlightError, MissingFileError, OrthonavError
+from orthonav.files import require_file
 from orthonav.flight import decode_image
 from orthonav.flight.fixes import result_from_json
 from orthonav.flight.logged import (
@@ -206,7 +207,7 @@ def run_files(path: Path, *, live: bool) -> list[Path]:
     Raises `MissingFileError` or `FlightError` where there is none, unless `live`.
     """
     if path.is_file():
-        return files_of_run(path)
+        return files_of_run(require_file(path, "flight log"))
     if path.is_dir() and not live:
         found = files_of_run(path)
         if not found:

@@ -1,6 +1,7 @@
 """Routes as tables: CSV with comma, semicolon or tab, one waypoint a row."""
 
 import io
+import re
 from typing import Any
 
 from orthonav.errors import RouteError
@@ -11,13 +12,19 @@ from orthonav.tables import MAX_LINE_CHARS, TableError, TableRows
 _LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
 _LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
 _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
-    ("agl", ("agl_m", "agl")),
+    ("agl", ("agl_m", "agl", "altitude_agl_m", "altitudeagl")),
     ("home", ("home_m", "height_above_home_m")),
-    ("amsl", ("amsl_m", "amsl", "altitude_amsl_m")),
+    ("amsl", ("amsl_m", "amsl", "altitude_amsl_m", "altitudeamsl")),
     ("hae", ("hae_m",)),
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
 _BAND = ("band_m",)
+_MODE = ("altitudemode", "altitude_mode")
+"""Column of Litchi."""
+_FRAME_OF_MODE: dict[float, HeightFrame] = {0: "home", 1: "agl"}
+_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")
+"""Unit that ends the name of a column, as in altitude(m)."""
+_METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
 
 
 def read_delimited(data: bytes) -> list[Route]:
@@ -31,7 +38,7 @@ def read_delimited(data: bytes) -> list[Route]:
     delimiter = max(",;\t", key=header.count)
     try:
         table = TableRows(stream, delimiter=delimiter)
-        names = {name.strip().lower(): name for name in table.columns}
+        names = {_UNIT.sub("", name.strip().lower()): name for name in table.columns}
         rows = []
         for row in table:
             rows.append(row)
@@ -64,10 +71,40 @@ def _heights(
     for frame, aliases in _HEIGHTS:
         column = _column(names, aliases)
         if column is not None:
+            factor = _metres_of(str(column))
+            frames = _frames(names, rows, comma) if frame is None else [frame] * len(rows)
             found = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
-            heights = tuple(None if value is None else Height(value, frame) for value in found)
+            heights = tuple(
+                None if value is None else Height(factor * value, each)
+                for value, each in zip(found, frames, strict=True)
+            )
             return heights if any(heights) else ()
     return ()
+
+
+def _metres_of(column: str) -> float:
+    """Metres of the unit in the name of a column of heights, which are metres without one."""
+    unit = _UNIT.search(column.strip().lower())
+    if unit is not None and unit[1] not in _METRES:
+        raise RouteError(f"heights must be in m or ft, got the column {column!r:.60}")
+    return 1.0 if unit is None else _METRES[unit[1]]
+
+
+def _frames(
+    names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
+) -> list[HeightFrame | None]:
+    """Reference of the height of each row, by its altitude mode; None without such a column."""
+    column = _column(names, _MODE)
+    if column is None:
+        return [None] * len(rows)
+    modes = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
+    for line, mode in enumerate(modes, 2):
+        if mode is not None and mode not in _FRAME_OF_MODE:
+            raise RouteError(
+                f"row {line}, {column}: must be 0 (above take-off) or 1 (above ground), got "
+                f"{mode:g}"
+            )
+    return [None if mode is None else _FRAME_OF_MODE[mode] for mode in modes]
 
 
 def _bands_m(

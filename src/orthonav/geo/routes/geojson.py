@@ -7,6 +7,7 @@ ellipsoid is hardly ever meant, so without it that is taken as not said); `home_
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 from orthonav.errors import RouteError
@@ -21,7 +22,8 @@ def read_geojson(data: bytes) -> list[Route]:
 
 def routes_of(plain: dict[str, Any]) -> list[Route]:
     """All lines of a GeoJSON object, in order. Raises `RouteError` if there is none."""
-    found, others = [], set()
+    found: list[Route] = []
+    others: list[tuple[str, str]] = []
     for geometry, properties in _geometries(plain):
         kind = geometry.get("type")
         if kind == "LineString":
@@ -30,11 +32,13 @@ def routes_of(plain: dict[str, Any]) -> list[Route]:
             joined = [point for part in geometry["coordinates"] for point in part]
             found.append(_route(joined, properties))
         elif kind not in ("Feature", "FeatureCollection", "GeometryCollection"):
-            others.add(str(kind)[:40])
+            others.append((str(kind)[:40], str(properties.get("name") or "(no name)")[:40]))
     if not found:
-        held = f"it holds {', '.join(sorted(others))}" if others else "it is empty"
+        kinds = sorted({kind for kind, _ in others})
+        held = f"it holds {', '.join(kinds)}" if kinds else "it is empty"
         raise RouteError(f"GeoJSON holds no LineString; {held}")
-    return found
+    points = tuple(f"{kind} {name}" for kind, name in others if kind.endswith("Point"))
+    return [replace(route, left_out=points) for route in found]
 
 
 def to_geojson(routes: Sequence[Route]) -> str:

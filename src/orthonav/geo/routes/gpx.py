@@ -1,6 +1,7 @@
 """Routes as GPX 1.0 and 1.1 (topografix.com/GPX/1/1): routes, else tracks."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from xml.etree.ElementTree import Element
 
 from orthonav.errors import RouteError
@@ -25,7 +26,14 @@ def read_gpx(data: bytes) -> list[Route]:
         held = f"only {waypoints} waypoints (wpt) without an order" if waypoints else "nothing else"
         raise RouteError(f"GPX holds no route (rte) and no track (trk); it holds {held}")
     # Planned routes take precedence over recorded tracks.
-    return [route for route in routes if route is not None] or found
+    planned = [route for route in routes if route is not None]
+    lost = [f"waypoint {_name(each)}" for each in root.iterfind("wpt")]
+    lost += [f"track {_name(each)}" for each in root.iterfind("trk") if planned]
+    return [replace(route, left_out=tuple(lost)) for route in planned or found]
+
+
+def _name(element: Element) -> str:
+    return f"{text_of(element, 'name') or '(no name)':.40}"
 
 
 def _route(element: Element, points: Iterable[Element]) -> Route | None:

@@ -5,6 +5,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
 from xml.etree.ElementTree import Element
 
@@ -60,16 +61,22 @@ def read_kml(data: bytes) -> list[Route]:
     root = read_markup(data, "KML")
     if root.tag != "kml":
         raise RouteError(f"KML must begin with <kml>, got <{root.tag:.40}>")
-    found = [route for mark in root.iter("Placemark") for route in _routes(mark)]
+    marks = list(root.iter("Placemark"))
+    found = [route for mark in marks for route in _routes(mark)]
     if found:
-        return found
+        points = tuple(_point_name(mark) for mark in marks if mark.find(".//Point") is not None)
+        return [replace(route, left_out=points) for route in found]
     if any(element.tag == "missionConfig" for element in root.iter()):
         raise RouteError(
             "KML is the template of a DJI mission; give its waylines.wpml, or the whole KMZ"
         )
-    kinds = sorted({each.tag for mark in root.iter("Placemark") for each in mark.iter()})
+    kinds = sorted({each.tag for mark in marks for each in mark.iter()})
     held = [kind for kind in kinds if kind in _POINTLESS] or ["no placemark with a geometry"]
     raise RouteError(f"KML holds no LineString and no gx:Track; it holds {', '.join(held)}")
+
+
+def _point_name(mark: Element) -> str:
+    return f"point {text_of(mark, 'name') or '(no name)'!s:.40}"
 
 
 def _routes(mark: Element) -> list[Route]:

@@ -8,14 +8,28 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from orthonav.errors import RouteError
-from orthonav.geo.routes.record import Height, HeightFrame, Route
+from orthonav.geo.routes.record import MAX_NAMED, Height, HeightFrame, Route
 
 WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 84, 85
-_LOITERS = (17, 18, 19, 31)
-_ARC, _SPLINE, _PLACE = 36, 82, 94
-FLOWN = {WAYPOINT, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND, *_LOITERS, _ARC, _SPLINE, _PLACE}
-"""Commands with a position that the aircraft flies to. All others (cameras, regions of interest,
-speeds, jumps, conditions, landing markers) do not change the route."""
+_CIRCLES = (17, 18, 19, 31, 34)
+_ARC, _SPLINE, _PLACE, _REPOSITION = 36, 82, 94, 192
+_OF_USERS = range(31000, 31005)
+FLOWN = {
+    *(WAYPOINT, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND),
+    *(*_CIRCLES, _ARC, _SPLINE, _PLACE, _REPOSITION, *_OF_USERS),
+}
+"""Commands with a position that the aircraft flies to."""
+_NOT_FLOWN = {
+    *(80, 83, 92, 93, 95),  # regions of interest, delays
+    *range(112, 160),  # conditions
+    *range(176, 301),  # servos, speeds, cameras, gimbals, jumps, landing markers, home, fences
+    *range(400, 3001),  # the vehicle's state, gimbals, cameras, payloads
+    *(4000, 4001, 4501, *range(5000, 5101)),  # gates, fences, rally points
+    *range(31005, 31010),  # positions that are not flown through
+    *range(42000, 44000),  # of ArduPilot
+}
+"""Commands that do not change the route, although some state a position, or use its numbers for
+something else."""
 _HEIGHT_FRAMES: dict[int, HeightFrame] = {
     0: "amsl",
     5: "amsl",
@@ -31,8 +45,9 @@ class MissionItem:
     """A mission item.
 
     `command`: MAV_CMD. `frame`: MAV_FRAME, the reference of `height_m`. `lat_deg`, `lon_deg`:
-    position, None if it has none. `pattern`: number shared by all items of one survey or corridor,
-    which is flown as a whole. `band_m`: search band between items of one pattern.
+    position, None if it has none. `number`: of the item in its file. `pattern`: number shared by
+    all items of one survey or corridor, which is flown as a whole. `band_m`: search band between
+    items of one pattern.
     """
 
     command: int
@@ -40,6 +55,7 @@ class MissionItem:
     lat_deg: float | None
     lon_deg: float | None
     height_m: float | None = None
+    number: int = 0
     pattern: int | None = None
     band_m: float | None = None
 
@@ -67,24 +83,29 @@ def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
     """The route of a mission. Raises `RouteError` if no item has a position.
 
     As in autopilots, a position of 0, 0 or none means the current position, so a take-off without
-    a position is at home. A return to launch ends the route at home; later items are ignored. Jumps
-    are not followed; a circle is replaced by its centre.
+    a position is at home. A return to launch ends the route at home. Jumps are not followed; a
+    circle is replaced by its centre. Items with a position that are left out are named: those after
+    the return, and those whose command is not known.
     """
     stops: list[MissionItem] = []
-    for item in items:
+    left_out: list[str] = []
+    remaining = iter(items)
+    for item in remaining:
         if item.command == RETURN_HOME:
             if home is not None:
                 stops.append(_at_home(home))
             break
-        if item.command not in FLOWN:
-            continue
-        if _has_place(item):
+        if item.command in FLOWN and _has_place(item):
             height_frame(item.frame)
             stops.append(item)
         elif item.command in (TAKEOFF, VTOL_TAKEOFF) and home is not None:
             stops.append(_at_home(home))
+        elif _is_lost(item):
+            left_out.append(_named(item))
+    left_out += [f"{_named(item)} after the return" for item in remaining if _is_lost(item)]
     if not stops:
-        raise RouteError("mission holds no waypoint with a position")
+        held = f"; left out are {', '.join(left_out[:MAX_NAMED])}" if left_out else ""
+        raise RouteError(f"mission holds no waypoint with a position{held}")
     heights = tuple(_height(stop) for stop in stops)
     bands = tuple(
         start.band_m if start.pattern is not None and start.pattern == end.pattern else None
@@ -95,6 +116,7 @@ def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
         heights if any(heights) else (),
         bands if any(bands) else (),
         home_amsl_m=None if home is None else home.amsl_m,
+        left_out=tuple(left_out),
     )
 
 
@@ -106,6 +128,15 @@ def _has_place(item: MissionItem) -> bool:
     if item.lat_deg is None or item.lon_deg is None:
         return False
     return item.lat_deg != 0 or item.lon_deg != 0
+
+
+def _is_lost(item: MissionItem) -> bool:
+    """Whether an item that is left out may be flown to."""
+    return (item.command in FLOWN or item.command not in _NOT_FLOWN) and _has_place(item)
+
+
+def _named(item: MissionItem) -> str:
+    return f"item {item.number} (command {item.command})"
 
 
 def _height(item: MissionItem) -> Height | None:

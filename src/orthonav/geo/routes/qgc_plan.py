@@ -58,7 +58,7 @@ def _items(raw: Any, index: int) -> list[MissionItem]:
         raise RouteError(f"{where} must be an object, got {raw!r:.60}")
     kind = raw.get("type")
     if kind == "SimpleItem":
-        return [_simple(raw, where)]
+        return [_simple(raw, index + 1, where)]
     if kind != "ComplexItem":
         raise RouteError(f"{where} must be a SimpleItem or a ComplexItem, got {kind!r:.40}")
     name = raw.get("complexItemType")
@@ -73,7 +73,7 @@ def _items(raw: Any, index: int) -> list[MissionItem]:
     )
 
 
-def _simple(raw: dict[str, Any], where: str) -> MissionItem:
+def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
     params = raw.get("params")
     place = params[4:7] if isinstance(params, list) and len(params) >= 7 else raw.get("coordinate")
     if not isinstance(place, list) or len(place) < 3:
@@ -82,7 +82,7 @@ def _simple(raw: dict[str, Any], where: str) -> MissionItem:
     lat, lon, height = (number_or_none(value, f"{where}: params") for value in place[:3])
     if raw.get("AltitudeMode") == _ABOVE_TERRAIN_MODE:
         frame, height = _TERRAIN, number_or_none(raw.get("Altitude"), f"{where}: Altitude")
-    return MissionItem(command, frame, lat, lon, height)
+    return MissionItem(command, frame, lat, lon, height, item)
 
 
 def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]:

@@ -1,6 +1,7 @@
 """A planned route, independent of its file format."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +20,18 @@ MAX_BAND_M = 50_000.0
 """Width of the largest sheet."""
 MAX_WAYPOINTS = 100_000
 """Sanity limit against files that exhaust memory."""
+
+
+MAX_NAMED = 12
+
+
+def left_out_text(left_out: Sequence[str]) -> str:
+    """A sentence that names what a route leaves out."""
+    more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
+    return (
+        "positions that are not part of the route, so the map may not cover them: "
+        f"{', '.join(left_out[:MAX_NAMED])}{more}"
+    )
 
 
 def require_few_waypoints(count: int) -> None:
@@ -65,6 +78,7 @@ class Route:
       if the file has none.
     - `name`: name of the line in its file, None if it has none.
     - `home_amsl_m`: height of the take-off position above mean sea level, metres, None if unknown.
+    - `left_out`: what of the file has a position and is not part of the route, by name.
     """
 
     waypoints: tuple[tuple[float, float], ...]
@@ -72,6 +86,7 @@ class Route:
     leg_bands_m: tuple[float | None, ...] = ()
     name: str | None = None
     home_amsl_m: float | None = None
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.waypoints:

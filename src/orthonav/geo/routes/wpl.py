@@ -2,21 +2,23 @@
 
 A line an item, twelve numbers: index, current, frame, command, four parameters, latitude,
 longitude, altitude, autocontinue (mavlink.io, "Mission Plain-Text File Format"). In version 110 the
-first item is the planned home position, in the older 120 of QGroundControl there is none
-(QGroundControl, `MissionController::_loadTextMissionFile`).
+first item, with number 0, is the planned home position, in the older 120 of QGroundControl there is
+none (QGroundControl, `MissionController::_loadTextMissionFile`).
 """
 
 import io
 from collections.abc import Iterator
 
 from orthonav.errors import RouteError
-from orthonav.geo.routes.mission import Home, MissionItem, route_of
+from orthonav.geo.routes.mission import WAYPOINT, Home, MissionItem, route_of
 from orthonav.geo.routes.record import Route, require_few_waypoints
 from orthonav.geo.routes.values import decoded, parsed
 from orthonav.tables import TableError, bounded_lines
 
 _COLUMNS = 12
 _MAGIC = b"QGC WPL"
+_HOMES = (0, WAYPOINT, 179)
+"""Commands of the home position: none, a waypoint, or one that sets it."""
 
 
 def is_wpl(data: bytes) -> bool:
@@ -38,7 +40,7 @@ def read_wpl(data: bytes) -> list[Route]:
     except TableError as error:
         raise RouteError(f"waypoint file cannot be read ({error})") from error
     home = None
-    if version[2] == "110" and items:
+    if version[2] == "110" and items and items[0].number == 0 and items[0].command in _HOMES:
         first, *items = items
         if first.lat_deg or first.lon_deg:
             home = Home(first.lat_deg or 0.0, first.lon_deg or 0.0, first.height_m)
@@ -57,15 +59,16 @@ def _item(values: list[str], line: int) -> MissionItem:
         raise RouteError(
             f"line {line} of the waypoint file has {len(values)} values, expected {_COLUMNS}"
         )
-    frame, command = (_whole(values[index], line) for index in (2, 3))
+    number, frame, command = (_whole(values[index], line) for index in (0, 2, 3))
     lat_deg, lon_deg, height_m = (
         parsed(values[index], f"line {line}, column {index + 1}") for index in (8, 9, 10)
     )
-    return MissionItem(command, frame, lat_deg, lon_deg, height_m)
+    return MissionItem(command, frame, lat_deg, lon_deg, height_m, number)
 
 
 def _whole(text: str, line: int) -> int:
-    value = parsed(text, f"line {line}: frame and command")
+    what = f"line {line}: number, frame and command"
+    value = parsed(text, what)
     if value != int(value):
-        raise RouteError(f"line {line}: frame and command must be whole numbers, got {text!r:.40}")
+        raise RouteError(f"{what} must be whole numbers, got {text!r:.40}")
     return int(value)

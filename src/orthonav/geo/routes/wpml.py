@@ -4,6 +4,7 @@ https://developer.dji.com/doc/cloud-api-tutorial/en/api-reference/dji-wpml/wayli
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from xml.etree.ElementTree import Element
 
 from orthonav.errors import RouteError
@@ -27,10 +28,22 @@ def read_wpml(data: bytes) -> list[Route]:
     root = read_markup(data, "WPML")
     if root.tag != "kml":
         raise RouteError(f"WPML must begin with <kml>, got <{root.tag:.40}>")
-    found = [route for folder in root.iter("Folder") for route in _routes(folder)]
+    folders = list(root.iter("Folder"))
+    found = [route for folder in folders for route in _routes(folder)]
     if not found:
         raise RouteError("WPML holds no wayline with waypoints")
-    return found
+    read = {mark for folder in folders for mark in _waypoints(folder)}
+    lost = [mark for mark in root.iter("Placemark") if _has_point(mark) and mark not in read]
+    names = tuple(f"placemark {text_of(mark, 'index') or '(no index)'!s:.40}" for mark in lost)
+    return [replace(route, left_out=names) for route in found]
+
+
+def _has_point(mark: Element) -> bool:
+    return mark.find("Point") is not None
+
+
+def _waypoints(folder: Element) -> list[Element]:
+    return [mark for mark in folder.iterfind("Placemark") if _has_point(mark)]
 
 
 def _routes(folder: Element) -> Iterator[Route]:
@@ -40,7 +53,7 @@ def _routes(folder: Element) -> Iterator[Route]:
             f"WPML executeHeightMode must be {', '.join(_HEIGHT_FRAMES)}, got {mode!r:.60}"
         )
     frame = None if mode is None else _HEIGHT_FRAMES[mode]
-    marks = [mark for mark in folder.iterfind("Placemark") if mark.find("Point") is not None]
+    marks = _waypoints(folder)
     require_few_waypoints(len(marks))
     marks.sort(key=_index)
     if marks:

@@ -1,0 +1,162 @@
+"""Single photographs, and folders of images that a table describes by file name."""
+
+import math
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from recorders import dji, photo, picture, place
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.sources import SourceOptions, open_source
+
+FOV = SourceOptions(fov_deg=60.0)
+
+
+@pytest.fixture
+def images(tmp_path):
+    """Three images without metadata."""
+    folder = tmp_path / "images"
+    (folder / "sub").mkdir(parents=True)
+    for number, name in enumerate(("a.png", "sub/b.jpg", "c.png")):
+        cv2.imwrite(str(folder / name), picture(number))
+    return folder
+
+
+def views_of(folder, table, options=FOV):
+    (folder / "poses.csv").write_text(table)
+    recording = open_source(folder, options)
+    return SimpleNamespace(
+        warnings="\n".join(recording.warnings), by={view.frame: view for view in recording.views}
+    )
+
+
+def angles(view):
+    now = view.telemetry
+    return now.yaw_deg, now.pitch_deg, now.roll_deg, now.agl_m
+
+
+def test_a_table_beside_images_is_found(images):
+    table = (
+        "filename,time,yaw,pitch,roll,agl,lat,lon\n"
+        "a.png,2024-05-01T10:00:01.5Z,370,1,-2,120,46.5,2.5\n"
+        "sub/b.jpg,1714557600,20,0,0,121,46.5001,2.5\n"
+        "c.png,2024:05:01 10:00:03,30,0,0,122,,\n"
+    )
+    found = views_of(images, table)
+    assert list(found.by) == ["sub/b.jpg", "a.png", "c.png"], "by time"
+    assert angles(found.by["a.png"]) == (10, 1, -2, 120) and found.warnings == ""
+    assert found.by["a.png"].telemetry.time_ns == 1_714_557_601_500_000_000
+    assert found.by["a.png"].truth_latlon_deg == (46.5, 2.5)
+    assert found.by["c.png"].truth_latlon_deg is None
+    again = open_source(images / "poses.csv", FOV)
+    assert [view.frame for view in again.views] == list(found.by)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Image,Heading,Height",
+        "image_name,yaw_deg,agl_m",
+        "#Label,Azimuth [deg],Height above ground (m)",
+        "SourceFile,GimbalYawDegree,AGL",
+        "File Name,HDG,altitude_agl_m",
+        "photo,Camera Yaw,AltitudeAGL",
+    ],
+)
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_columns_by_many_names(images, header, delimiter):
+    rows = "a.png,20.5,120\n./sub/B.JPG,21,121\nC:\\dcim\\c.png,22,122\n"
+    found = views_of(images, f"{header}\n{rows}".replace(",", delimiter))
+    assert angles(found.by["a.png"]) == (20.5, 0, 0, 120)
+    assert angles(found.by["sub/b.jpg"]) == (21, 0, 0, 121)
+    assert angles(found.by["c.png"]) == (22, 0, 0, 122)
+    assert "pitch and roll of 3 of 3 photographs are not known" in found.warnings
+    assert "ordered by name" in found.warnings
+
+
+@pytest.mark.parametrize(
+    "column, pitch, expected, said",
+    [
+        ("pitch", -90, 0, True),
+        ("pitch", -80, 10, True),
+        ("pitch", 5, 5, False),
+        ("gimbal_pitch", -85, 5, False),
+        ("gimbal_pitch", -40, 50, False),
+    ],
+)
+def test_a_pitch_near_90_is_that_of_a_gimbal(images, column, pitch, expected, said):
+    found = views_of(images, f"file,yaw,{column},height\na,30,{pitch},120\n")
+    assert angles(found.by["a.png"]) == pytest.approx((30, expected, 0, 120), abs=1e-6)
+    assert ("taken as that of a gimbal" in found.warnings) == said
+
+
+def test_what_is_missing_is_named(images):
+    found = views_of(images, "file,lat,lon\na.png,46.5,2.5\nz.png,46.5,2.5\n")
+    assert "no column of heading (yaw or heading) and of height (agl or height)" in found.warnings
+    assert "2 of 3 photographs left out, not in the table, the first: c.png" in found.warnings
+    assert "1 rows of the table have no photograph" in found.warnings
+    zero = views_of(images, "file,yaw,agl\na.png,1,0\n")
+    assert math.isnan(zero.by["a.png"].telemetry.agl_m), "0 was not measured"
+
+
+def test_units_and_decimal_commas(images):
+    found = views_of(images, "file;yaw;height (ft)\na.png;20,5;1.000,0\n".replace("1.000", "1000"))
+    assert angles(found.by["a.png"]) == pytest.approx((20.5, 0, 0, 304.8))
+
+
+@pytest.mark.parametrize(
+    "table, message",
+    [
+        ("file,yaw\nx.png,1\n", "names none of the 3 photographs, such as a.png; it names x"),
+        ("file,yaw\na.png,north\n", "line 2: yaw is not a number, got 'north'"),
+        ("file,lat,lon\na.png,146.5,2.5\n", "line 2: not a latitude and longitude in degrees"),
+        ("file,time\na.png,noon\n", "line 2: time must be seconds or a date"),
+        ("file,yaw\na.png,1\na.png,2\n", "names 'a.png' twice"),
+        ("file,yaw\n", "names no image"),
+    ],
+)
+def test_tables_that_are_refused(images, table, message):
+    with pytest.raises(FlightError, match=message):
+        views_of(images, table)
+
+
+def test_several_tables_are_not_guessed(images):
+    for name in ("p.csv", "q.csv"):
+        (images / name).write_text("file,yaw\na.png,1\n")
+    with pytest.raises(FlightError, match=r"several tables of images \(p.csv, q.csv\)"):
+        open_source(images, FOV)
+    given = SourceOptions(fov_deg=60.0, telemetry=images / "p.csv")
+    assert [view.frame for view in open_source(images, given).views] == ["a.png"]
+
+
+def test_the_table_comes_before_metadata(tmp_path):
+    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5), xmp=dji(yaw=30, pitch=-80))
+    found = views_of(tmp_path / "p", "file,yaw,agl,lat,lon\na,77,99,47,3\n", SourceOptions())
+    assert angles(found.by["a.jpg"]) == pytest.approx((77, 10, 0, 99), abs=1e-6)
+    assert found.by["a.jpg"].truth_latlon_deg == (47, 3)
+
+
+def test_single_photographs(images):
+    options = SourceOptions(fov_deg=60.0, agl_m=120.0)
+    recording = open_source(images / "a.png", options)
+    (view,) = recording.views
+    assert view.telemetry.missing() == ["yaw_deg"] and view.telemetry.agl_m == 120
+    assert view.telemetry.tilt_std_deg == 6 and view.frame == "a.png"
+    assert recording.camera.fx_px == pytest.approx(32 / math.tan(math.radians(30)))
+    two = open_source([images / "c.png", images / "sub/b.jpg"], options)
+    assert [view.frame for view in two.views] == ["c.png", "sub/b.jpg"], "as they were given"
+    with pytest.raises(CameraError, match="--camera FILE or --fov-deg"):
+        open_source(images / "a.png")
+    (images / "a.txt").write_text("words")
+    with pytest.raises(FlightError, match="expected photographs"):
+        open_source([images / "a.png", images / "a.txt"], options)
+
+
+def test_a_height_that_is_given_replaces_the_recorded_one(tmp_path):
+    path = photo(tmp_path / "a.jpg", xmp=dji(height=80.0))
+    recording = open_source(path, SourceOptions(agl_m=120.0))
+    (view,) = recording.views
+    assert view.telemetry.agl_m == 120 and not any("level" in each for each in recording.warnings)
+    assert np.array_equal(view.grey(), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))

@@ -1,0 +1,51 @@
+"""What an interrupt says of the results that are written, and what it skips."""
+
+import shutil
+
+import pytest
+
+from orthonav.flight.fixes import read_results
+
+
+@pytest.fixture
+def turned(flight_path, tmp_path):
+    """Two views of a flight whose headings are off by 180 degrees."""
+    folder = shutil.copytree(flight_path, tmp_path / "turned")
+    header, *rows = (folder / "telemetry.csv").read_text().splitlines()
+    at = header.split(",").index("yaw_deg")
+    for number, row in enumerate(rows):
+        values = row.split(",")
+        values[at] = str((float(values[at]) + 180) % 360)
+        rows[number] = ",".join(values)
+    (folder / "telemetry.csv").write_text("\n".join([header, *rows[:2]]) + "\n")
+    return folder
+
+
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_an_interrupt_of_the_search_for_another_set_up_skips_it(
+    run, map_path, turned, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("orthonav.onboard.setups.try_setups", interrupted)
+    command = ["localize", map_path, turned, "--out", tmp_path / "fixes.jsonl"]
+    done = run(*command)
+    assert (done.code, done.err) == (0, "")
+    assert "! the search for another set-up was interrupted" in done.out
+    assert f"written to {tmp_path / 'fixes.jsonl'}" in done.out
+    assert len(read_results(tmp_path / "fixes.jsonl")) == 2
+    assert "!" not in run(*command, "--no-diagnosis").out
+
+
+def test_the_search_for_another_set_up_ends_in_time(run, map_path, turned, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.cli.setups.BUDGET_S", 0.0)
+    done = run("localize", map_path, turned, "--out", tmp_path / "fixes.jsonl")
+    assert done.code == 0 and "! the search for another set-up was ended after 0 s" in done.out
+
+
+def test_an_interrupt_names_what_is_written(run, map_path, flight_path, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.cli.localize.report_changes", interrupted)
+    fixes, cameras = tmp_path / "fixes.jsonl", tmp_path / "cameras.csv"
+    done = run("localize", map_path, flight_path, "--out", fixes, "--export", f"csv={cameras}")
+    assert done == (1, "", f"orthonav: error: interrupted; written: {fixes}, {cameras}\n")
