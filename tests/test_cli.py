@@ -650,7 +650,7 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     refused(simulated("--route", route, *low, "--spacing-m", "0"), "above 0")
     refused(simulated("--route", tmp_path / "no.csv", *low), "does not exist")
     refused(simulated(*random, *low, "--agl-std", "5"), "--agl-std must be", "0.05 is 5 %")
-    refused(simulated(*random, *low, "--yaw-std-deg", "nan"), "yaw_std_deg")
+    refused(simulated(*random, *low, "--yaw-std-deg", "nan"), "--yaw-std-deg must be")
     assert simulated(*random, *low, "--jpeg-quality", "500").code == 2
     refused(simulated(*random, *low, "--camera", tmp_path / "no.json"), "does not exist")
     no_crs = make_ortho(tmp_path / "no_crs.tif", crs=None)
@@ -664,7 +664,7 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
 
 def test_landscape_refuses(run, out, names_in):
     refused(run("landscape", "--out", out / "l", "--size-m", "-5", "5"), "--size-m must be")
-    refused(run("landscape", "--out", out / "l", "--gsd-m", "500"), "gsd_m")
+    refused(run("landscape", "--out", out / "l", "--gsd-m", "500"), "--gsd-m must be")
     (out / "file").write_text("in the way")
     refused(run("landscape", "--out", out / "file", "--size-m", "50", "50"), "cannot write")
     assert names_in(out) == ["file"]
