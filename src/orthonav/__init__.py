@@ -1,3 +1,77 @@
-"""orthonav: position fixes for aircraft without GNSS from a camera and an orthophoto."""
+"""Position fixes for aircraft without GNSS: a downward camera is compared with an orthophoto.
+
+    import cv2, orthonav
+
+    localizer = orthonav.Localizer(orthonav.open_map("area.onav"))
+    camera = orthonav.Camera.from_fov(65, 1280, 960)
+    fix = localizer.localize(cv2.imread("0100.jpg"), camera, agl_m=270, heading_deg=None)
+    if fix.is_confident:
+        print(fix.lat_deg, fix.lon_deg, fix.std_m, fix.heading_deg)
+
+`build_map` makes a map from orthophotos, `Tracker` follows a flight, `evaluate` compares fixes with
+the truth. The names in `__all__` are stable from version 0.2 on; modules below are not.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from orthonav.errors import OrthonavError
+    from orthonav.flight import FlightFolder, open_flight, read_truth
+    from orthonav.flight.fixes import read_results
+    from orthonav.geo.camera import Camera
+    from orthonav.localizer import Localizer, Tracker
+    from orthonav.mapfile import MapFile, open_map
+    from orthonav.prepare import BuildRequest, build_map
+    from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
+    from orthonav.simulate.flight import SimulateRequest, simulate_flight
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "CONFIDENT",
+    "BuildRequest",
+    "Camera",
+    "Fix",
+    "FlightFolder",
+    "Localizer",
+    "MapFile",
+    "NoFix",
+    "OrthonavError",
+    "Prior",
+    "SimulateRequest",
+    "Telemetry",
+    "Tracker",
+    "View",
+    "ViewResult",
+    "build_map",
+    "open_flight",
+    "open_map",
+    "read_results",
+    "read_truth",
+    "simulate_flight",
+]
+_HOMES = {
+    **dict.fromkeys(("BuildRequest", "build_map"), "prepare"),
+    **dict.fromkeys(("CONFIDENT", "Fix", "NoFix", "Prior"), "records"),
+    **dict.fromkeys(("Telemetry", "View", "ViewResult"), "records"),
+    **dict.fromkeys(("FlightFolder", "open_flight", "read_truth"), "flight"),
+    **dict.fromkeys(("Localizer", "Tracker"), "localizer"),
+    **dict.fromkeys(("MapFile", "open_map"), "mapfile"),
+    **dict.fromkeys(("SimulateRequest", "simulate_flight"), "simulate.flight"),
+    "Camera": "geo.camera",
+    "OrthonavError": "errors",
+    "read_results": "flight.fixes",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is used first."""
+    if name not in _HOMES:
+        raise AttributeError(f"module orthonav has no attribute {name}; see orthonav.__all__")
+    globals()[name] = found = getattr(import_module(f"orthonav.{_HOMES[name]}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

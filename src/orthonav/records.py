@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +126,54 @@ class View:
         object.__setattr__(self, "grey", grey)
         object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
 
+    @classmethod
+    def of(
+        cls,
+        image: NDArray[Any],
+        camera: Camera,
+        *,
+        agl_m: float,
+        heading_deg: float | None = None,
+        pitch_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        time_s: float = 0.0,
+        prior: Prior | None = None,
+        heading_std_deg: float | None = None,
+        agl_std_m: float | None = None,
+        tilt_std_deg: float | None = None,
+        vel_en_mps: tuple[float, float] | None = None,
+    ) -> "View":
+        """A view of an image (H, W), (H, W, 3) BGR or (H, W, 4), see `orthonav.grey.grey_levels`.
+
+        `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
+        north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
+        `time_s`: of the exposure. The standard deviations are those of `Telemetry`.
+        """
+        heading = math.nan if heading_deg is None else float(heading_deg)
+        return cls(
+            image,
+            camera,
+            Telemetry(
+                round(time_s * 1e9),
+                heading,
+                float(pitch_deg),
+                float(roll_deg),
+                float(agl_m),
+                yaw_std_deg=heading_std_deg,
+                agl_std_m=agl_std_m,
+                prior=prior,
+                vel_en_mps=vel_en_mps,
+                tilt_std_deg=tilt_std_deg,
+            ),
+        )
+
+    def __repr__(self) -> str:
+        told = self.telemetry
+        return (
+            f"View({self.camera.width_px} x {self.camera.height_px} px, heading "
+            f"{told.yaw_deg:.1f} deg, {told.agl_m:.1f} m above ground)"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Fix:
@@ -154,6 +203,22 @@ class Fix:
     pose_cov: NDArray[np.float64] | None = None
     """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None
     where the six were not estimated together."""
+
+    @property
+    def is_confident(self) -> bool:
+        """Whether the position may be relied on: a confidence of `CONFIDENT` or more."""
+        return self.confidence >= CONFIDENT
+
+    @property
+    def std_m(self) -> float:
+        """Standard deviation of the position along the worst direction, m."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.cov_en_m2)[-1]))
+
+    def __repr__(self) -> str:
+        return (
+            f"Fix({self.lat_deg:.6f}, {self.lon_deg:.6f}, std {self.std_m:.1f} m, confidence "
+            f"{self.confidence:.2f}, heading {self.heading_deg:.1f} deg)"
+        )
 
     def tilt_deg(self, telemetry: Telemetry) -> tuple[float, float]:
         """Pitch and roll of the camera of a view with this telemetry: those of the fix, else the
@@ -185,6 +250,14 @@ class NoFix:
     detail: str
     evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
 
+    is_confident = False
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __repr__(self) -> str:
+        return f"NoFix({self.reason}: {self.detail})"
+
 
 @dataclass(frozen=True, eq=False)
 class ViewResult:
@@ -208,4 +281,4 @@ class ViewResult:
         """Whether the position may be relied on; any other fix is the best guess."""
         if not isinstance(self.outcome, Fix):
             return False
-        return self.outcome.confidence >= CONFIDENT if self.accepted is None else self.accepted
+        return self.outcome.is_confident if self.accepted is None else self.accepted

@@ -8,8 +8,10 @@ positive roll makes it look left.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,8 @@ from orthonav.geo import lens
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
+FOV_STD = 0.02
+"""Of a focal length by a stated field of view, as a share of it."""
 _BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
 _HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 _BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -70,6 +74,48 @@ class Camera:
                 f"camera distortion of a {self.model} lens must be empty or {names}, "
                 f"got {self.distortion}"
             )
+
+    @classmethod
+    def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
+        """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
+
+        The focal length of a data sheet is seldom better than 2 %, which is what is stated.
+        """
+        if not 0 < fov_deg < 180:
+            raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
+        focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
+        middle_px = width_px / 2, height_px / 2
+        return cls(width_px, height_px, focal_px, focal_px, *middle_px, focal_std=FOV_STD)
+
+    @classmethod
+    def from_matrix(
+        cls,
+        matrix: Array,
+        distortion: Sequence[float],
+        size_px: tuple[int, int],
+        model: str = "brown",
+    ) -> "Camera":
+        """A camera by the matrix (3, 3) and the distortion of OpenCV's calibration.
+
+        `size_px`: width and height of the images that it was calibrated with.
+        """
+        k = np.asarray(matrix, np.float64)
+        if k.shape != (3, 3):
+            raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
+        # OpenCV counts from the centre of the first pixel.
+        numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
+        more = tuple(np.ravel(np.asarray(distortion, np.float64)).tolist())
+        return cls(*size_px, *numbers, more, model)
+
+    @classmethod
+    def from_file(cls, path: Path | str) -> "Camera":
+        """The camera of a `flight.json`, or of a calibration of OpenCV, ROS or Kalibr.
+
+        Raises `MissingFileError`, `CameraError` or `MissingExtraError`.
+        """
+        from orthonav.sources.cameras import read_camera_file  # the readers make cameras
+
+        return read_camera_file(Path(path))
 
     @property
     def is_pinhole(self) -> bool:

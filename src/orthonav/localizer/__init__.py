@@ -28,12 +28,14 @@ places, `camera` their pitch and roll, `odometry` the displacement between views
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.match import Match, TileMatcher
 from orthonav.localizer.rectify import RectifiedView, downsampled, rectify
+from orthonav.localizer.tracker import Tracker
 
 __all__ = [
     "Localizer",
     "Match",
     "RectifiedView",
     "TileMatcher",
+    "Tracker",
     "downsampled",
     "rectify",
 ]

@@ -1,8 +1,12 @@
 """The front of this package: one map, one method that places a view on it."""
 
 from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
 
 from orthonav.errors import MapFileError
+from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.checks import check_view
 from orthonav.localizer.plan import DEFAULT_PLAN, SearchPlan
@@ -32,7 +36,7 @@ class Localizer:
         position: PositionRule = "peak",
         flying: bool = True,
         level_ground: bool = False,
-        plan: SearchPlan = DEFAULT_PLAN,
+        plan: SearchPlan | None = None,
     ) -> None:
         """Take an opened map; raises `MapFileError` if this program cannot fly it.
 
@@ -46,12 +50,17 @@ class Localizer:
         """
         if len(opened.manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {opened.path}")
+        self.opened = opened
         self.tiles = TileLocalizer(opened, position=position, flying=flying)
         self.registration = None
         if registration:
             self.registration = RegistrationLocalizer.of_map(
-                opened, self.tiles.proposer(), plan, level_ground=level_ground
+                opened, self.tiles.proposer(), plan or DEFAULT_PLAN, level_ground=level_ground
             )
+
+    def __repr__(self) -> str:
+        kind = "tiles" if self.registration is None else "registration"
+        return f"Localizer({self.opened.path}, {kind})"
 
     @property
     def sheet(self) -> SheetInfo:
@@ -84,3 +93,36 @@ class Localizer:
             prior = replace(prior, std_m=WIDEST_M)
         chosen = self.registration or self.tiles
         return chosen.locate(view, prior, heading_known)
+
+    def localize(
+        self,
+        image: NDArray[Any],
+        camera: Camera,
+        *,
+        agl_m: float,
+        heading_deg: float | None = None,
+        pitch_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        prior: Prior | None = None,
+        heading_std_deg: float | None = None,
+        agl_std_m: float | None = None,
+        tilt_std_deg: float | None = None,
+    ) -> Fix | NoFix:
+        """The position from which an image was taken; for the arguments see `View.of`.
+
+        `heading_deg` None: all headings are tried. `prior`: searched within three of its standard
+        deviations; None: on the whole map. Raises `FlightError` for what is no image and
+        `CameraError` where image and camera have different aspect ratios.
+        """
+        view = View.of(
+            image,
+            camera,
+            agl_m=agl_m,
+            heading_deg=heading_deg,
+            pitch_deg=pitch_deg,
+            roll_deg=roll_deg,
+            heading_std_deg=heading_std_deg,
+            agl_std_m=agl_std_m,
+            tilt_std_deg=tilt_std_deg,
+        )
+        return self.locate(view, prior=prior, heading_known=heading_deg is not None)

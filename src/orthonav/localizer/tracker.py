@@ -8,11 +8,13 @@ on each other too, which is odometry by the camera (`odometry`).
 import math
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import MapFileError
+from orthonav.geo.camera import Camera
 from orthonav.geo.ground import Ground
 from orthonav.localizer.camera import CameraFound
 from orthonav.localizer.checks import check_view
@@ -30,6 +32,7 @@ from orthonav.localizer.places import places_of
 from orthonav.localizer.prepared import PreparedView
 from orthonav.localizer.registration import RegisteredView
 from orthonav.localizer.relief import Relief
+from orthonav.mapfile.reader import MapFile
 from orthonav.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import rotation
 from orthonav.register.refine import Placed
@@ -102,7 +105,7 @@ class Tracker:
 
     def __init__(
         self,
-        localizer: Localizer,
+        localizer: Localizer | MapFile,
         *,
         model: Model | None = None,
         heading_known: bool = True,
@@ -111,7 +114,7 @@ class Tracker:
         smooth: bool = False,
         lag: int | None = None,
     ) -> None:
-        """Begin a track on the map of a localizer.
+        """Begin a track on the map of a localizer, or on an opened map.
 
         `model`: None for the usual one, with a mount as good as the height of the flight asks for.
         With `use_prior` the track starts at the first view's prior; with `every_prior` the priors
@@ -121,6 +124,8 @@ class Tracker:
 
         Raises `MapFileError` where the map has no registration layer or no confidence.
         """
+        if isinstance(localizer, MapFile):
+            localizer = Localizer(localizer)
         self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
         self._usual_scale = self._usual_model
@@ -173,6 +178,46 @@ class Tracker:
         if refused is None:
             refused = self._update(view, overlap, ground)
         return self._outcome(view.telemetry, refused)
+
+    def update(
+        self,
+        image: NDArray[Any],
+        camera: Camera,
+        *,
+        time_s: float,
+        agl_m: float,
+        heading_deg: float | None = None,
+        pitch_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        prior: Prior | None = None,
+        heading_std_deg: float | None = None,
+        agl_std_m: float | None = None,
+        tilt_std_deg: float | None = None,
+        vel_en_mps: tuple[float, float] | None = None,
+    ) -> Fix | NoFix:
+        """The position of the aircraft by this image and all before it; arguments as of `View.of`.
+
+        `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
+        reported velocity over ground. Raises as `View.of`.
+        """
+        view = View.of(
+            image,
+            camera,
+            time_s=time_s,
+            agl_m=agl_m,
+            heading_deg=heading_deg,
+            pitch_deg=pitch_deg,
+            roll_deg=roll_deg,
+            prior=prior,
+            heading_std_deg=heading_std_deg,
+            agl_std_m=agl_std_m,
+            tilt_std_deg=tilt_std_deg,
+            vel_en_mps=vel_en_mps,
+        )
+        return self.locate(view)
+
+    def __repr__(self) -> str:
+        return f"Tracker({self._localizer.opened.path}, {self.state.value})"
 
     @property
     def state_name(self) -> str:

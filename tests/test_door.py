@@ -1,0 +1,98 @@
+"""What `import orthonav` gives, and the examples that use it."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import orthonav
+from orthonav.errors import CameraError
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def run_example(name, *arguments):
+    """The output of an example."""
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_public_names_are_there_and_loaded_when_used():
+    names = [name for name in dir(orthonav) if not name.startswith("_")]
+    assert set(names) == set(orthonav.__all__) and 15 <= len(names) <= 25
+    assert all(getattr(orthonav, name) is not None for name in names)
+    with pytest.raises(AttributeError, match="no attribute nothing"):
+        orthonav.nothing  # noqa: B018 - the attribute is the test
+    code = "import sys, orthonav; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_an_image_is_localized_and_followed(map_path, area, flight, flight_path):
+    map_ = orthonav.open_map(str(map_path))
+    localizer = orthonav.Localizer(map_)
+    truth = orthonav.read_truth(flight_path / "truth.csv")
+    found = []
+    for seen in flight.views[:10]:
+        colour = cv2.cvtColor(seen.grey(), cv2.COLOR_GRAY2BGR)
+        fix = localizer.localize(colour, area.camera, agl_m=area.agl_m, heading_deg=None)
+        if fix.is_confident:
+            at = [localizer.sheet.frame.en_from_latlon(*each) for each in
+                  ((fix.lat_deg, fix.lon_deg), truth[seen.frame])]  # fmt: skip
+            found.append(np.hypot(*(at[0] - at[1])) / fix.std_m)
+    assert len(found) >= 5 and np.median(found) < 3
+    assert map_.contains(*truth[flight.views[0].frame]) and not map_.contains(0.0, 0.0)
+    south, west, north, east = map_.bounds_deg
+    assert south < truth[flight.views[0].frame][0] < north and west < east
+    blank = localizer.localize(colour * 0, area.camera, agl_m=area.agl_m)
+    assert not blank and not blank.is_confident and blank.reason in repr(blank)
+    tracker = orthonav.Tracker(map_, heading_known=False)
+    first = tracker.update(colour, area.camera, time_s=0.0, agl_m=area.agl_m)
+    assert isinstance(first, orthonav.Fix) and "searching" in repr(tracker)
+
+
+def test_cameras_by_field_of_view_and_by_matrix(tmp_path):
+    camera = orthonav.Camera.from_fov(90.0, 1280, 960)
+    assert camera.fx_px == pytest.approx(640) and camera.cx_px == 640 and camera.focal_std > 0
+    matrix = np.array([[1000.0, 0, 639.5], [0, 1001.0, 479.5], [0, 0, 1]])
+    by_matrix = orthonav.Camera.from_matrix(matrix, [[0.1, 0, 0, 0, 0]], (1280, 960))
+    assert (by_matrix.cx_px, by_matrix.cy_px, by_matrix.fy_px) == (640.0, 480.0, 1001.0)
+    writer = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
+    for name, value in (("image_width", 1280), ("image_height", 960), ("camera_matrix", matrix),
+                        ("distortion_coefficients", np.array([[0.1, 0, 0, 0, 0]]))):  # fmt: skip
+        writer.write(name, value)
+    writer.release()
+    assert orthonav.Camera.from_file(tmp_path / "camera.yml") == by_matrix
+    for wrong in (0.0, 180.0, float("nan")):
+        with pytest.raises(CameraError, match="field of view"):
+            orthonav.Camera.from_fov(wrong, 1280, 960)
+    with pytest.raises(CameraError, match=r"\(3, 3\)"):
+        orthonav.Camera.from_matrix(np.eye(2), [], (1280, 960))
+
+
+def test_examples_run(map_path, area, flight_path, tmp_path):
+    fov_deg = 2 * np.degrees(np.arctan(area.camera.width_px / 2 / area.camera.fx_px))
+    image = flight_path / "frames" / "0003.jpg"
+    assert " deg" in run_example("one_image.py", map_path, image, area.agl_m, fov_deg)
+    assert "Fix(" in run_example("follow_flight.py", map_path, flight_path)
+    assert "MapFile(" in run_example("build_map.py", area.past, tmp_path / "a.onav", 2.5)
+
+
+def test_cells_of_the_notebook_run(map_path, flight_path, tmp_path, monkeypatch):
+    demo = tmp_path / "demo"
+    shutil.copytree(flight_path, demo / "flight")
+    (demo / "area.onav").symlink_to(map_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    notebook = json.loads((EXAMPLES / "first_steps.ipynb").read_text("utf-8"))
+    names: dict = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert len(names["fixes"]) == 30 and len(names["errors_m"]) > 10
