@@ -13,18 +13,7 @@ the truth. The names in `__all__` are stable from version 0.2 on; modules below 
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from orthonav.errors import OrthonavError
-    from orthonav.flight import FlightFolder, open_flight, read_truth
-    from orthonav.flight.fixes import read_results
-    from orthonav.geo.camera import Camera
-    from orthonav.localizer import Localizer, Tracker
-    from orthonav.mapfile import MapFile, open_map
-    from orthonav.prepare import BuildRequest, build_map
-    from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
-    from orthonav.simulate.flight import SimulateRequest, simulate_flight
+from typing import Any
 
 __version__ = "0.1.0"
 
