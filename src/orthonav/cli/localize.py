@@ -245,7 +245,7 @@ def _on_map(options: argparse.Namespace) -> None:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
-        write_positions(options, results, Identity(used, digest.source(options.flight)))
+        write_positions(options, results, Identity(used, digest.source(_source_path(options))))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
@@ -270,6 +270,12 @@ def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptan
     if made.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
     return made
+
+
+def _source_path(options: argparse.Namespace) -> Path:
+    """The recording; of several photographs the folder of the first."""
+    first: Path = options.flight[0]
+    return first if len(options.flight) == 1 else first.parent
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
@@ -325,7 +331,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    write_positions(options, results, Identity(flight=digest.source(options.flight)))
+    write_positions(options, results, Identity(flight=digest.source(_source_path(options))))
     export_all(exports, results, None)
     _print_summary(options, results, accept)
 
