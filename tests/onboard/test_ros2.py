@@ -794,6 +794,7 @@ def test_sigterm_ends_the_wait_for_camera_info(flown, env, peer, tmp_path):
     """On the loopback by ROS_LOCALHOST_ONLY, as ROS users ask for it."""
     errors = tmp_path / "errors"
     peer.advertise("/cam/image_raw", ros.Image)
+    peer.subscribe("/diagnostics", ros.DiagnosticArray)
     local = {**env, "CYCLONEDDS_URI": "", "ROS_LOCALHOST_ONLY": "1"}
     running = process(local, errors, "fly", flown[0], "--ros2", "--ros-args", *REMAPPED)
     try:
@@ -801,7 +802,11 @@ def test_sigterm_ends_the_wait_for_camera_info(flown, env, peer, tmp_path):
         wait_for(lambda: "no message on /cam/camera_info" in errors.read_text())
     finally:
         code = stopped(running)
-    assert code == 1 and "--camera" in errors.read_text().splitlines()[-1]
+    assert code == 0 and "--camera" in errors.read_text().splitlines()[-1]
+    heard = peer.heard("/diagnostics")
+    assert heard[0].status[0].message == "no_camera"  # from the first second on
+    assert {each.status[0].level for each in heard} == {2}
+    assert "camera_info" in {v.key: v.value for v in heard[0].status[0].values}["waiting"]
 
 
 def test_conflicting_options_end_with_one_line(flown, run, env):

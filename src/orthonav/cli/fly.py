@@ -1,6 +1,7 @@
 """`orthonav fly`: position messages to an autopilot, from a live camera or a recording."""
 
 import argparse
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -180,7 +181,8 @@ def _add_ros2(group: argparse._ActionsContainer) -> None:
         nargs=argparse.REMAINDER,
         default=[],
         metavar="ARGS",
-        help="must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE",
+        help="must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE, "
+        "--params-file FILE, --log-level LEVEL",
     )
 
 
@@ -368,6 +370,7 @@ def run(options: argparse.Namespace) -> None:
     import threading
 
     from orthonav.cli.flying import runner
+    from orthonav.errors import StoppedError
 
     _check(options)
     stopping = threading.Event()
@@ -382,6 +385,8 @@ def run(options: argparse.Namespace) -> None:
             gc.freeze()  # a full collection over the loaded modules takes as long as a view
             stack.callback(gc.unfreeze)
             made.run(stopping)
+    except StoppedError as error:  # as it was asked to: no failure
+        logging.getLogger(__name__).warning("%s", error)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

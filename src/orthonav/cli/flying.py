@@ -73,10 +73,12 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
     heading_known = options.heading == "known"
-    tracker = Tracker(
-        localizer, heading_known=heading_known, model=model_of(mount) if mount else None
-    )
-    locator: Locator = MountCorrected(tracker, mount) if mount else tracker
+    model = model_of(mount) if mount else None
+
+    def locator() -> Locator:
+        tracker = Tracker(localizer, heading_known=heading_known, model=model)
+        return MountCorrected(tracker, mount) if mount else tracker
+
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
@@ -117,7 +119,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     return Runner(
         thread.newest,
         camera,
-        locator,
+        locator(),
         publisher,
         fly,
         clocks,
@@ -125,6 +127,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         sink=sink,
         diagnosis=TelemetryDiagnosis(localizer, least),
         start=_start(options, clocks, localizer),
+        fresh=locator,
         notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
@@ -332,16 +335,17 @@ def _start(
 ) -> Callable[[], Prior | None]:
     """Function that gives the prior of the first view.
 
-    It is the saved position if that is recent, else `--start`, else None.
+    It is the saved position if that is recent, but once only, else `--start`, else None.
     """
     given = _given_start(options, localizer)
-    saved = load(options.state) if options.state else None
+    saved = [load(options.state)] if options.state else []
 
     def prior() -> Prior | None:
-        if saved is None:
+        last = saved.pop() if saved else None
+        if last is None:
             return given
-        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(saved, age_s, options.state_max_age_s) or given
+        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        return prior_of(last, age_s, options.state_max_age_s) or given
 
     return prior
 

@@ -92,6 +92,7 @@ class Definitions:
         )
         made.serialize = lambda self, **_: self.cdr
         made.deserialize = classmethod(_sample)
+        made.deserialize_key = classmethod(lambda kind, data, **_: kind())  # of a writer that left
         return made
 
     def _members(self, name: str) -> dict[str, Any]:

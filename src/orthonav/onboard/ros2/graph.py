@@ -1,0 +1,99 @@
+"""A node of a ROS 2 graph, whichever library carries its messages."""
+
+import logging
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from orthonav.errors import described
+from orthonav.onboard.ros2.arguments import RosArguments
+from orthonav.onboard.ros2.messages import Definitions
+
+log = logging.getLogger(__name__)
+LOST_SHARE, LEAST_LOST, LOST_CHECKS = 0.2, 3, 10
+"""A topic that loses more than this share of its messages, and as many, within so many checks of
+the graph has a problem."""
+Handler = Callable[[Any, bytes], None]
+
+
+class Writer(Protocol):
+    """Sends messages of one topic."""
+
+    def write(self, message: Any) -> None:
+        """Send one message. Raises `OSError` where the middleware does not take it."""
+
+
+class Graph(ABC):
+    """Reads and writes topics. `spin` is for one thread, writers are for any.
+
+    `problems` says by topic why little or nothing can flow there: another type, QoS that does not
+    match, lost messages. `undecodable` counts damaged messages by topic, `lost` those that did not
+    arrive.
+    """
+
+    def __init__(self, arguments: RosArguments) -> None:
+        """Raises `MissingExtraError` without the message definitions."""
+        self.arguments, self.definitions = arguments, Definitions(arguments.distro)
+        self.problems: dict[str, str] = {}
+        self.undecodable: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
+        self._counts: deque[tuple[Counter[str], Counter[str]]] = deque(maxlen=LOST_CHECKS)
+        self._said: set[tuple[str, str]] = set()
+
+    @abstractmethod
+    def subscribe(
+        self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
+    ) -> None:
+        """Hand each message on `topic` (resolved already) to `handler`, with its raw sample.
+
+        The QoS is that of sensor data: best effort, volatile, the last `depth` messages.
+        """
+
+    @abstractmethod
+    def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
+        """A writer of `topic` (resolved already): reliable, and transient local if `latched`."""
+
+    @abstractmethod
+    def spin(self, timeout_s: float) -> int:
+        """Wait at most so long for messages and handle those that are there; how many."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the graph."""
+
+    @abstractmethod
+    def _mismatches(self) -> dict[str, str]:
+        """Topics whose endpoints cannot match now, and why. It updates `lost`."""
+
+    def check_graph(self) -> None:
+        """Look for endpoints that cannot match and for lost messages; each is logged once."""
+        found = self._mismatches()
+        now = self.lost.copy(), self.received.copy()
+        lost, received = self._counts[0] if self._counts else now
+        self._counts.append(now)
+        for topic, total in now[0].items():
+            count = total - lost[topic]
+            whole = count + now[1][topic] - received[topic]
+            if count >= LEAST_LOST and count > LOST_SHARE * whole:
+                found.setdefault(
+                    topic,
+                    "loses messages: raise net.core.rmem_max, or use compressed images or "
+                    "image_reliability:=reliable",
+                )
+        self.problems = found
+        for topic, text in found.items():
+            if (topic, text) not in self._said:
+                self._said.add((topic, text))
+                log.warning("topic %s %s", topic, text)
+
+    def _handle(self, topic: str, kind: str, handler: Handler, cdr: bytes) -> None:
+        """Decode a sample and hand it on; one odd message never ends a flight."""
+        self.received[topic] += 1
+        try:
+            handler(self.definitions.decoded(kind, cdr), cdr)
+        except Exception as error:
+            if not self.undecodable[topic]:
+                log.warning("message on %s cannot be used (%s)", topic, described(error))
+            self.undecodable[topic] += 1

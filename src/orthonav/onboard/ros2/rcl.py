@@ -1,0 +1,182 @@
+"""A node by `rclpy`, where a ROS environment is sourced: with its middleware, security, parameters.
+
+Messages stay serialized on both sides: their definitions are those of the node over DDS.
+"""
+
+import importlib
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from orthonav.errors import OutputError
+from orthonav.onboard.ros2.arguments import RosArguments
+from orthonav.onboard.ros2.graph import Graph, Handler, Writer
+from orthonav.onboard.ros2.messages import Definitions
+from orthonav.onboard.ros2.node import Node
+
+log = logging.getLogger(__name__)
+_NEED_ROS = ("RMW_IMPLEMENTATION", "ROS_DISCOVERY_SERVER", "ROS_SECURITY_ENABLE")
+
+
+def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Graph:
+    """A node by `rclpy` where a ROS environment is sourced, else over DDS."""
+    if environment.get("AMENT_PREFIX_PATH"):
+        try:
+            importlib.import_module("rclpy")
+        except ImportError as error:
+            log.warning("rclpy of the sourced ROS environment cannot be used (%s)", error)
+        else:
+            return RclNode(arguments)
+    for name in _NEED_ROS:
+        if environment.get(name) not in (None, "", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"):
+            log.warning("%s has no effect without a sourced ROS environment", name)
+    return Node(arguments)
+
+
+class RclWriter:
+    """Sends messages of one topic."""
+
+    def __init__(self, topic: str, definitions: Definitions, publisher: Any) -> None:
+        """`publisher` is None where ROS has no such message: nothing is sent."""
+        self._topic, self._definitions, self._publisher = topic, definitions, publisher
+
+    def write(self, message: Any) -> None:
+        """See `Writer.write`."""
+        if self._publisher is None:
+            return
+        try:
+            self._publisher.publish(self._definitions.encoded(message))
+        except Exception as error:  # of the middleware
+            raise OSError(f"cannot publish on {self._topic} ({error})") from error
+
+
+class RclNode(Graph):
+    """Reads and writes topics through `rclpy`."""
+
+    def __init__(self, arguments: RosArguments) -> None:
+        """Raises `OutputError` where ROS does not start."""
+        super().__init__(arguments)
+        self._rclpy, self._qos = _module("rclpy"), _module("rclpy.qos")
+        self._subscriptions: list[tuple[Any, str, Handler]] = []
+        self._publishers: list[tuple[Any, str]] = []
+        try:
+            self._context = self._rclpy.Context()
+            self._rclpy.init(
+                args=["--ros-args", *arguments.passed],
+                context=self._context,
+                signal_handler_options=_module("rclpy.signals").SignalHandlerOptions.NO,
+            )
+            own = asdict(arguments.parameters)
+            made = _module("rclpy.parameter").Parameter
+            self._node = self._rclpy.create_node(
+                arguments.node,
+                namespace=arguments.namespace,
+                context=self._context,
+                use_global_arguments=False,  # names are resolved already
+                enable_rosout=False,  # as over DDS, see `rosout`
+                parameter_overrides=[made(name, value=value) for name, value in own.items()],
+            )
+        except Exception as error:  # of the middleware
+            raise OutputError(f"cannot join the ROS graph: {error}") from error
+        read_only = _module("rcl_interfaces.msg").ParameterDescriptor(read_only=True)
+        for name, value in own.items():
+            if not self._node.has_parameter(name):
+                self._node.declare_parameter(name, value, read_only)
+        self._executor = _module("rclpy.executors").SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def subscribe(
+        self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
+    ) -> None:
+        """See `Graph.subscribe`."""
+
+        def take(cdr: bytes) -> None:
+            self._handle(topic, kind, handler, cdr)
+
+        def lost(event: Any) -> None:
+            self.lost[topic] = event.total_count
+
+        qos = self._made_qos(depth, reliable=reliable)
+        arguments = _message(kind), topic, take, qos
+        events = _module("rclpy.event_handler")
+        try:
+            callbacks = events.SubscriptionEventCallbacks(
+                message_lost=lost, use_default_callbacks=False
+            )
+            made = self._node.create_subscription(*arguments, raw=True, event_callbacks=callbacks)
+        except events.UnsupportedEventTypeError:
+            made = self._node.create_subscription(*arguments, raw=True)
+        self._subscriptions.append((made, kind, handler))
+
+    def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
+        """See `Graph.advertise`; without a message of ROS nothing is sent, and that is logged."""
+        made = None
+        try:
+            qos = self._made_qos(depth, reliable=True, latched=latched)
+            made = self._node.create_publisher(_message(kind), topic, qos)
+        except ImportError:
+            log.warning("nothing is published on %s: ROS has no %s here", topic, kind)
+        else:
+            self._publishers.append((made, kind))
+        return RclWriter(topic, self.definitions, made)
+
+    def spin(self, timeout_s: float) -> int:
+        """See `Graph.spin`."""
+        before = self.received.total()
+        self._executor.spin_once(timeout_s)
+        for made, kind, handler in self._subscriptions:  # spin_once handles one message
+            with made.handle:
+                while (taken := made.handle.take_message(made.msg_type, True)) is not None:
+                    self._handle(made.topic_name, kind, handler, taken[0])
+        return self.received.total() - before
+
+    def close(self) -> None:
+        """See `Graph.close`."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def _mismatches(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for made, kind, _ in self._subscriptions:
+            for other in self._node.get_publishers_info_by_topic(made.topic_name):
+                pair = other.qos_profile, made.qos_profile
+                self._mismatch(found, made.topic_name, kind, other, pair)
+        for made, kind in self._publishers:
+            for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
+                pair = made.qos_profile, other.qos_profile
+                self._mismatch(found, made.topic_name, kind, other, pair)
+        return found
+
+    def _mismatch(
+        self, found: dict[str, str], topic: str, kind: str, other: Any, qos: tuple[Any, Any]
+    ) -> None:
+        """Note why an endpoint of another node does not match; `qos`: published and subscribed."""
+        verdict, reason = self._qos.qos_check_compatible(*qos)
+        if other.topic_type != kind:
+            found.setdefault(topic, f"is of type {other.topic_type}; expected {kind}")
+        elif verdict == self._qos.QoSCompatibility.ERROR:
+            found.setdefault(topic, f"{other.node_name} has QoS that does not match: {reason}")
+
+    def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
+        qos = self._qos
+        return qos.QoSProfile(
+            depth=depth,
+            reliability=qos.ReliabilityPolicy.RELIABLE
+            if reliable
+            else qos.ReliabilityPolicy.BEST_EFFORT,
+            durability=qos.DurabilityPolicy.TRANSIENT_LOCAL
+            if latched
+            else qos.DurabilityPolicy.VOLATILE,
+        )
+
+
+def _module(name: str) -> Any:
+    return importlib.import_module(name)
+
+
+def _message(kind: str) -> Any:
+    """The class of a message type of ROS. Raises `ImportError` where ROS does not have it."""
+    package, _, name = kind.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
