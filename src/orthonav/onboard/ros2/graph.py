@@ -2,8 +2,9 @@
 
 import logging
 from abc import ABC, abstractmethod
-from collections import Counter, deque
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, Protocol
 
 from orthonav.errors import described
@@ -11,9 +12,6 @@ from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.messages import Definitions
 
 log = logging.getLogger(__name__)
-LOST_SHARE, LEAST_LOST, LOST_CHECKS = 0.2, 3, 10
-"""A topic that loses more than this share of its messages, and as many, within so many checks of
-the graph has a problem."""
 Handler = Callable[[Any, bytes], None]
 
 
@@ -28,8 +26,7 @@ class Graph(ABC):
     """Reads and writes topics. `spin` is for one thread, writers are for any.
 
     `problems` says by topic why little or nothing can flow there: another type, QoS that does not
-    match, lost messages. `undecodable` counts damaged messages by topic, `lost` those that did not
-    arrive.
+    match, lost messages. `undecodable` counts damaged messages by topic.
     """
 
     def __init__(self, arguments: RosArguments) -> None:
@@ -37,9 +34,6 @@ class Graph(ABC):
         self.arguments, self.definitions = arguments, Definitions(arguments.distro)
         self.problems: dict[str, str] = {}
         self.undecodable: Counter[str] = Counter()
-        self.received: Counter[str] = Counter()
-        self.lost: Counter[str] = Counter()
-        self._counts: deque[tuple[Counter[str], Counter[str]]] = deque(maxlen=LOST_CHECKS)
         self._said: set[tuple[str, str]] = set()
 
     @abstractmethod
@@ -65,32 +59,30 @@ class Graph(ABC):
 
     @abstractmethod
     def _mismatches(self) -> dict[str, str]:
-        """Topics whose endpoints cannot match now, and why. It updates `lost`."""
+        """Topics whose endpoints cannot match now, and why."""
 
-    def check_graph(self) -> None:
-        """Look for endpoints that cannot match and for lost messages; each is logged once."""
-        found = self._mismatches()
-        now = self.lost.copy(), self.received.copy()
-        lost, received = self._counts[0] if self._counts else now
-        self._counts.append(now)
-        for topic, total in now[0].items():
-            count = total - lost[topic]
-            whole = count + now[1][topic] - received[topic]
-            if count >= LEAST_LOST and count > LOST_SHARE * whole:
-                found.setdefault(
-                    topic,
-                    "loses messages: raise net.core.rmem_max, or use compressed images or "
-                    "image_reliability:=reliable",
-                )
-        self.problems = found
-        for topic, text in found.items():
+    def check_graph(self, others: Mapping[str, str] = MappingProxyType({})) -> None:
+        """Look for endpoints that cannot match now; `others` are further problems by topic.
+
+        Each problem is logged once.
+        """
+        self.problems = {**others, **self._mismatches()}
+        for topic, text in self.problems.items():
             if (topic, text) not in self._said:
                 self._said.add((topic, text))
                 log.warning("topic %s %s", topic, text)
 
+    def _mismatch(
+        self, found: dict[str, str], topic: str, kind: str, other_kind: str, why: str
+    ) -> None:
+        """Note that an endpoint of our topic has another type, or `why` it does not match."""
+        if other_kind != kind:
+            why = f"is of type {other_kind}; expected {kind}"
+        if why:
+            found.setdefault(topic, why)
+
     def _handle(self, topic: str, kind: str, handler: Handler, cdr: bytes) -> None:
         """Decode a sample and hand it on; one odd message never ends a flight."""
-        self.received[topic] += 1
         try:
             handler(self.definitions.decoded(kind, cdr), cdr)
         except Exception as error:

@@ -5,6 +5,7 @@ QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Qualit
 
 import logging
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -14,7 +15,6 @@ from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.graph import Graph, Handler
 from orthonav.onboard.ros2.messages import (
     Definitions,
-    dds_type_name,
     ros2_module,
     ros_type_name,
 )
@@ -145,38 +145,16 @@ class Node(Graph):
         found: dict[str, str] = {}
         publishers, subscribers = map(self._discovered, (self._publishers, self._subscribers))
         for each in self._subscriptions:
-            status = each.reader.get_requested_incompatible_qos_status()
+            why = _unmatched(each.reader.get_requested_incompatible_qos_status(), "a publisher")
             matched = each.reader.get_matched_publications()
-            self._mismatch(found, each, publishers, matched, status, "a publisher")
-            self.lost[each.topic] = each.reader.get_sample_lost_status().total_count
+            for other in _others(publishers, each.topic, matched):
+                self._mismatch(found, each.topic, each.kind, other, why)
         for writer in self._writers:
-            status = writer.writer.get_offered_incompatible_qos_status()
+            why = _unmatched(writer.writer.get_offered_incompatible_qos_status(), "a subscriber")
             matched = writer.writer.get_matched_subscriptions()
-            self._mismatch(found, writer, subscribers, matched, status, "a subscriber")
+            for other in _others(subscribers, writer.topic, matched):
+                self._mismatch(found, writer.topic, writer.kind, other, why)
         return found
-
-    def _mismatch(
-        self,
-        found: dict[str, str],
-        own: Subscription | DdsWriter,
-        others: list[Any],
-        matched: list[int],
-        status: Any,
-        other: str,
-    ) -> None:
-        """Note the first of the endpoints on our topic that ours does not match."""
-        handles = {handle % 2**64 for handle in matched}
-        for each in others:
-            if each.topic_name != f"rt{own.topic}" or each.sample_info.instance_handle in handles:
-                continue
-            if each.type_name != dds_type_name(own.kind):
-                text = f"is of type {ros_type_name(str(each.type_name))}; expected {own.kind}"
-            elif status.total_count > 0:
-                policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
-                text = f"{other} has QoS that does not match ours: {policy}"
-            else:
-                continue  # not matched yet
-            found.setdefault(own.topic, text)
 
     def _topic(self, name: str, kind: str) -> Any:
         made = ros2_module("cyclonedds.topic")
@@ -228,3 +206,19 @@ def _discovery(arguments: RosArguments) -> str:
             return ""
         inner = f"<ParticipantIndex>auto</ParticipantIndex><Peers>{''.join(peers)}</Peers>"
     return f"<CycloneDDS><Domain><Discovery>{inner}</Discovery></Domain></CycloneDDS>"
+
+
+def _others(endpoints: list[Any], topic: str, matched: list[int]) -> Iterator[str]:
+    """Message types of the endpoints of a topic beside those that are matched."""
+    handles = {handle % 2**64 for handle in matched}
+    for each in endpoints:
+        if each.topic_name == f"rt{topic}" and each.sample_info.instance_handle not in handles:
+            yield ros_type_name(str(each.type_name))
+
+
+def _unmatched(status: Any, other: str) -> str:
+    """Why an endpoint did not match ours lately; "" where it is only not matched yet."""
+    if not status.total_count:
+        return ""
+    policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
+    return f"{other} has QoS that does not match ours: {policy}"

@@ -86,11 +86,10 @@ class Ros2Publisher:
         new = self._node.definitions.new
         problems = {f"topic {name}": text for name, text in self._node.problems.items()}
         damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
-        lost = {f"lost on {name}": n for name, n in self._node.lost.items() if n}
         level = _LEVELS[plain["health"]]
         values = [
             new("diagnostic_msgs/msg/KeyValue", key=name, value=value)
-            for name, value in _flat({**plain, **problems, **damaged, **lost})
+            for name, value in _flat({**plain, **problems, **damaged})
         ]
         status = new(
             "diagnostic_msgs/msg/DiagnosticStatus",

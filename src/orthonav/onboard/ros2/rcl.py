@@ -58,7 +58,8 @@ class RclNode(Graph):
         """Raises `OutputError` where ROS does not start."""
         super().__init__(arguments)
         self._rclpy, self._qos = _module("rclpy"), _module("rclpy.qos")
-        self._subscriptions: list[tuple[Any, str, Handler]] = []
+        self._subscriptions: list[tuple[Any, str]] = []
+        self._handled = 0
         self._publishers: list[tuple[Any, str]] = []
         try:
             self._context = self._rclpy.Context()
@@ -92,22 +93,12 @@ class RclNode(Graph):
         """See `Graph.subscribe`."""
 
         def take(cdr: bytes) -> None:
+            self._handled += 1
             self._handle(topic, kind, handler, cdr)
 
-        def lost(event: Any) -> None:
-            self.lost[topic] = event.total_count
-
         qos = self._made_qos(depth, reliable=reliable)
-        arguments = _message(kind), topic, take, qos
-        events = _module("rclpy.event_handler")
-        try:
-            callbacks = events.SubscriptionEventCallbacks(
-                message_lost=lost, use_default_callbacks=False
-            )
-            made = self._node.create_subscription(*arguments, raw=True, event_callbacks=callbacks)
-        except events.UnsupportedEventTypeError:
-            made = self._node.create_subscription(*arguments, raw=True)
-        self._subscriptions.append((made, kind, handler))
+        made = self._node.create_subscription(_message(kind), topic, take, qos, raw=True)
+        self._subscriptions.append((made, kind))
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
         """See `Graph.advertise`; without a message of ROS nothing is sent, and that is logged."""
@@ -123,13 +114,13 @@ class RclNode(Graph):
 
     def spin(self, timeout_s: float) -> int:
         """See `Graph.spin`."""
-        before = self.received.total()
+        self._handled = 0
         self._executor.spin_once(timeout_s)
-        for made, kind, handler in self._subscriptions:  # spin_once handles one message
+        for made, _ in self._subscriptions:  # spin_once handles one message
             with made.handle:
                 while (taken := made.handle.take_message(made.msg_type, True)) is not None:
-                    self._handle(made.topic_name, kind, handler, taken[0])
-        return self.received.total() - before
+                    made.callback(taken[0])
+        return self._handled
 
     def close(self) -> None:
         """See `Graph.close`."""
@@ -139,25 +130,25 @@ class RclNode(Graph):
 
     def _mismatches(self) -> dict[str, str]:
         found: dict[str, str] = {}
-        for made, kind, _ in self._subscriptions:
+        for made, kind in self._subscriptions:
             for other in self._node.get_publishers_info_by_topic(made.topic_name):
-                pair = other.qos_profile, made.qos_profile
-                self._mismatch(found, made.topic_name, kind, other, pair)
+                why = self._unmatched(other.qos_profile, made.qos_profile, "a publisher")
+                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
         for made, kind in self._publishers:
             for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
-                pair = made.qos_profile, other.qos_profile
-                self._mismatch(found, made.topic_name, kind, other, pair)
+                why = self._unmatched(made.qos_profile, other.qos_profile, "a subscriber")
+                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
         return found
 
-    def _mismatch(
-        self, found: dict[str, str], topic: str, kind: str, other: Any, qos: tuple[Any, Any]
-    ) -> None:
-        """Note why an endpoint of another node does not match; `qos`: published and subscribed."""
-        verdict, reason = self._qos.qos_check_compatible(*qos)
-        if other.topic_type != kind:
-            found.setdefault(topic, f"is of type {other.topic_type}; expected {kind}")
-        elif verdict == self._qos.QoSCompatibility.ERROR:
-            found.setdefault(topic, f"{other.node_name} has QoS that does not match: {reason}")
+    def _unmatched(self, offered: Any, requested: Any, other: str) -> str:
+        """Why a subscription does not match a publisher; "" where it does."""
+        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
+        policy = ""
+        if requested.reliability == reliability.RELIABLE != offered.reliability:
+            policy = "reliability"
+        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
+            policy = "durability"
+        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
 
     def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
         qos = self._qos

@@ -16,6 +16,7 @@ from orthonav.flight.gnss import FIX_3D, GnssSample
 from orthonav.geo.camera import Camera
 from orthonav.onboard.cameras import CameraImage
 from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.lost import LostImages
 from orthonav.onboard.ros2.messages import TIME_NS
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
 from orthonav.records import NoFix
@@ -83,6 +84,7 @@ class Ros2Reader:
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
         self._tilt_std_deg = AUTOPILOT_TILT_STD_DEG
         self._said: set[str] = set()
+        self._lost = LostImages()
         self._subscribe()
 
     def wait_for_camera(self) -> Camera:
@@ -155,7 +157,8 @@ class Ros2Reader:
         now_ns = self._clocks.mono_ns()
         if now_ns - self._checked_ns >= TIME_NS:
             self._checked_ns = now_ns
-            self._node.check_graph()
+            lost = self._lost.reason()
+            self._node.check_graph({} if lost is None else {self._image_topic: lost})
 
     def _ahead_ns(self) -> int | None:
         """ROS time minus our monotonic clock; None before the first `/clock`."""
@@ -187,12 +190,14 @@ class Ros2Reader:
                 return
             self._restart(self._image_topic, self._image_ns - time_ns)
         self._image_ns = time_ns
+        self._lost.images.append(time_ns)
         while len(self._images) > 1:
             self._images.pop()
         self._images.append(_WaitingImage(message, time_ns, self._clocks.mono_ns()))
 
     def _take_camera_info(self, message: Any, cdr: bytes) -> None:
         """Use the first one: the camera does not change in flight."""
+        self._lost.infos.append(stamp_ns(message, 0))
         if self._camera is None:
             try:
                 self._camera = camera_of_info(message)
@@ -282,6 +287,7 @@ class Ros2Reader:
         log.warning("ROS time went back by %.1f s (%s); telemetry is cleared", back_ns / 1e9, what)
         self._buffer.clear()
         self._images.clear()
+        self._lost = LostImages()
         self._image_ns = self._attitude_ns = 0
 
     def _remind(self, text: str) -> None:
