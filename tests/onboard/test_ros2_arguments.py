@@ -79,7 +79,7 @@ def test_parameters_of_files_are_those_of_the_node(tmp_path, caplog):
     """As `ros2 launch` passes them: tables by node, names and patterns, the last one counts."""
     path = tmp_path / "params.yaml"
     path.write_text(
-        "/**:\n  ros__parameters:\n    use_sim_time: true\n    map_frame: all\n    qos: {depth: 3}\n"
+        "/**:\n  ros__parameters: {use_sim_time: true, map_frame: all, qos: {depth: 3}}\n"
         "/uav1/orthonav:\n  ros__parameters: {map_frame: mine, altitude: 12.5}\n"
         "uav1:\n  orthonav:\n    ros__parameters: {base_frame: drone}\n"
         "/uav2/orthonav:\n  ros__parameters: {publish_tf: true}\n"

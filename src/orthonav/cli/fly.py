@@ -380,13 +380,15 @@ def run(options: argparse.Namespace) -> None:
             before[number] = signal.signal(number, lambda *_: stopping.set())
     try:
         with ExitStack() as stack:
-            made = runner(options, stopping, stack)
+            try:
+                made = runner(options, stopping, stack)
+            except StoppedError as error:  # as it was asked to: no failure
+                logging.getLogger(__name__).warning("%s", error)
+                return
             gc.collect()
             gc.freeze()  # a full collection over the loaded modules takes as long as a view
             stack.callback(gc.unfreeze)
             made.run(stopping)
-    except StoppedError as error:  # as it was asked to: no failure
-        logging.getLogger(__name__).warning("%s", error)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -332,6 +332,7 @@ class Runner:
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
+        vehicle = self._with_altitude(vehicle, outcome, known)
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, reported, latency.std_s)
         as_stated = latency is None or latency.stated
@@ -359,6 +360,18 @@ class Runner:
             found = result.state in (None, "tracking") and isinstance(outcome, Fix)
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
+
+    def _with_altitude(
+        self, vehicle: VehicleState, outcome: Fix | NoFix, telemetry: Telemetry
+    ) -> VehicleState:
+        """The vehicle with the altitude by the terrain at a fix, where none was reported."""
+        heights = self.options.heights
+        if heights is None or not isinstance(outcome, Fix) or math.isfinite(vehicle.amsl_m):
+            return vehicle
+        try:
+            return replace(vehicle, amsl_m=heights.ground_m(outcome) + telemetry.agl_m)
+        except MapFileError:  # reported when the next view needs it
+            return vehicle
 
     def _over_gap(
         self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState
