@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from orthonav.errors import MissingFileError, VariantError
 from orthonav.onboard.ros2.arguments import RosArguments, ros_arguments
-from orthonav.onboard.ros2.messages import dds_type_name, ros_type_name
+from orthonav.onboard.ros2.messages import ros_type_name
 
 
 def parsed(*words, **environment):
@@ -45,6 +45,8 @@ def test_parameters_and_environment():
     assert made.parameters.use_sim_time is True and made.parameters.map_frame == "earth"
     assert made.domain_id == 42 and made.is_local is False
     assert parsed(ROS_LOCALHOST_ONLY="1").is_local
+    assert parsed(ROS_AUTOMATIC_DISCOVERY_RANGE="OFF").is_alone
+    assert parsed(ROS_STATIC_PEERS="10.0.0.2; host").peers == ("10.0.0.2", "host")
     assert parsed(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST").is_local
     assert parsed(ROS_NAMESPACE="/uav").resolved("image") == "/uav/image"
     assert parsed("-r", "__ns:=/b", ROS_NAMESPACE="a").resolved("image") == "/b/image"
@@ -133,6 +135,5 @@ def test_expansion_is_absolute_and_idempotent(space, name, node):
 
 
 def test_type_names_of_dds():
-    assert dds_type_name("sensor_msgs/msg/Image") == "sensor_msgs::msg::dds_::Image_"
     assert ros_type_name("sensor_msgs::msg::dds_::Image_") == "sensor_msgs/msg/Image"
     assert ros_type_name("Other::Thing") == "Other::Thing"

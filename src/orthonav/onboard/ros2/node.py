@@ -139,7 +139,10 @@ class Node(Graph):
                 if error.code == error.DDS_RETCODE_PRECONDITION_NOT_MET:
                     return None
                 failed = error
-        raise OutputError(f"cannot join DDS domain {arguments.domain_id}: {failed}") from failed
+        where = f"DDS domain {arguments.domain_id}"
+        if arguments.cyclonedds_uri:
+            where += f" with CYCLONEDDS_URI={arguments.cyclonedds_uri}"
+        raise OutputError(f"cannot join {where}: {failed}") from failed
 
     def _mismatches(self) -> dict[str, str]:
         found: dict[str, str] = {}
