@@ -355,6 +355,7 @@ def test_a_publisher_that_leaves_is_no_message(peer, reading):
         other.advertise(topic, KINDS[topic])
         matched(other, flying)
         other.write(topic, ros.zeros(KINDS[topic]))
+        wait_for(lambda: flying.node.spin(0.01))  # what comes later only says that it left
         other.close()
     assert flying.read(1.0) is None
     assert not flying.node.undecodable

@@ -369,7 +369,6 @@ def run(options: argparse.Namespace) -> None:
     import signal
     import threading
 
-    from orthonav.cli.flying import runner
     from orthonav.errors import StoppedError
 
     _check(options)
@@ -379,6 +378,8 @@ def run(options: argparse.Namespace) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
             before[number] = signal.signal(number, lambda *_: stopping.set())
     try:
+        from orthonav.cli.flying import runner  # takes a while, in which it may be stopped
+
         with ExitStack() as stack:
             try:
                 made = runner(options, stopping, stack)

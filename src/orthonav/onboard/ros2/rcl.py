@@ -16,7 +16,12 @@ from orthonav.onboard.ros2.messages import Definitions
 from orthonav.onboard.ros2.node import Node
 
 log = logging.getLogger(__name__)
-_NEED_ROS = ("RMW_IMPLEMENTATION", "ROS_DISCOVERY_SERVER", "ROS_SECURITY_ENABLE")
+_NEEDS_ROS = {
+    "RMW_IMPLEMENTATION": "zenoh",
+    "ROS_SECURITY_ENABLE": "true",
+    "ROS_DISCOVERY_SERVER": "",
+}
+"""Variables, and what in their values, only ROS itself can do."""
 
 
 def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Graph:
@@ -28,9 +33,10 @@ def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Gra
             log.warning("rclpy of the sourced ROS environment cannot be used (%s)", error)
         else:
             return RclNode(arguments)
-    for name in _NEED_ROS:
-        if environment.get(name) not in (None, "", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"):
-            log.warning("%s has no effect without a sourced ROS environment", name)
+    for name, part in _NEEDS_ROS.items():
+        value = environment.get(name, "")
+        if value and part in value:
+            log.warning("%s=%s has no effect without a sourced ROS environment", name, value)
     return Node(arguments)
 
 
