@@ -21,7 +21,8 @@ import orthonav
 
 pytestmark = pytest.mark.long
 PEER = Path(__file__).with_name("rclpy_peer.py")
-PROGRAM = "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))"
+FLY = "-c", "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))", "fly"
+PACKAGE = Path(__file__).parents[2] / "ros2" / "orthonav_ros"
 HEADING, SPEED_MPS, COUNT, EVERY_S = 60.0, 14.0, 40, 0.4
 ENOUGH = 5
 LONGEST_S = 60.0
@@ -77,7 +78,7 @@ class Flying:
         python = ros_python if sourced else sys.executable
         self.errors = folder / "errors"
         with self.errors.open("w") as stream:
-            self.process = subprocess.Popen([python, "-c", PROGRAM, *words], env=env, stderr=stream)
+            self.process = subprocess.Popen([python, *words], env=env, stderr=stream)
 
     def said(self):
         return self.errors.read_text()
@@ -110,7 +111,7 @@ def of_kind(heard, key):
 @pytest.mark.parametrize("sourced", [False, True], ids=["dds", "rclpy"])
 def test_a_flight_in_a_graph(flown, env, tmp_path, distribution, sourced):
     path, frame, flight, places = flown
-    words = ["fly", path, "--ros2", "--deadline-ms", "5000", "--ros-args"]
+    words = [*FLY, path, "--ros2", "--deadline-ms", "5000", "--ros-args"]
     words += ["-r", "image:=/cam/image_raw", "-p", "covariance:=fix", "-p", "altitude:=321"]
     words += ["-p", "unknown:=1"]
     flying = Flying(env, tmp_path, distribution, sourced, *words)
@@ -149,7 +150,7 @@ def test_a_flight_in_a_graph(flown, env, tmp_path, distribution, sourced):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_the_wait_for_a_camera(flown, env, tmp_path, distribution, number):
-    words = ["fly", flown[0], "--ros2", "--ros-args", "-r", "image:=/cam/image_raw"]
+    words = [*FLY, flown[0], "--ros2", "--ros-args", "-r", "image:=/cam/image_raw"]
     flying = Flying(env, tmp_path, distribution, True, *words)
     deadline = time.monotonic() + LONGEST_S
     while "camera_info" not in flying.said():
@@ -160,16 +161,16 @@ def test_signals_end_the_wait_for_a_camera(flown, env, tmp_path, distribution, n
 
 
 def test_parameters_of_a_sourced_node(flown, env, tmp_path, distribution):
-    """The ROS package's own file and entry point; the parameters of the node are those of it."""
-    package = Path(__file__).parents[2] / "ros2" / "orthonav_ros"
-    parameters = package / "config" / "params.yaml"
+    """By the entry point and the file of the ROS package, with the arguments of a launch file."""
+    parameters = PACKAGE / "config" / "params.yaml"
     asked = tmp_path / "asked.yaml"
     asked.write_text(parameters.read_text().replace("map_frame: map", "map_frame: earth"))
-    words = ["--ros2", "--ros-args", "--params-file", asked, "--log-level", "error"]
-    flying = Flying(env, tmp_path, distribution, True, "fly", flown[0], *words)
+    words = [PACKAGE / "orthonav_ros" / "node.py", flown[0], "--ros-args", "--log-level", "error"]
+    words += ["--ros-args", "-r", "__node:=orthonav", "-r", "__ns:=/uav1", "--params-file", asked]
+    flying = Flying(env, tmp_path, distribution, True, *words, "-r", "image:=/cam/image_raw")
     get = (
         "import rclpy, sys; from rcl_interfaces.srv import GetParameters as G; rclpy.init(); "
-        "n = rclpy.create_node('asks'); c = n.create_client(G, '/orthonav/get_parameters'); "
+        "n = rclpy.create_node('asks'); c = n.create_client(G, '/uav1/orthonav/get_parameters'); "
         "assert c.wait_for_service(60); f = c.call_async(G.Request(names=['map_frame'])); "
         "rclpy.spin_until_future_complete(n, f, timeout_sec=60); "
         "print(f.result().values[0].string_value)"
