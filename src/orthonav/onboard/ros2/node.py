@@ -5,7 +5,7 @@ QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Qualit
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -35,6 +35,8 @@ _POLICIES = {
 }
 _BLOCK_NS = 10_000_000
 _MOST_ENDPOINTS = 10_000
+_ALIVE = 16
+"""State of an instance in DDS."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class Node(Graph):
         self._conditions: list[Any] = []
         self._waitset = self._core.WaitSet(self._participant)
         self._publishers, self._subscribers = (
-            self._alive(builtin.BuiltinDataReader(self._participant, topic))
+            Endpoints(builtin.BuiltinDataReader(self._participant, topic))
             for topic in (
                 builtin.BuiltinTopicDcpsPublication,
                 builtin.BuiltinTopicDcpsSubscription,
@@ -118,7 +120,7 @@ class Node(Graph):
 
     def close(self) -> None:
         """See `Graph.close`."""
-        self._publishers = self._subscribers = None
+        del self._publishers, self._subscribers
         for held in (self._conditions, self._subscriptions, self._writers):
             held.clear()
         self._waitset = self._participant = self._domain = None
@@ -146,16 +148,17 @@ class Node(Graph):
 
     def _mismatches(self) -> dict[str, str]:
         found: dict[str, str] = {}
-        publishers, subscribers = map(self._discovered, (self._publishers, self._subscribers))
+        self._publishers.update()
+        self._subscribers.update()
         for each in self._subscriptions:
             why = _unmatched(each.reader.get_requested_incompatible_qos_status(), "a publisher")
             matched = each.reader.get_matched_publications()
-            for other in _others(publishers, each.topic, matched):
+            for other in self._publishers.others(each.topic, matched):
                 self._mismatch(found, each.topic, each.kind, other, why)
         for writer in self._writers:
             why = _unmatched(writer.writer.get_offered_incompatible_qos_status(), "a subscriber")
             matched = writer.writer.get_matched_subscriptions()
-            for other in _others(subscribers, writer.topic, matched):
+            for other in self._subscribers.others(writer.topic, matched):
                 self._mismatch(found, writer.topic, writer.kind, other, why)
         return found
 
@@ -183,19 +186,34 @@ class Node(Graph):
                 handled += 1
         return handled
 
-    def _alive(self, reader: Any) -> Any:
-        """Condition for the endpoints that exist."""
-        states = self._core
-        mask = states.ViewState.Any | states.InstanceState.Alive | states.SampleState.Any
-        return states.ReadCondition(reader, mask)
 
-    def _discovered(self, condition: Any) -> list[Any]:
-        """The endpoints of a condition that exist."""
+class Endpoints:
+    """Topic and type of the publishers or subscribers of a domain, by handle. Mutable."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+        self._alive: dict[int, tuple[str, str]] = {}
+
+    def others(self, topic: str, matched: Sequence[int]) -> Iterator[str]:
+        """Message types of those of a topic beside the handles that are matched."""
+        handles = {handle % 2**64 for handle in matched}
+        for handle, (name, kind) in self._alive.items():
+            if name == f"rt{topic}" and handle not in handles:
+                yield ros_type_name(kind)
+
+    def update(self) -> None:
+        """Take note of what came and left."""
         try:
-            return list(condition.reader.read(_MOST_ENDPOINTS, condition=condition))
+            changes = self._reader.take(_MOST_ENDPOINTS)
         except Exception as error:  # a policy of another vendor that the library cannot name
             log.debug("discovery: %r", error)
-            return []
+            return
+        for each in changes:
+            info = each.sample_info
+            if info.instance_state != _ALIVE:
+                self._alive.pop(info.instance_handle, None)
+            elif info.valid_data:
+                self._alive[info.instance_handle] = str(each.topic_name), str(each.type_name)
 
 
 def _discovery(arguments: RosArguments) -> str:
@@ -209,14 +227,6 @@ def _discovery(arguments: RosArguments) -> str:
             return ""
         inner = f"<ParticipantIndex>auto</ParticipantIndex><Peers>{''.join(peers)}</Peers>"
     return f"<CycloneDDS><Domain><Discovery>{inner}</Discovery></Domain></CycloneDDS>"
-
-
-def _others(endpoints: list[Any], topic: str, matched: list[int]) -> Iterator[str]:
-    """Message types of the endpoints of a topic beside those that are matched."""
-    handles = {handle % 2**64 for handle in matched}
-    for each in endpoints:
-        if each.topic_name == f"rt{topic}" and each.sample_info.instance_handle not in handles:
-            yield ros_type_name(str(each.type_name))
 
 
 def _unmatched(status: Any, other: str) -> str:
