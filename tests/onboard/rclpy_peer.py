@@ -134,6 +134,7 @@ def main():
         peer.number(options.seconds)
     else:
         peer.fly(np.load(options.flight), options.seconds, options.enough, options.reliable)
+    say(nodes=peer.node.get_node_names())
     peer.node.destroy_node()
     rclpy.shutdown()
 

@@ -137,6 +137,7 @@ def test_a_flight_in_a_graph(flown, env, tmp_path, distribution, sourced):
     number = {each["stamp_ns"]: each["image"] for each in of_kind(heard, "image")}
     poses = {each["stamp_ns"]: each["pose"] for each in of_kind(heard, "pose")}
     fixes = of_kind(heard, "fix")
+    assert "orthonav" in heard[-1]["nodes"]
     assert len(fixes) >= ENOUGH, flying.said()
     for each in fixes:  # stamped as its image
         lat, lon, altitude = each["fix"]

@@ -11,6 +11,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from orthonav.errors import OutputError
+from orthonav.onboard.ros2 import names
 from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.graph import Graph, Handler
 from orthonav.onboard.ros2.messages import (
@@ -77,10 +78,12 @@ class Node(Graph):
         builtin = ros2_module("cyclonedds.builtin")
         domain = ros2_module("cyclonedds.domain")
         self._domain = self._opened(domain, arguments)
-        self._participant = domain.DomainParticipant(arguments.domain_id)
+        made = self._qos.Qos(self._qos.Policy.Userdata(names.USER_DATA))
+        self._participant = domain.DomainParticipant(arguments.domain_id, made)
         self._subscriptions: list[Subscription] = []
         self._writers: list[DdsWriter] = []
         self._conditions: list[Any] = []
+        self._names = self._writer(names.TOPIC, names.KIND, depth=1, latched=True)
         self._waitset = self._core.WaitSet(self._participant)
         self._publishers, self._subscribers = (
             Endpoints(builtin.BuiltinDataReader(self._participant, topic))
@@ -96,21 +99,20 @@ class Node(Graph):
         """See `Graph.subscribe`."""
         qos = self._made_qos(kind, reliable=reliable, depth=depth)
         sub = ros2_module("cyclonedds.sub")
-        reader = sub.DataReader(self._participant, self._topic(topic, kind), qos)
+        reader = sub.DataReader(self._participant, self._topic(f"rt{topic}", kind), qos)
         states = self._core
         mask = states.ViewState.Any | states.InstanceState.Any | states.SampleState.NotRead
         self._conditions.append(states.ReadCondition(reader, mask))
         self._waitset.attach(self._conditions[-1])
         self._subscriptions.append(Subscription(topic, kind, reader, depth, handler))
+        self._announce()
 
     def advertise(
         self, topic: str, kind: str, *, depth: int = 10, latched: bool = False
     ) -> DdsWriter:
         """See `Graph.advertise`."""
-        qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
-        pub = ros2_module("cyclonedds.pub")
-        made = pub.DataWriter(self._participant, self._topic(topic, kind), qos)
-        self._writers.append(DdsWriter(topic, kind, self.definitions, made))
+        self._writers.append(self._writer(f"rt{topic}", kind, depth=depth, latched=latched))
+        self._announce()
         return self._writers[-1]
 
     def spin(self, timeout_s: float) -> int:
@@ -120,7 +122,7 @@ class Node(Graph):
 
     def close(self) -> None:
         """See `Graph.close`."""
-        del self._publishers, self._subscribers
+        del self._publishers, self._subscribers, self._names
         for held in (self._conditions, self._subscriptions, self._writers):
             held.clear()
         self._waitset = self._participant = self._domain = None
@@ -162,9 +164,24 @@ class Node(Graph):
                 self._mismatch(found, writer.topic, writer.kind, other, why)
         return found
 
+    def _announce(self) -> None:
+        """Tell the graph which readers and writers belong to this node."""
+        readers = [each.reader for each in self._subscriptions]
+        writers = [each.writer for each in self._writers]
+        own = self._participant
+        message = names.node_entities(self.definitions, self.arguments, own, readers, writers)
+        self._names.write(message)
+
+    def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> DdsWriter:
+        """A writer of a topic of DDS."""
+        qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
+        pub = ros2_module("cyclonedds.pub")
+        made = pub.DataWriter(self._participant, self._topic(name, kind), qos)
+        return DdsWriter(name.removeprefix("rt"), kind, self.definitions, made)
+
     def _topic(self, name: str, kind: str) -> Any:
         made = ros2_module("cyclonedds.topic")
-        return made.Topic(self._participant, f"rt{name}", self.definitions.dds_type(kind))
+        return made.Topic(self._participant, name, self.definitions.dds_type(kind))
 
     def _made_qos(self, kind: str, *, reliable: bool, depth: int, latched: bool = False) -> Any:
         policy = self._qos.Policy
