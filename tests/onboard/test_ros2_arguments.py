@@ -113,6 +113,8 @@ def test_other_arguments_of_ros_are_taken():
     assert (made.log_level, made.silenced) == (logging.WARNING, {"rosout", "external-lib"})
     assert made.passed[4:6] == ("-e", "/enclave")
     assert parsed("--log-level", "orthonav:=DEBUG").log_level == logging.DEBUG
+    words = "-r", "__ns:=/uav1", "--log-level", "uav1.orthonav:=fatal"
+    assert parsed(*words).log_level == logging.CRITICAL
 
 
 @pytest.mark.parametrize("text", ["-1", "233", "x", "1.5"])

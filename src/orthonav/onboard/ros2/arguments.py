@@ -154,6 +154,7 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     only_local = environment.get("ROS_LOCALHOST_ONLY") == "1"
     peers = environment.get("ROS_STATIC_PEERS", "").split(";")
     full_name = f"{namespace.rstrip('/')}/{node}"
+    logger = full_name.strip("/").replace("/", ".")
     made = RosArguments(
         node,
         namespace,
@@ -165,7 +166,7 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
         is_alone=not only_local and scope == "OFF",
         peers=tuple(peer.strip() for peer in peers if peer.strip()),
         cyclonedds_uri=environment.get("CYCLONEDDS_URI", ""),
-        log_level=next((n for name, n in reversed(given.levels) if name in ("", node)), 0),
+        log_level=next((n for name, n in reversed(given.levels) if name in ("", logger)), 0),
         silenced=frozenset(given.silenced),
         passed=tuple(given.passed),
     )
