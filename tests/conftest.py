@@ -56,6 +56,7 @@ LONGEST = (
     "test_cli.py",
     "test_in_browser.py",
     "test_ros2.py",
+    "test_ros2_graph.py",
     "test_demo.py",
     "test_check_command.py",
     "test_tracker.py",

@@ -48,6 +48,10 @@ class CameraError(OrthonavError, ValueError):
     """Camera parameters are impossible or do not belong to the images."""
 
 
+class StoppedError(CameraError):
+    """The program was stopped while it waited for the calibration of a camera."""
+
+
 class CheckError(OrthonavError, ValueError):
     """A check was asked for under conditions that cannot be: a share above 1, a negative seed."""
 

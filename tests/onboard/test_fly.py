@@ -120,7 +120,9 @@ class Flight:
             lines=[JsonOut(self.lines), Narrator(self.said, clocks, inputs)],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
-        rest = {name: options.pop(name) for name in ("diagnosis", "start") if name in options}
+        rest = {
+            name: options.pop(name) for name in ("diagnosis", "start", "fresh") if name in options
+        }
         options = FlyOptions(**options)
         self.runner = Runner(
             self.newest,
@@ -653,6 +655,27 @@ def test_recorded_telemetry_needs_no_autopilot(begin):
     assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [telemetry]
 
 
+def test_time_that_goes_back_begins_the_track_again(begin, caplog):
+    """A bag that is played in a loop: the second pass knows nothing of the first but the start."""
+    start, second = Prior(48.0, 2.0, 5.0), FakeLocator()
+    flight = begin(recorded=True, start=lambda: start, fresh=lambda: second)
+    for number, time_s in enumerate((100, 101, 100.5, 50, 51)):
+        grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
+        telemetry = Telemetry(round(time_s * S), 1.0, 2.0, 3.0, 50.0)
+        flight.newest.put(
+            CameraImage(
+                number, "a", flight.time.now_ns, telemetry.time_ns, grey, telemetry=telemetry
+            )
+        )
+        flight.runner.step(0)
+    first = flight.locator.seen
+    assert [each.time_ns / S for each in first] == [100, 101, 100.5]
+    assert [each.time_ns / S for each in second.seen] == [50, 51]
+    for seen in (first, second.seen):
+        assert [each.prior for each in seen][:2] == [start, None]
+    assert caplog.text.count("time went back by 50.5 s") == 1
+
+
 def test_a_map_with_terrain_gives_heights_above_ground(begin):
     """Also the first view, by its start position, and where only a height above sea is known."""
     north_deg = 10.0  # metres of terrain per degree
@@ -683,6 +706,19 @@ def test_gps_input_has_the_altitude_by_the_terrain_where_the_autopilot_knows_non
     flight.views(3)  # 100 m above the place of take-off
     (message,) = flight.port.sent("GPS_INPUT")
     assert message["alt"] == pytest.approx(400.0) and not message["ignore_flags"] & 1
+
+
+def test_the_altitude_by_a_measured_height_is_that_over_the_terrain_at_the_fix(begin, monkeypatch):
+    heights = FlownHeights(lambda lat, lon: 300.0 + 0 * lat, (np.zeros(2), np.zeros(2)))
+    flight, vehicles = begin(recorded=True, heights=heights), []
+    monkeypatch.setattr(
+        flight.runner._publisher, "publish", lambda *given, **_: vehicles.append(given[2])
+    )
+    telemetry = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
+    grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
+    flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
+    flight.runner.step(0)
+    assert [each.amsl_m for each in vehicles] == [350.0]
 
 
 @pytest.mark.parametrize(

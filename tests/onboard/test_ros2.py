@@ -32,6 +32,7 @@ from orthonav.geo.camera import attitude_of
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
+from orthonav.onboard.ros2.lost import LostImages
 from orthonav.onboard.ros2.messages import Definitions
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
@@ -330,6 +331,61 @@ def test_an_imu_without_orientation_is_no_attitude(peer, reading):
     assert math.isnan(flying.read().telemetry.yaw_deg)
 
 
+@pytest.mark.parametrize(
+    ("std_deg", "expected"),
+    [(0.0, 3.0), (0.1, 1.5), (5.0, 5.0), (57.3, 3.0), (math.nan, 3.0)],  # MAVROS: 1 rad
+)
+def test_the_covariance_of_an_imu_is_that_of_the_tilt(peer, reading, std_deg, expected):
+    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
+    flying = reading()
+    matched(peer, flying)
+    now_ns = time.time_ns()
+    message = imu(now_ns)
+    variance = math.radians(std_deg) ** 2
+    message.orientation_covariance = [variance, 0.0, 0.0, 0.0, variance / 4, 0.0, 0.0, 0.0, 9.0]
+    peer.write("/imu/data", message)
+    peer.write("/cam/image_raw", image(now_ns))
+    assert flying.read().telemetry.tilt_std_deg == pytest.approx(expected)
+
+
+def test_a_publisher_that_leaves_is_no_message(peer, reading):
+    flying = reading()
+    for topic in ("/cam/camera_info", "/imu/data", "/range", "/rel_alt"):
+        other = Peer(os.environ["ROS_DOMAIN_ID"])
+        other.advertise(topic, KINDS[topic])
+        matched(other, flying)
+        other.write(topic, ros.zeros(KINDS[topic]))
+        wait_for(lambda: flying.node.spin(0.01))  # what comes later only says that it left
+        other.close()
+    assert flying.read(1.0) is None
+    assert not flying.node.undecodable
+
+
+@pytest.mark.parametrize(
+    ("arrive", "is_lost"),
+    [
+        (lambda n: True, False),
+        (lambda n: n % 10 != 3, False),  # a tenth
+        (lambda n: n % 3 == 0, False),  # a node passes every third one on
+        (lambda n: n % 10 in (0, 1, 5, 9), True),
+        (lambda n: n in (0, 40, 41, 75, 90), True),
+    ],
+)
+def test_lost_images_are_a_problem_of_their_topic(arrive, is_lost):
+    lost, order = LostImages(), np.random.default_rng(0).permutation(100)
+    for number in order:  # what arrives first does not matter
+        lost.infos.append(int(number) * S // 10)
+        if arrive(number):
+            lost.images.append(int(number) * S // 10)
+    assert (lost.reason() is not None) is is_lost
+
+
+def test_images_without_camera_info_are_not_lost():
+    lost = LostImages()
+    lost.images.extend(range(0, 100 * S, S))
+    assert lost.reason() is None
+
+
 def test_stamps_that_go_back(peer, reading, caplog):
     advertised(peer, "/cam/image_raw", "/imu/data", "/range")
     flying = reading()
@@ -564,6 +620,28 @@ def test_covariances_are_for_filters(peer, publishing):
     assert full[:2, :2] == pytest.approx(COV * averaged)
 
 
+def test_covariances_of_the_fix_on_request(env, peer, publishing):
+    flying = publishing("-p", "covariance:=fix")
+    for time_s in (7, 8, 9):
+        flying.publish(fix(), time_s * S)
+    wait_for(lambda: len(peer.heard("/orthonav/fix")) > 2)
+    for each in peer.heard("/orthonav/fix"):
+        full = np.reshape(each.position_covariance, (3, 3))
+        assert full[:2, :2] == pytest.approx(COV)
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [("none", math.nan), ("terrain", 512.0), ("home", 260.0), ("-3.5", -3.5)],
+)
+def test_an_altitude_on_request(peer, publishing, asked, expected):
+    flying = publishing("-p", f"altitude:={asked}", origin_alt_m=200.0)
+    flying.publish(fix(), reported=VehicleState(None, amsl_m=512.0, home_m=60.0))
+    (found,) = wait_for(lambda: peer.heard("/orthonav/fix"))
+    assert found.altitude == pytest.approx(expected, nan_ok=True)
+    assert found.position_covariance[8] > 1e6  # not measured
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -627,10 +705,19 @@ def test_a_transform_on_request(peer, publishing):
 def test_health_is_a_diagnostic(peer, publishing):
     flying = publishing("-r", "__node:=down")
     for level, reasons in (("OK", []), ("DEGRADED", ["lost"]), ("FAILED", ["no_camera"])):
-        flying.whole.health({"health": level, "reasons": reasons, "state": None})
+        flying.whole.health(
+            {"health": level, "reasons": reasons, "state": None, "counts": {"late": 2}}
+        )
     found = wait_for(lambda: len(peer.heard("/diagnostics")) == 3 and peer.heard("/diagnostics"))
     assert [int.from_bytes(bytes([each.status[0].level])) for each in found] == [0, 1, 2]
     assert [each.status[0].message for each in found] == ["OK", "lost", "no_camera"]
+    values = {each.key: each.value for each in found[1].status[0].values}
+    assert values == {
+        "health": "DEGRADED",
+        "reasons": "lost",
+        "state": "",
+        "counts.late": "2",
+    }
     assert found[0].status[0].name == "down: position" and found[0].header.stamp.sec == 5
 
 
@@ -645,7 +732,12 @@ def test_a_subscriber_whose_qos_cannot_match_is_named(env, peer, publishing):
     assert "durability" in wait_for(found)
     flying.whole.health({"health": "OK", "reasons": []})
     (said,) = wait_for(lambda: peer.heard("/diagnostics"))
-    assert "/orthonav/fix" in said.status[0].message
+    assert "/orthonav/fix" in said.status[0].message and said.status[0].level == 1
+    del peer._readers["/orthonav/fix"]  # it leaves
+    wait_for(lambda: found() is None)
+    flying.whole.health({"health": "OK", "reasons": []})
+    said = wait_for(lambda: peer.heard("/diagnostics")[1:])[0]
+    assert (said.status[0].message, said.status[0].level) == ("OK", 0)
 
 
 # The whole command in a process of its own, over the loopback.
@@ -790,18 +882,24 @@ def test_a_replayed_bag_is_flown(flown, env, peer, tmp_path, sim_time):
 
 
 @pytest.mark.long
-def test_sigterm_ends_the_wait_for_camera_info(flown, env, peer, tmp_path):
+@pytest.mark.parametrize("has_own", [False, True], ids=["", "CYCLONEDDS_URI"])
+def test_sigterm_ends_the_wait_for_camera_info(flown, env, peer, tmp_path, has_own):
     """On the loopback by ROS_LOCALHOST_ONLY, as ROS users ask for it."""
     errors = tmp_path / "errors"
     peer.advertise("/cam/image_raw", ros.Image)
-    local = {**env, "CYCLONEDDS_URI": "", "ROS_LOCALHOST_ONLY": "1"}
+    peer.subscribe("/diagnostics", ros.DiagnosticArray)
+    local = {**env, "ROS_LOCALHOST_ONLY": "1"} | ({} if has_own else {"CYCLONEDDS_URI": ""})
     running = process(local, errors, "fly", flown[0], "--ros2", "--ros-args", *REMAPPED)
     try:
         wait_for(peer.matched, "fly joins the graph")
         wait_for(lambda: "no message on /cam/camera_info" in errors.read_text())
     finally:
         code = stopped(running)
-    assert code == 1 and "--camera" in errors.read_text().splitlines()[-1]
+    assert code == 0 and "--camera" in errors.read_text().splitlines()[-1]
+    heard = peer.heard("/diagnostics")
+    assert heard[0].status[0].message == "no_camera"  # from the first second on
+    assert {each.status[0].level for each in heard} == {2}
+    assert "camera_info" in {v.key: v.value for v in heard[0].status[0].values}["waiting"]
 
 
 def test_conflicting_options_end_with_one_line(flown, run, env):

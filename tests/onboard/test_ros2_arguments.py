@@ -1,12 +1,14 @@
 """Names, remapping rules and parameters as a ROS 2 node resolves them."""
 
+import logging
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import VariantError
+from orthonav.errors import MissingFileError, VariantError
 from orthonav.onboard.ros2.arguments import RosArguments, ros_arguments
-from orthonav.onboard.ros2.messages import dds_type_name, ros_type_name
+from orthonav.onboard.ros2.messages import ros_type_name
 
 
 def parsed(*words, **environment):
@@ -43,6 +45,8 @@ def test_parameters_and_environment():
     assert made.parameters.use_sim_time is True and made.parameters.map_frame == "earth"
     assert made.domain_id == 42 and made.is_local is False
     assert parsed(ROS_LOCALHOST_ONLY="1").is_local
+    assert parsed(ROS_AUTOMATIC_DISCOVERY_RANGE="OFF").is_alone
+    assert parsed(ROS_STATIC_PEERS="10.0.0.2; host").peers == ("10.0.0.2", "host")
     assert parsed(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST").is_local
     assert parsed(ROS_NAMESPACE="/uav").resolved("image") == "/uav/image"
     assert parsed("-r", "__ns:=/b", ROS_NAMESPACE="a").resolved("image") == "/b/image"
@@ -53,21 +57,64 @@ def test_parameters_and_environment():
     [
         (("-r", "image"), "-r image"),
         (("-r",), "-r FROM:=TO"),
-        (("--params-file", "x.yaml"), "--params-file"),
+        (("--params-file", "x.yaml"), "x.yaml"),
+        (("--params-files", "x.yaml"), "--params-files"),
+        (("--log-level", "loud"), "'loud'"),
+        (("-p", "altitude:=high"), "'high'"),
+        (("-p", "covariance:=mine"), "filter or fix"),
         (("-r", "image:=a//b"), "'a//b'"),
         (("-r", "image:=2nd"), "'2nd'"),
         (("-r", "ima ge:=a"), "'ima ge'"),
         (("-r", "__ns:=/a/"), "'/a/'"),
         (("-r", "__node:=a/b"), "'a/b'"),
         (("-p", "use_sim_time:=maybe"), "'maybe'"),
-        (("-p", "colour:=red"), "use_sim_time"),
         (("-p", "image_transport:=theora"), "raw or compressed"),
     ],
 )
 def test_invalid_arguments_are_named(words, said):
-    with pytest.raises(VariantError) as error:
+    with pytest.raises((VariantError, MissingFileError)) as error:
         parsed(*words)
     assert said in str(error.value)
+
+
+def test_parameters_of_files_are_those_of_the_node(tmp_path, caplog):
+    """As `ros2 launch` passes them: tables by node, names and patterns, the last one counts."""
+    path = tmp_path / "params.yaml"
+    path.write_text(
+        "/**:\n  ros__parameters: {use_sim_time: true, map_frame: all, qos: {depth: 3}}\n"
+        "/uav1/orthonav:\n  ros__parameters: {map_frame: mine, altitude: 12.5}\n"
+        "uav1:\n  orthonav:\n    ros__parameters: {base_frame: drone}\n"
+        "/uav2/orthonav:\n  ros__parameters: {publish_tf: true}\n"
+    )
+    made = parsed("-r", "__ns:=/uav1", "--params-file", str(path)).parameters
+    assert (made.use_sim_time, made.publish_tf, made.altitude) == (True, False, "12.5")
+    assert (made.map_frame, made.base_frame) == ("mine", "drone")
+    assert "qos.depth is ignored" in caplog.text
+    before = parsed("-p", "map_frame:=x", "--params-file", str(path)).parameters
+    after = parsed("--params-file", str(path), "-p", "orthonav:map_frame:=x").parameters
+    assert (before.map_frame, after.map_frame) == ("all", "x")
+    assert parsed("-p", "other:map_frame:=x").parameters.map_frame == "map"
+
+
+@pytest.mark.parametrize("text", ["[1, 2", "- a", "orthonav: {map_frame: x}", "", "\x00"])
+def test_a_file_without_parameters_is_refused(tmp_path, text):
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    with pytest.raises(VariantError, match="parameter file"):
+        parsed("--params-file", str(path))
+
+
+def test_other_arguments_of_ros_are_taken():
+    made = parsed(
+        *("--ros-args", "--log-level", "warn", "--log-level", "rcl:=debug", "-e", "/enclave"),
+        *("--disable-rosout-logs", "--disable-stdout-logs", "--enable-stdout-logs"),
+        *("--disable-external-lib-logs", "-p", "colour:=red"),
+    )
+    assert (made.log_level, made.silenced) == (logging.WARNING, {"rosout", "external-lib"})
+    assert made.passed[4:6] == ("-e", "/enclave")
+    assert parsed("--log-level", "orthonav:=DEBUG").log_level == logging.DEBUG
+    words = "-r", "__ns:=/uav1", "--log-level", "uav1.orthonav:=fatal"
+    assert parsed(*words).log_level == logging.CRITICAL
 
 
 @pytest.mark.parametrize("text", ["-1", "233", "x", "1.5"])
@@ -90,6 +137,5 @@ def test_expansion_is_absolute_and_idempotent(space, name, node):
 
 
 def test_type_names_of_dds():
-    assert dds_type_name("sensor_msgs/msg/Image") == "sensor_msgs::msg::dds_::Image_"
     assert ros_type_name("sensor_msgs::msg::dds_::Image_") == "sensor_msgs/msg/Image"
     assert ros_type_name("Other::Thing") == "Other::Thing"

@@ -1,6 +1,7 @@
 """`orthonav fly`: position messages to an autopilot, from a live camera or a recording."""
 
 import argparse
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -180,7 +181,8 @@ def _add_ros2(group: argparse._ActionsContainer) -> None:
         nargs=argparse.REMAINDER,
         default=[],
         metavar="ARGS",
-        help="must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE",
+        help="must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE, "
+        "--params-file FILE, --log-level LEVEL",
     )
 
 
@@ -367,7 +369,7 @@ def run(options: argparse.Namespace) -> None:
     import signal
     import threading
 
-    from orthonav.cli.flying import runner
+    from orthonav.errors import StoppedError
 
     _check(options)
     stopping = threading.Event()
@@ -376,8 +378,14 @@ def run(options: argparse.Namespace) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
             before[number] = signal.signal(number, lambda *_: stopping.set())
     try:
+        from orthonav.cli.flying import runner  # takes a while, in which it may be stopped
+
         with ExitStack() as stack:
-            made = runner(options, stopping, stack)
+            try:
+                made = runner(options, stopping, stack)
+            except StoppedError as error:  # as it was asked to: no failure
+                logging.getLogger(__name__).warning("%s", error)
+                return
             gc.collect()
             gc.freeze()  # a full collection over the loaded modules takes as long as a view
             stack.callback(gc.unfreeze)

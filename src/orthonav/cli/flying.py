@@ -77,10 +77,12 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     localizer = Localizer(opened, plan=search_plan(options))
     start = start_of(options, clocks, localizer)
     heading_known = options.heading == "known"
-    tracker = Tracker(
-        localizer, heading_known=heading_known, model=model_of(mount) if mount else None
-    )
-    locator: Locator = MountCorrected(tracker, mount) if mount else tracker
+    model = model_of(mount) if mount else None
+
+    def locator() -> Locator:
+        tracker = Tracker(localizer, heading_known=heading_known, model=model)
+        return MountCorrected(tracker, mount) if mount else tracker
+
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
@@ -129,7 +131,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     return Runner(
         newest,
         camera,
-        locator,
+        locator(),
         publisher,
         fly,
         clocks,
@@ -139,6 +141,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
             localizer, least, has_start=bool(options.start or options.state)
         ),
         start=start,
+        fresh=locator,
         notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),

@@ -1,15 +1,19 @@
 """`orthonav fly --ros2`: the node with its reader and publisher, made from the options."""
 
 import argparse
+import logging
+import math
 import os
 import threading
 from contextlib import ExitStack
 
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.node import Node
+from orthonav.onboard.ros2.graph import Graph
 from orthonav.onboard.ros2.publisher import Ros2Publisher
+from orthonav.onboard.ros2.rcl import joined_graph
 from orthonav.onboard.ros2.reader import Ros2Reader
+from orthonav.onboard.ros2.rosout import Rosout
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 
@@ -26,8 +30,9 @@ def joined(
     `frame` is the local frame of the map; its centre is the origin of the ROS map frame unless
     `--origin` is given.
     """
-    node = Node(ros_arguments(options.ros_args, os.environ))
+    node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
     stack.callback(node.close)
+    _log_as_asked(node, stack)
     reader = Ros2Reader(
         node,
         TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
@@ -41,8 +46,29 @@ def joined(
         node,
         origin,
         reader.now_ns,
+        origin_alt_m=options.origin[2] if options.origin else math.nan,
         min_std_m=options.min_std_m,
         min_confidence=min_confidence,
         silent=options.dry_run,
     )
+    reader.report_wait = lambda why: publisher.health(
+        {"health": "FAILED", "reasons": ["no_camera"], "waiting": why}
+    )
     return reader, publisher
+
+
+def _log_as_asked(node: Graph, stack: ExitStack) -> None:
+    """The log on `/rosout`, at the level of `--log-level` and where it is wanted, until the end."""
+    own, arguments = logging.getLogger("orthonav"), node.arguments
+    level, propagates = own.level, own.propagate
+    handler = logging.NullHandler() if "rosout" in arguments.silenced else Rosout(node)
+    own.addHandler(handler)
+    own.setLevel(arguments.log_level or level)
+    own.propagate = propagates and "stdout" not in arguments.silenced
+
+    def restore() -> None:
+        own.removeHandler(handler)
+        own.setLevel(level)
+        own.propagate = propagates
+
+    stack.callback(restore)

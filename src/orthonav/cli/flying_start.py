@@ -23,16 +23,17 @@ def start_of(
 ) -> Callable[[], Prior | None]:
     """Function that gives the prior of the first view.
 
-    It is the saved position if that is recent, else `--start`, else None.
+    It is the saved position if that is recent, but once only, else `--start`, else None.
     """
     given = given_start(options, localizer)
-    saved = load(options.state) if options.state else None
+    saved = [load(options.state)] if options.state else []
 
     def prior() -> Prior | None:
-        if saved is None:
+        last = saved.pop() if saved else None
+        if last is None:
             return given
-        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(saved, age_s, options.state_max_age_s) or given
+        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        return prior_of(last, age_s, options.state_max_age_s) or given
 
     return prior
 

@@ -175,6 +175,12 @@ class FlownHeights:
             if self._newest.time_ns == time_ns and reported is not None:
                 self._fit.take(outcome, reported[0])
 
+    def ground_m(self, fix: Fix) -> float:
+        """Height of the terrain above sea level at a fix; NaN where the terrain has none."""
+        std_m = math.sqrt(float(np.trace(fix.cov_en_m2)) / 2)
+        below = ground_around(self._terrain, (fix.lat_deg, fix.lon_deg), std_m)
+        return math.nan if below is None else below.height_m
+
     def _place(self, telemetry: Telemetry) -> tuple[Place | None, float]:
         """Expected position and its standard deviation per axis."""
         found: list[tuple[float, Place | None]] = []

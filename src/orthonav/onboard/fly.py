@@ -52,6 +52,8 @@ TICK_NS = 10**9
 """Interval of health and state."""
 UTC_JUMP_NS = 200_000_000
 """UTC that moves by more than this against the monotonic clock within a tick has been set."""
+JUMP_NS = 10**9
+"""Recorded images that are earlier than the one before by more belong to another run."""
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
 Velocity = tuple[float, float]
@@ -144,11 +146,13 @@ class Runner:
         sink: LogSink | None = None,
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
+        fresh: Callable[[], Locator] | None = None,
         notifier: Notifier | None = None,
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
         """`start` gives the prior of the first view; it is called when that view is located.
+        `fresh` makes another locator when recorded time goes back, and a flight begins again.
         `latency`: that of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
@@ -156,6 +160,8 @@ class Runner:
         self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
         self._start_check: StartCheck | None = None
+        self._begin, self._fresh = start, fresh
+        self._time_ns = 0
         self._notifier = notifier or Notifier("")
         self._gnss = gnss
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
@@ -221,6 +227,7 @@ class Runner:
             image = replace(
                 image, exposed_ns=arrived_ns - delay_ns, time_ns=image.time_ns - delay_ns
             )
+        self._restart_after_jump(image.time_ns)
         vehicle, camera = VehicleState(None), self._camera
         refused = self._map_changed() or self._bad_image(image)
         if refused is None and image.grey is not None:
@@ -245,6 +252,17 @@ class Runner:
             return self._located(image, view, vehicle, latency)
         finally:
             self._observe(image, camera)
+
+    def _restart_after_jump(self, time_ns: int) -> None:
+        """Forget the track where time goes back: a bag or a simulation that begins again."""
+        before_ns, self._time_ns = self._time_ns, time_ns
+        if self._fresh is None or not self.options.recorded or time_ns > before_ns - JUMP_NS:
+            return
+        log.warning("time went back by %.1f s: the track begins again", (before_ns - time_ns) / 1e9)
+        self._locator, self._start, self._start_check = self._fresh(), self._begin, None
+        self._tracked_ns = self._travelled = None
+        if self.options.heights is not None:
+            self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
 
     def _refused(self, image: CameraImage, reason: NoFix, vehicle: VehicleState) -> ViewResult:
         """Log and publish an image that cannot be located."""
@@ -315,6 +333,7 @@ class Runner:
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
+        vehicle = self._with_altitude(vehicle, outcome, known)
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, reported, latency.std_s)
         as_stated = latency is None or latency.stated
@@ -354,6 +373,18 @@ class Runner:
         if self._start_check is not None:
             self._start_check.moved(telemetry)
         return view
+
+    def _with_altitude(
+        self, vehicle: VehicleState, outcome: Fix | NoFix, telemetry: Telemetry
+    ) -> VehicleState:
+        """The vehicle with the altitude by the terrain at a fix, where none was reported."""
+        heights = self.options.heights
+        if heights is None or not isinstance(outcome, Fix) or math.isfinite(vehicle.amsl_m):
+            return vehicle
+        try:
+            return replace(vehicle, amsl_m=heights.ground_m(outcome) + telemetry.agl_m)
+        except MapFileError:  # reported when the next view needs it
+            return vehicle
 
     def _over_gap(
         self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState

@@ -32,7 +32,12 @@ class ViewOutput(Protocol):
 
 
 class PositionOutput(Protocol):
-    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`."""
+    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`.
+
+    `for_filter`: whether it gets covariances for a filter instead of those of the fixes.
+    """
+
+    for_filter: bool
 
     def position(
         self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
@@ -136,7 +141,10 @@ class Publisher:
         if self._graph and self.gate.due("ROS2", self._clocks.mono_ns()):
             stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
             self._each(
-                self._graph, lambda out: sent.extend(out.position(stated, vehicle, stamp_ns))
+                self._graph,
+                lambda out: sent.extend(
+                    out.position(stated if out.for_filter else estimate, vehicle, stamp_ns)
+                ),
             )
             self._covariance.sent("ROS2", exposed_ns)
         return tuple(sent)

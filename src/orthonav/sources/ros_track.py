@@ -6,7 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from orthonav.sources.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
+from orthonav.sources.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+    Angles,
+    enu_from_ros_camera,
+    rotations_of_wxyz,
+)
 from orthonav.sources.ros_topics import Topics, is_above_home
 from orthonav.sources.track import (
     RecordedTrack,
@@ -17,6 +22,8 @@ from orthonav.sources.track import (
 )
 
 Reader = Any
+LEAST_TILT_STD_DEG, MOST_TILT_STD_DEG = 1.5, 10.0
+"""Between them an IMU is believed about its orientation; MAVROS states 57 deg by default."""
 
 
 def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> RecordedTrack:
@@ -67,6 +74,20 @@ def attitude_of_message(message: Any) -> tuple[float, float, float, float] | Non
     else:
         turn = message.pose.orientation
     return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
+
+
+def tilt_std_of_message(message: Any) -> float:
+    """Standard deviation of pitch and roll (deg) by the covariance of a `sensor_msgs/Imu`.
+
+    That of an autopilot where it is not stated, or is a placeholder. A smaller one than
+    `LEAST_TILT_STD_DEG` leaves out the errors of the mount and of accelerations.
+    """
+    covariance = getattr(message, "orientation_covariance", (0.0,) * 9)
+    variance = max(float(covariance[0]), float(covariance[4]))
+    std_deg = math.degrees(math.sqrt(variance)) if variance > 0 else math.inf
+    if not std_deg <= MOST_TILT_STD_DEG:
+        return AUTOPILOT_TILT_STD_DEG
+    return max(std_deg, LEAST_TILT_STD_DEG)
 
 
 def height_of_message(message: Any) -> float | None:

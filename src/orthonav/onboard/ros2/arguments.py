@@ -5,12 +5,20 @@ https://design.ros2.org/articles/static_remapping.html,
 https://design.ros2.org/articles/ros_command_line_arguments.html.
 """
 
+import logging
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
 
 from orthonav.errors import VariantError
+from orthonav.extras import needed
+from orthonav.files import require_file
 
+log = logging.getLogger(__name__)
 MAX_DOMAIN_ID = 232
 """Beyond it the ports of the domain would exceed 65535."""
 _TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
@@ -20,7 +28,15 @@ _TRUTH = {"true": True, "false": False}
 _CHOICES = {
     "image_transport": ("raw", "compressed"),
     "image_reliability": ("best_effort", "reliable"),
+    "covariance": ("filter", "fix"),
 }
+_ALTITUDES = ("none", "terrain", "home")
+_LEVELS = {
+    **{"UNSET": logging.NOTSET, "DEBUG": logging.DEBUG, "INFO": logging.INFO},
+    **{"WARN": logging.WARNING, "ERROR": logging.ERROR, "FATAL": logging.CRITICAL},
+}
+_PASSED = ("-e", "--enclave", "--log-config-file", "--log-file-name")
+_STREAMS = re.compile("--(enable|disable)-(rosout|stdout|external-lib)-logs")
 
 
 @dataclass(frozen=True)
@@ -30,7 +46,10 @@ class Parameters:
     `use_sim_time`: ROS time is that of `/clock`, not the system's. `image_transport`: "raw" or
     "compressed". `image_reliability`: "best_effort" (sensor data) or "reliable", which resends lost
     parts of large pictures and matches reliable writers only. `publish_tf`: publish the transform
-    from `map_frame` to `base_frame` too.
+    from `map_frame` to `base_frame` too. `covariance`: "filter" (larger, for a filter that takes
+    positions as independent) or "fix". `altitude` of the fix: "none" (NaN), that of the "terrain"
+    of the map plus the height above ground, that of the origin plus the height above "home", or a
+    number of metres.
     """
 
     use_sim_time: bool = False
@@ -39,6 +58,8 @@ class Parameters:
     publish_tf: bool = False
     map_frame: str = "map"
     base_frame: str = "base_link"
+    covariance: str = "filter"
+    altitude: str = "none"
 
 
 @dataclass(frozen=True)
@@ -46,7 +67,11 @@ class RosArguments:
     """Name and namespace of the node, remapping rules in their order, parameters and domain.
 
     `rules` are pairs of a name to match and its replacement, not yet expanded. `is_local`:
-    discovery and traffic stay on the loopback interface. `distro`: whose message definitions.
+    discovery and traffic stay on the loopback interface. `is_alone`: it discovers nobody. `peers`:
+    addresses to be found beside that. `distro`: whose message definitions. `cyclonedds_uri`: the
+    user's configuration of Cyclone DDS. `log_level`: of `logging`, 0 for the usual one.
+    `silenced`: of "rosout" and "stdout", where nothing is to be logged. `passed`: arguments about
+    security and logging that only ROS understands.
     """
 
     node: str = "orthonav"
@@ -56,6 +81,12 @@ class RosArguments:
     domain_id: int = 0
     is_local: bool = False
     distro: str = ""
+    is_alone: bool = False
+    peers: tuple[str, ...] = ()
+    cyclonedds_uri: str = ""
+    log_level: int = logging.NOTSET
+    silenced: frozenset[str] = frozenset()
+    passed: tuple[str, ...] = ()
 
     @property
     def full_name(self) -> str:
@@ -82,42 +113,62 @@ class RosArguments:
         return full
 
 
+@dataclass
+class _Words:
+    """What stands after `--ros-args`. `parameters`: names and values, or files of them."""
+
+    rules: list[tuple[str, str]] = field(default_factory=list)
+    parameters: list[tuple[str, str] | Path] = field(default_factory=list)
+    levels: list[tuple[str, int]] = field(default_factory=list)
+    silenced: set[str] = field(default_factory=set)
+    passed: list[str] = field(default_factory=list)
+
+
 def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosArguments:
     """Arguments after `--ros-args`, and variables of the environment.
 
-    Reads `-r FROM:=TO` (`--remap`; `__node`, `__name` and `__ns` too) and `-p NAME:=VALUE`
-    (`--param`), `ROS_DOMAIN_ID`, `ROS_NAMESPACE`, `ROS_LOCALHOST_ONLY`,
-    `ROS_AUTOMATIC_DISCOVERY_RANGE` and `ROS_DISTRO`. Raises `VariantError` for anything else.
+    Reads `-r FROM:=TO` (`--remap`; `__node`, `__name` and `__ns` too), `-p NAME:=VALUE`
+    (`--param`), `--params-file`, `--log-level`, `--disable-rosout-logs`, `--disable-stdout-logs`,
+    `ROS_DOMAIN_ID`, `ROS_NAMESPACE`, `ROS_LOCALHOST_ONLY`, `ROS_AUTOMATIC_DISCOVERY_RANGE`,
+    `ROS_STATIC_PEERS`, `ROS_DISTRO` and `CYCLONEDDS_URI`. As in ROS, an unknown parameter is
+    ignored. Raises `VariantError` for an argument that ROS does not have either, and
+    `MissingFileError`.
     """
-    remaps, parameters = _pairs(words)
+    given = _words(words)
     node, namespace = "orthonav", environment.get("ROS_NAMESPACE", "") or "/"
     rules = []
-    for before, after in remaps:
-        target, colon, rest = before.partition(":")
-        if colon and re.fullmatch(_TOKEN, target):
-            if target != node:
-                continue  # a rule for another node of the same command line
-            before = rest
-        if before in ("__node", "__name"):
+    for before, after in given.rules:
+        name = _for_node(before, node)
+        if name in ("__node", "__name"):
             node = after
-        elif before == "__ns":
+        elif name == "__ns":
             namespace = after
-        else:
-            rules.append((before, after))
+        elif name is not None:
+            rules.append((name, after))
     namespace = namespace if namespace.startswith("/") else f"/{namespace}"
     if not re.fullmatch(_TOKEN, node):
         raise VariantError(f"not a node name of ROS 2: '{node}'")
     if not _NAMESPACE.fullmatch(namespace):
         raise VariantError(f"not a namespace of ROS 2: '{namespace}'")
+    scope = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    only_local = environment.get("ROS_LOCALHOST_ONLY") == "1"
+    peers = environment.get("ROS_STATIC_PEERS", "").split(";")
+    full_name = f"{namespace.rstrip('/')}/{node}"
+    logger = full_name.strip("/").replace("/", ".")
     made = RosArguments(
         node,
         namespace,
         tuple(rules),
-        _parameters(parameters),
+        _parameters(list(_values(given.parameters, node, full_name))),
         _domain_id(environment.get("ROS_DOMAIN_ID", "")),
-        environment.get("ROS_LOCALHOST_ONLY") == "1"
-        or environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST",
+        only_local or scope == "LOCALHOST",
         environment.get("ROS_DISTRO", ""),
+        is_alone=not only_local and scope == "OFF",
+        peers=tuple(peer.strip() for peer in peers if peer.strip()),
+        cyclonedds_uri=environment.get("CYCLONEDDS_URI", ""),
+        log_level=next((n for name, n in reversed(given.levels) if name in ("", logger)), 0),
+        silenced=frozenset(given.silenced),
+        passed=tuple(given.passed),
     )
     for rule in rules:
         for name in rule:
@@ -125,41 +176,124 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     return made
 
 
-def _pairs(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """Remapping rules and parameters of the words after `--ros-args`."""
-    flags = {"-r": 0, "--remap": 0, "-p": 1, "--param": 1}
-    found: tuple[list[tuple[str, str]], list[tuple[str, str]]] = [], []
+def _words(words: Sequence[str]) -> _Words:
+    found = _Words()
     waiting = list(words)
     while waiting:
         flag = waiting.pop(0)
+        stream = _STREAMS.fullmatch(flag)
         if flag in ("--ros-args", "--") and (flag == "--ros-args" or not waiting):
             continue
-        pair = waiting.pop(0) if flag in flags and waiting else ""
-        name, separator, value = pair.partition(":=")
-        if not (name and separator and value):
+        if stream is not None:
+            found.passed.append(flag)
+            change = found.silenced.add if stream[1] == "disable" else found.silenced.discard
+            change(stream[2])
+            continue
+        text = waiting.pop(0) if waiting else ""
+        name, separator, value = text.partition(":=")
+        if flag in ("-r", "--remap") and name and separator and value:
+            found.rules.append((name, value))
+        elif flag in ("-p", "--param") and name and separator and value:
+            found.parameters.append((name, value))
+        elif flag == "--params-file" and text:
+            found.parameters.append(Path(text))
+        elif flag == "--log-level" and text:
+            found.levels.append(_level(text))
+            found.passed += [flag, text]
+        elif flag in _PASSED and text:
+            found.passed += [flag, text]
+        else:
             raise VariantError(
-                "after --ros-args expected -r FROM:=TO or -p NAME:=VALUE, "
-                f"got '{' '.join((flag, pair)).strip()}'"
+                "after --ros-args expected -r FROM:=TO, -p NAME:=VALUE, --params-file FILE or "
+                f"--log-level LEVEL, got '{' '.join((flag, text)).strip()}'"
             )
-        found[flags[flag]].append((name, value))
     return found
+
+
+def _level(text: str) -> tuple[str, int]:
+    """Logger ("": all) and level of `--log-level`."""
+    name, _, level = text.rpartition(":=")
+    if level.upper() not in _LEVELS:
+        raise VariantError(f"--log-level is {', '.join(_LEVELS).lower()}, got '{level}'")
+    return name, _LEVELS[level.upper()]
+
+
+def _for_node(name: str, node: str) -> str | None:
+    """A name without the node that it is for; None where that is another node."""
+    target, colon, rest = name.partition(":")
+    if not (colon and re.fullmatch(_TOKEN, target)):
+        return name
+    return rest if target == node else None
+
+
+def _values(
+    given: Sequence[tuple[str, str] | Path], node: str, full_name: str
+) -> Iterator[tuple[str, str]]:
+    """Names and values of the parameters that are meant for the node, in their order."""
+    for each in given:
+        if isinstance(each, Path):
+            yield from _values_of_file(each, full_name)
+        else:
+            name = _for_node(each[0], node)
+            if name is not None:
+                yield name, each[1]
+
+
+def _values_of_file(path: Path, full_name: str) -> Iterator[tuple[str, str]]:
+    """Those of a parameter file of ROS: nodes by name or pattern, each with `ros__parameters`."""
+    yaml = needed("yaml", "ros2", "--params-file")
+    try:
+        content = yaml.safe_load(require_file(path, "parameter file").read_text("utf-8"))
+    except (ValueError, yaml.YAMLError) as error:
+        raise VariantError(f"parameter file is not YAML ({error}): {path}") from error
+    flat = dict(_flat(content if isinstance(content, dict) else {}, "/"))
+    marker = "/ros__parameters"
+    if not any(marker in name for name in flat):
+        raise VariantError(f"parameter file: expected NODE: ros__parameters: NAME: VALUE: {path}")
+    for name, value in flat.items():
+        node, _, parameter = name.partition(marker + "/")
+        pattern = re.sub("/+", "/", f"/{node}").replace("/**", "*")
+        if parameter and fnmatchcase(full_name, pattern):
+            yield parameter.replace("/", "."), value
+
+
+def _flat(values: Mapping[Any, Any], separator: str) -> Iterator[tuple[str, str]]:
+    """Leaves of nested tables, by their names joined."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            for inner, leaf in _flat(value, separator):
+                yield f"{name}{separator}{inner}", leaf
+        else:
+            yield str(name), str(value)
 
 
 def _parameters(pairs: Sequence[tuple[str, str]]) -> Parameters:
     known = {each.name: each.type for each in fields(Parameters)}
     values: dict[str, str | bool] = {}
-    for name, text in pairs:
+    for name, given in pairs:
+        text = given.strip("\"'")
         if name not in known:
-            raise VariantError(f"parameters are {', '.join(known)}, got '{name}'")
-        if known[name] is bool:
+            log.warning("parameter %s is ignored; parameters are %s", name, ", ".join(known))
+        elif known[name] is bool:
             if text.lower() not in _TRUTH:
                 raise VariantError(f"parameter {name} is true or false, got '{text}'")
             values[name] = _TRUTH[text.lower()]
         elif text not in _CHOICES.get(name, (text,)):
             raise VariantError(f"parameter {name} is {' or '.join(_CHOICES[name])}, got '{text}'")
+        elif name == "altitude" and text not in _ALTITUDES and not _is_number(text):
+            raise VariantError(
+                f"parameter altitude is {', '.join(_ALTITUDES)} or metres, got '{text}'"
+            )
         else:
-            values[name] = text.strip("\"'")
+            values[name] = text
     return Parameters(**values)  # type: ignore[arg-type]  # each has the type of its field
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _domain_id(text: str) -> int:

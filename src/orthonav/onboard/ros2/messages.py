@@ -31,8 +31,8 @@ def ros2_module(name: str) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         raise MissingExtraError(
-            f"--ros2 needs {package}: pip install 'orthonav[ros2]', on x86-64 with Python 3.11 to "
-            f"3.13 (docs/ros2.md says what to do elsewhere) ({error})"
+            f"--ros2 needs {package}: pip install 'orthonav[ros2]'; where cyclonedds has no wheel "
+            f"(docs/ros2.md), source a ROS 2 environment ({error})"
         ) from error
 
 
@@ -92,6 +92,7 @@ class Definitions:
         )
         made.serialize = lambda self, **_: self.cdr
         made.deserialize = classmethod(_sample)
+        made.deserialize_key = classmethod(lambda kind, data, **_: kind())  # of a writer that left
         return made
 
     def _members(self, name: str) -> dict[str, Any]:
@@ -120,13 +121,8 @@ class Definitions:
         return self._nested[name]
 
 
-def dds_type_name(name: str) -> str:
-    """The name of a message type in DDS: "sensor_msgs::msg::dds_::Image_"."""
-    return _dotted(name).replace(".", "::")
-
-
 def ros_type_name(dds_name: str) -> str:
-    """The inverse of `dds_type_name`; other names stay as they are."""
+    """The message type of a name in DDS ("sensor_msgs::msg::dds_::Image_"); others stay."""
     parts = dds_name.split("::")
     if len(parts) != 4 or parts[2] != "dds_":
         return dds_name

@@ -1,34 +1,43 @@
-"""A node of a ROS 2 graph: DDS readers and writers under the names, types and QoS of ROS 2.
+"""A node over DDS, without ROS: readers and writers under the names, types and QoS of ROS 2.
 
 QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Quality-of-Service-Settings.html
 """
 
 import logging
-from collections import Counter
-from collections.abc import Callable
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
-from orthonav.errors import OutputError, described
+from orthonav.errors import OutputError
+from orthonav.onboard.ros2 import names
 from orthonav.onboard.ros2.arguments import RosArguments
+from orthonav.onboard.ros2.graph import Graph, Handler
 from orthonav.onboard.ros2.messages import (
     Definitions,
-    dds_type_name,
     ros2_module,
     ros_type_name,
 )
 
 log = logging.getLogger(__name__)
+CONFIGURATION = """<CycloneDDS><Domain>
+<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>
+<Internal><SocketReceiveBufferSize min="default" max="10MB"/></Internal>
+</Domain></CycloneDDS>"""
+"""Ours of Cyclone DDS. It rejects the type objects of Fast DDS 3 (vendor 1.15) of types with arrays
+or sequences, and would not match these topics. Its default buffer is smaller than an image."""
 LOOPBACK_ONLY = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast><Interfaces>
-<NetworkInterface address="127.0.0.1"/></Interfaces></General><Discovery><ParticipantIndex>auto
-</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
-"""Configuration of Cyclone DDS for ROS_LOCALHOST_ONLY=1."""
+<NetworkInterface address="127.0.0.1"/></Interfaces></General></Domain></CycloneDDS>"""
+"""Configuration for ROS_LOCALHOST_ONLY=1."""
 _POLICIES = {
     **{2: "durability", 4: "deadline", 6: "ownership", 8: "liveliness", 11: "reliability"},
     24: "type consistency (message definitions of another distribution: set ROS_DISTRO)",
 }
 _BLOCK_NS = 10_000_000
-Handler = Callable[[Any, bytes], None]
+_MOST_ENDPOINTS = 10_000
+_ALIVE = 16
+"""State of an instance in DDS."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,7 @@ class Subscription:
     handler: Handler
 
 
-class Writer:
+class DdsWriter:
     """Sends messages of one topic."""
 
     def __init__(self, topic: str, kind: str, definitions: Definitions, writer: Any) -> None:
@@ -50,7 +59,7 @@ class Writer:
         self._definitions, self._sample = definitions, writer.topic.data_type
 
     def write(self, message: Any) -> None:
-        """Send one message. Raises `OSError` where DDS does not take it."""
+        """See `Writer.write`."""
         sample = self._sample()
         sample.cdr = self._definitions.encoded(message)
         try:
@@ -59,95 +68,120 @@ class Writer:
             raise OSError(f"cannot publish on {self.topic} ({error})") from error
 
 
-class Node:
-    """Reads and writes topics of one DDS domain. `spin` is for one thread, writers for any.
-
-    `problems` says by topic why nothing can flow there: another type, or QoS that does not match.
-    `undecodable` counts damaged messages by topic.
-    """
+class Node(Graph):
+    """Reads and writes topics of one DDS domain."""
 
     def __init__(self, arguments: RosArguments) -> None:
         """Raises `MissingExtraError`, or `OutputError` where DDS has no network interface."""
-        self.arguments, self.definitions = arguments, Definitions(arguments.distro)
-        self.problems: dict[str, str] = {}
-        self.undecodable: Counter[str] = Counter()
+        super().__init__(arguments)
         self._core, self._qos = ros2_module("cyclonedds.core"), ros2_module("cyclonedds.qos")
-        domain, builtin = ros2_module("cyclonedds.domain"), ros2_module("cyclonedds.builtin")
-        self._domain = None
-        try:
-            if arguments.is_local:
-                self._domain = domain.Domain(arguments.domain_id, LOOPBACK_ONLY)
-            self._participant = domain.DomainParticipant(arguments.domain_id)
-        except self._core.DDSException as error:
-            raise OutputError(f"cannot join DDS domain {arguments.domain_id}: {error}") from error
+        builtin = ros2_module("cyclonedds.builtin")
+        domain = ros2_module("cyclonedds.domain")
+        self._domain = self._opened(domain, arguments)
+        made = self._qos.Qos(self._qos.Policy.Userdata(names.USER_DATA))
+        self._participant = domain.DomainParticipant(arguments.domain_id, made)
         self._subscriptions: list[Subscription] = []
-        self._writers: list[Writer] = []
+        self._writers: list[DdsWriter] = []
         self._conditions: list[Any] = []
+        self._names = self._writer(names.TOPIC, names.KIND, depth=1, latched=True)
         self._waitset = self._core.WaitSet(self._participant)
-        self._endpoints = [
-            builtin.BuiltinDataReader(self._participant, topic)
+        self._publishers, self._subscribers = (
+            Endpoints(builtin.BuiltinDataReader(self._participant, topic))
             for topic in (
                 builtin.BuiltinTopicDcpsPublication,
                 builtin.BuiltinTopicDcpsSubscription,
             )
-        ]
+        )
 
     def subscribe(
         self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
     ) -> None:
-        """Hand each message on `topic` (resolved already) to `handler`, with its raw sample.
-
-        The QoS is that of sensor data: best effort, volatile, the last `depth` messages.
-        """
+        """See `Graph.subscribe`."""
         qos = self._made_qos(kind, reliable=reliable, depth=depth)
         sub = ros2_module("cyclonedds.sub")
-        reader = sub.DataReader(self._participant, self._topic(topic, kind), qos)
+        reader = sub.DataReader(self._participant, self._topic(f"rt{topic}", kind), qos)
         states = self._core
         mask = states.ViewState.Any | states.InstanceState.Any | states.SampleState.NotRead
         self._conditions.append(states.ReadCondition(reader, mask))
         self._waitset.attach(self._conditions[-1])
         self._subscriptions.append(Subscription(topic, kind, reader, depth, handler))
+        self._announce()
 
-    def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
-        """A writer of `topic` (resolved already): reliable, and transient local if `latched`."""
-        qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
-        pub = ros2_module("cyclonedds.pub")
-        made = pub.DataWriter(self._participant, self._topic(topic, kind), qos)
-        self._writers.append(Writer(topic, kind, self.definitions, made))
+    def advertise(
+        self, topic: str, kind: str, *, depth: int = 10, latched: bool = False
+    ) -> DdsWriter:
+        """See `Graph.advertise`."""
+        self._writers.append(self._writer(f"rt{topic}", kind, depth=depth, latched=latched))
+        self._announce()
         return self._writers[-1]
 
     def spin(self, timeout_s: float) -> int:
-        """Wait at most so long for messages and handle those that are there; how many."""
+        """See `Graph.spin`."""
         self._waitset.wait(round(timeout_s * 1e9))
         return sum(self._taken(each) for each in self._subscriptions)
 
-    def check_graph(self) -> None:
-        """Look for endpoints of our topics that cannot match; each problem is logged once."""
-        expected = {each.topic: each.kind for each in self._subscriptions}
-        expected |= {each.topic: each.kind for each in self._writers}
-        for reader in self._endpoints:
-            for endpoint in self._discovered(reader):
-                topic = str(endpoint.topic_name).removeprefix("rt")
-                kind = expected.get(topic)
-                if kind is not None and endpoint.type_name != dds_type_name(kind):
-                    found = ros_type_name(str(endpoint.type_name))
-                    self._problem(topic, f"is of type {found}; expected {kind}")
-        for each in self._subscriptions:
-            status = each.reader.get_requested_incompatible_qos_status()
-            self._qos_problem(each.topic, status, "a publisher")
-        for writer in self._writers:
-            status = writer.writer.get_offered_incompatible_qos_status()
-            self._qos_problem(writer.topic, status, "a subscriber")
-
     def close(self) -> None:
-        """Leave the graph."""
-        for held in (self._endpoints, self._conditions, self._subscriptions, self._writers):
+        """See `Graph.close`."""
+        del self._publishers, self._subscribers, self._names
+        for held in (self._conditions, self._subscriptions, self._writers):
             held.clear()
         self._waitset = self._participant = self._domain = None
 
+    def _opened(self, domain: Any, arguments: RosArguments) -> Any:
+        """The DDS domain by our configuration, then that of the user.
+
+        None where this process has joined it already.
+        """
+        first, own = [CONFIGURATION, _discovery(arguments)], [arguments.cyclonedds_uri]
+        attempts = [first + own]
+        if arguments.is_local:  # an interface must not be named twice
+            attempts.insert(0, [*first, LOOPBACK_ONLY, *own])
+        for attempt in attempts:
+            try:
+                return domain.Domain(arguments.domain_id, ",".join(filter(None, attempt)))
+            except self._core.DDSException as error:
+                if error.code == error.DDS_RETCODE_PRECONDITION_NOT_MET:
+                    return None
+                failed = error
+        where = f"DDS domain {arguments.domain_id}"
+        if arguments.cyclonedds_uri:
+            where += f" with CYCLONEDDS_URI={arguments.cyclonedds_uri}"
+        raise OutputError(f"cannot join {where}: {failed}") from failed
+
+    def _mismatches(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        self._publishers.update()
+        self._subscribers.update()
+        for each in self._subscriptions:
+            why = _unmatched(each.reader.get_requested_incompatible_qos_status(), "a publisher")
+            matched = each.reader.get_matched_publications()
+            for other in self._publishers.others(each.topic, matched):
+                self._mismatch(found, each.topic, each.kind, other, why)
+        for writer in self._writers:
+            why = _unmatched(writer.writer.get_offered_incompatible_qos_status(), "a subscriber")
+            matched = writer.writer.get_matched_subscriptions()
+            for other in self._subscribers.others(writer.topic, matched):
+                self._mismatch(found, writer.topic, writer.kind, other, why)
+        return found
+
+    def _announce(self) -> None:
+        """Tell the graph which readers and writers belong to this node."""
+        readers = [each.reader for each in self._subscriptions]
+        writers = [each.writer for each in self._writers]
+        own = self._participant
+        message = names.node_entities(self.definitions, self.arguments, own, readers, writers)
+        self._names.write(message)
+
+    def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> DdsWriter:
+        """A writer of a topic of DDS."""
+        qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
+        pub = ros2_module("cyclonedds.pub")
+        made = pub.DataWriter(self._participant, self._topic(name, kind), qos)
+        return DdsWriter(name.removeprefix("rt"), kind, self.definitions, made)
+
     def _topic(self, name: str, kind: str) -> Any:
         made = ros2_module("cyclonedds.topic")
-        return made.Topic(self._participant, f"rt{name}", self.definitions.dds_type(kind))
+        return made.Topic(self._participant, name, self.definitions.dds_type(kind))
 
     def _made_qos(self, kind: str, *, reliable: bool, depth: int, latched: bool = False) -> Any:
         policy = self._qos.Policy
@@ -164,32 +198,57 @@ class Node:
         handled = 0
         for sample in subscription.reader.take(subscription.depth):
             cdr = getattr(sample, "cdr", None)
-            if cdr is None:  # only says that a writer left
-                continue
-            try:
-                message = self.definitions.decoded(subscription.kind, cdr)
-                subscription.handler(message, cdr)
-            except Exception as error:  # one odd message never ends a flight
-                if not self.undecodable[subscription.topic]:
-                    why = described(error)
-                    log.warning("message on %s cannot be used (%s)", subscription.topic, why)
-                self.undecodable[subscription.topic] += 1
-            handled += 1
+            if cdr is not None:  # else it only says that a writer left
+                self._handle(subscription.topic, subscription.kind, subscription.handler, cdr)
+                handled += 1
         return handled
 
-    def _discovered(self, reader: Any) -> list[Any]:
+
+class Endpoints:
+    """Topic and type of the publishers or subscribers of a domain, by handle. Mutable."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+        self._alive: dict[int, tuple[str, str]] = {}
+
+    def others(self, topic: str, matched: Sequence[int]) -> Iterator[str]:
+        """Message types of those of a topic beside the handles that are matched."""
+        handles = {handle % 2**64 for handle in matched}
+        for handle, (name, kind) in self._alive.items():
+            if name == f"rt{topic}" and handle not in handles:
+                yield ros_type_name(kind)
+
+    def update(self) -> None:
+        """Take note of what came and left."""
         try:
-            return list(reader.take(100))
+            changes = self._reader.take(_MOST_ENDPOINTS)
         except Exception as error:  # a policy of another vendor that the library cannot name
             log.debug("discovery: %r", error)
-            return []
+            return
+        for each in changes:
+            info = each.sample_info
+            if info.instance_state != _ALIVE:
+                self._alive.pop(info.instance_handle, None)
+            elif info.valid_data:
+                self._alive[info.instance_handle] = str(each.topic_name), str(each.type_name)
 
-    def _qos_problem(self, topic: str, status: Any, other: str) -> None:
-        if status.total_count > 0 and topic not in self.problems:
-            policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
-            self._problem(topic, f"{other} has QoS that does not match ours: {policy}")
 
-    def _problem(self, topic: str, text: str) -> None:
-        if self.problems.get(topic) != text:
-            self.problems[topic] = text
-            log.warning("topic %s %s", topic, text)
+def _discovery(arguments: RosArguments) -> str:
+    """Configuration of Cyclone DDS for the discovery that the variables of ROS ask for."""
+    if arguments.is_alone:
+        inner = f"<ParticipantIndex>none</ParticipantIndex><Tag>orthonav_{os.getpid()}</Tag>"
+    else:
+        local = ("127.0.0.1",) if arguments.is_local else ()
+        peers = [f"<Peer address={quoteattr(peer)}/>" for peer in (*local, *arguments.peers)]
+        if not peers:
+            return ""
+        inner = f"<ParticipantIndex>auto</ParticipantIndex><Peers>{''.join(peers)}</Peers>"
+    return f"<CycloneDDS><Domain><Discovery>{inner}</Discovery></Domain></CycloneDDS>"
+
+
+def _unmatched(status: Any, other: str) -> str:
+    """Why an endpoint did not match ours lately; "" where it is only not matched yet."""
+    if not status.total_count:
+        return ""
+    policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
+    return f"{other} has QoS that does not match ours: {policy}"

@@ -5,7 +5,7 @@ up. Positions reach this module only through the gate.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthonav.flight.logged import NO_ALTITUDE_M2
 from orthonav.geo.frames import LocalFrame
-from orthonav.onboard.ros2.node import Node
+from orthonav.onboard.ros2.graph import Graph
 from orthonav.onboard.telemetry import VehicleState
 from orthonav.publish.estimate import NavigationEstimate, floored
 from orthonav.publish.mavlink import require_confident
@@ -32,20 +32,24 @@ class Ros2Publisher:
 
     def __init__(
         self,
-        node: Node,
+        node: Graph,
         origin: LocalFrame,
         now_ns: Callable[[], int],
         *,
+        origin_alt_m: float = math.nan,
         min_std_m: float = 0.0,
         min_confidence: float = CONFIDENT,
         silent: bool = False,
     ) -> None:
-        """`origin`: origin of the map frame. `now_ns`: reads ROS time. `min_std_m`: lower bound of
-        the standard deviation in any direction. `silent`: send no positions."""
+        """`origin`: origin of the map frame, `origin_alt_m` its altitude. `now_ns`: reads ROS time.
+        `min_std_m`: lower bound of the standard deviation in any direction. `silent`: send no
+        positions."""
         self._node, self._frame, self._now_ns = node, origin, now_ns
         self._floor_m, self._least, self._silent = min_std_m, min_confidence, silent
+        self._origin_alt_m = origin_alt_m
         resolved = node.arguments.resolved
         self._parameters = node.arguments.parameters
+        self.for_filter = self._parameters.covariance == "filter"
         self._fix = node.advertise(resolved("~/fix"), "sensor_msgs/msg/NavSatFix")
         pose = "geometry_msgs/msg/PoseWithCovarianceStamped"
         self._pose = node.advertise(resolved("~/pose"), pose)
@@ -67,7 +71,7 @@ class Ros2Publisher:
         if self._silent:
             return ()
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
-        self._fix.write(self._navsatfix(estimate, cov, stamp_ns))
+        self._fix.write(self._navsatfix(estimate, cov, self._altitude_m(vehicle), stamp_ns))
         east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
         turn = orientation(vehicle)
         self._pose.write(self._posed((east, north), cov, turn, stamp_ns))
@@ -84,8 +88,8 @@ class Ros2Publisher:
         damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
         level = _LEVELS[plain["health"]]
         values = [
-            new("diagnostic_msgs/msg/KeyValue", key=name, value=str(value))
-            for name, value in {**plain, **problems, **damaged}.items()
+            new("diagnostic_msgs/msg/KeyValue", key=name, value=value)
+            for name, value in _flat({**plain, **problems, **damaged})
         ]
         status = new(
             "diagnostic_msgs/msg/DiagnosticStatus",
@@ -109,15 +113,26 @@ class Ros2Publisher:
             "geographic_msgs/msg/GeoPoint",
             latitude=self._frame.lat_deg,
             longitude=self._frame.lon_deg,
-            altitude=math.nan,  # "unspecified": the map has no altitude
+            altitude=self._origin_alt_m,  # NaN: not specified
         )
         header = definitions.header(self._now_ns(), self._parameters.map_frame)
         self._origin.write(
             definitions.new("geographic_msgs/msg/GeoPointStamped", header=header, position=place)
         )
 
-    def _navsatfix(self, estimate: NavigationEstimate, cov: Array, stamp_ns: int) -> Any:
-        """Latitude and longitude; the altitude is NaN, and the satellite service is 0."""
+    def _altitude_m(self, vehicle: VehicleState) -> float:
+        """Altitude of the fix, as its parameter asks for; NaN where that is not known."""
+        chosen = self._parameters.altitude
+        if chosen == "terrain":
+            return vehicle.amsl_m
+        if chosen == "home":
+            return self._origin_alt_m + vehicle.home_m
+        return math.nan if chosen == "none" else float(chosen)
+
+    def _navsatfix(
+        self, estimate: NavigationEstimate, cov: Array, altitude_m: float, stamp_ns: int
+    ) -> Any:
+        """Latitude and longitude; the altitude is not measured, and the satellite service is 0."""
         definitions = self._node.definitions
         full = np.zeros((3, 3))
         full[:2, :2], full[2, 2] = cov, NO_ALTITUDE_M2
@@ -127,7 +142,7 @@ class Ros2Publisher:
             status=definitions.new("sensor_msgs/msg/NavSatStatus", status=_STATUS_FIX, service=0),
             latitude=float(estimate.lat_deg),
             longitude=float(estimate.lon_deg),
-            altitude=math.nan,
+            altitude=altitude_m,
             position_covariance=full.ravel(),
             position_covariance_type=_COVARIANCE_KNOWN,
         )
@@ -167,6 +182,17 @@ class Ros2Publisher:
             transform=moved,
         )
         return definitions.new("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Names and texts of nested values, as tools for diagnostics show them."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{name}.")
+        elif isinstance(value, list | tuple):
+            yield f"{before}{name}", ", ".join(map(str, value))
+        else:
+            yield f"{before}{name}", "" if value is None else str(value)
 
 
 def orientation(vehicle: VehicleState) -> Array:

@@ -8,20 +8,31 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, StoppedError
 from orthonav.flight.gnss import FIX_3D, GnssSample
 from orthonav.geo.camera import Camera
 from orthonav.onboard.cameras import CameraImage
+from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.lost import LostImages
 from orthonav.onboard.ros2.messages import TIME_NS
-from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
 from orthonav.records import NoFix
-from orthonav.sources.attitude import LOOKS_DOWN, Angles, ned_wxyz_from_ros
+from orthonav.sources.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+    LOOKS_DOWN,
+    Angles,
+    ned_wxyz_from_ros,
+)
 from orthonav.sources.ros_images import camera_of_info, grey_of_message
-from orthonav.sources.ros_track import attitude_of_message, height_of_message, stamp_ns
+from orthonav.sources.ros_track import (
+    attitude_of_message,
+    height_of_message,
+    stamp_ns,
+    tilt_std_of_message,
+)
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS
@@ -51,7 +62,7 @@ class Ros2Reader:
 
     def __init__(
         self,
-        node: Node,
+        node: Graph,
         buffer: TelemetryBuffer,
         clocks: Clocks,
         stopped: Callable[[], bool],
@@ -64,28 +75,36 @@ class Ros2Reader:
         self._mount_deg, self._wait_ns = mount_deg, round(wait_s * 1e9)
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
         self.log_gnss: Callable[[int, bytes], None] = lambda time_ns, cdr: None
+        self.report_wait: Callable[[str], None] = lambda why: None  # once a second
         self._camera: Camera | None = None
         self._camera_error: CameraError | None = None
         self._images: deque[_WaitingImage] = deque()
         self._clock: tuple[int, int] | None = None
         self._number, self._image_ns, self._attitude_ns = 0, 0, 0
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
+        self._tilt_std_deg = AUTOPILOT_TILT_STD_DEG
         self._said: set[str] = set()
+        self._lost = LostImages()
         self._subscribe()
 
     def wait_for_camera(self) -> Camera:
         """Camera of the first `camera_info`; waits for it until stopped, and logs that.
 
-        Raises `CameraError` where it is not calibrated, or where the flight was stopped before.
+        Raises `CameraError` where it is not calibrated, `StoppedError` where the flight was stopped
+        before.
         """
+        why, reported_ns = f"no message on {self._info_topic}; or give --camera FILE", 0
         while not self._stopped():
+            if self._clocks.mono_ns() - reported_ns >= TIME_NS:
+                reported_ns = self._clocks.mono_ns()
+                self.report_wait(why)
             self._spin()
             if self._camera_error is not None:
                 raise CameraError(f"{self._camera_error}: {self._info_topic}")
             if self._camera is not None:
                 return self._camera
-            self._remind(f"no message on {self._info_topic}; or give --camera FILE")
-        raise CameraError(
+            self._remind(why)
+        raise StoppedError(
             f"stopped before a camera_info came; give --camera FILE: {self._info_topic}"
         )
 
@@ -138,7 +157,8 @@ class Ros2Reader:
         now_ns = self._clocks.mono_ns()
         if now_ns - self._checked_ns >= TIME_NS:
             self._checked_ns = now_ns
-            self._node.check_graph()
+            lost = self._lost.reason()
+            self._node.check_graph({} if lost is None else {self._image_topic: lost})
 
     def _ahead_ns(self) -> int | None:
         """ROS time minus our monotonic clock; None before the first `/clock`."""
@@ -170,12 +190,14 @@ class Ros2Reader:
                 return
             self._restart(self._image_topic, self._image_ns - time_ns)
         self._image_ns = time_ns
+        self._lost.images.append(time_ns)
         while len(self._images) > 1:
             self._images.pop()
         self._images.append(_WaitingImage(message, time_ns, self._clocks.mono_ns()))
 
     def _take_camera_info(self, message: Any, cdr: bytes) -> None:
         """Use the first one: the camera does not change in flight."""
+        self._lost.infos.append(stamp_ns(message, 0))
         if self._camera is None:
             try:
                 self._camera = camera_of_info(message)
@@ -189,6 +211,7 @@ class Ros2Reader:
         if time_ns < self._attitude_ns - JUMP_NS:
             self._restart("imu", self._attitude_ns - time_ns)
         self._attitude_ns = max(self._attitude_ns, time_ns)
+        self._tilt_std_deg = tilt_std_of_message(message)
         turned = ned_wxyz_from_ros(wxyz)
         if turned is not None:
             self._buffer.add_attitude(time_ns, turned.tolist())
@@ -235,11 +258,11 @@ class Ros2Reader:
     def _camera_image(self, image: _WaitingImage) -> CameraImage:
         self._number += 1
         exposed_ns = image.stamp_ns - (self._ahead_ns() or 0)
-        off_s = (self._clocks.mono_ns() - exposed_ns) / 1e9
-        if abs(off_s) > FAR_NS / 1e9:
+        if abs(self._clocks.mono_ns() - exposed_ns) > FAR_NS:
             self._say_once(
-                f"stamps of images are {off_s:.1f} s behind ROS time: set use_sim_time for "
-                f"recordings and simulations, or synchronize the clocks: {self._image_topic}"
+                f"stamps of images differ from ROS time by more than {FAR_NS / TIME_NS:g} s: set "
+                "use_sim_time for recordings and simulations, or synchronize the clocks: "
+                f"{self._image_topic}"
             )
         grey, problem = None, None
         try:
@@ -247,7 +270,7 @@ class Ros2Reader:
         except FlightError as error:
             problem = NoFix("bad_image", str(error))
             self._say_once(str(error))
-        vehicle = self._buffer.at(image.stamp_ns)
+        vehicle = replace(self._buffer.at(image.stamp_ns), tilt_std_deg=self._tilt_std_deg)
         return CameraImage(
             self._number,
             f"{image.stamp_ns}",
@@ -264,6 +287,7 @@ class Ros2Reader:
         log.warning("ROS time went back by %.1f s (%s); telemetry is cleared", back_ns / 1e9, what)
         self._buffer.clear()
         self._images.clear()
+        self._lost = LostImages()
         self._image_ns = self._attitude_ns = 0
 
     def _remind(self, text: str) -> None:

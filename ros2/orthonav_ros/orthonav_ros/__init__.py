@@ -1,0 +1,1 @@
+"""The ROS package around `orthonav fly --ros2`."""
