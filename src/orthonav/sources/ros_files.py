@@ -87,7 +87,7 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
     if not files:
         raise FlightError(f"folder holds no complete file of a bag (.mcap, .db3): {path}")
     if doubt:
-        warnings.append(f"{METADATA} is not used ({doubt}); read are the files beside it")
+        warnings.append(f"{METADATA} is not used ({doubt}); the files beside it are read")
     return _reader([_whole(file, file, warnings) for file in files], path, stack)
 
 
