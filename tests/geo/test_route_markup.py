@@ -253,17 +253,26 @@ def test_archives_of_many_members_or_with_a_password_are_refused(read):
 
 
 def test_positions_beside_lines_are_named(read, caplog):
-    point = "<Point><coordinates>2.5,46.5</coordinates></Point>"
+    point = "<Point><coordinates>2.6,46.5</coordinates></Point>"
     assert read(kml_of(("Way", line()), ("Farm", point)), "a.kml").left_out == ("point Farm",)
     beside = wpml_of(wayline()).replace("<Document>", f"<Document><Placemark>{point}</Placemark>")
     assert read(beside, "a.wpml").left_out == ("placemark (no index)",)
     gpx = (
-        '<gpx><wpt lat="1" lon="2"><name>Farm</name></wpt><rte><rtept lat="1" lon="2"/></rte>'
+        '<gpx><wpt lat="1" lon="3"><name>Farm</name></wpt><wpt lat="1" lon="2"/>'
+        '<rte><rtept lat="1" lon="2"/></rte>'
         '<trk><trkseg><trkpt lat="1" lon="2"/></trkseg></trk></gpx>'
     )
     assert read(gpx, "a.gpx").left_out == ("waypoint Farm", "track (no name)")
     assert "waypoint Farm, track (no name)" in caplog.text
-    assert read(kml_of(("Way", line())), "b.kml").left_out == ()
+    visited = point.replace("2.6", "2.50")
+    assert read(kml_of(("Way", line()), ("Start", visited)), "b.kml").left_out == ()
+    feature = '{{"type": "Feature", "properties": {{"name": "Farm"}}, "geometry": {}}}'
+    parts = [
+        feature.format(f'{{"type": "{kind}", "coordinates": {places}}}')
+        for kind, places in (("LineString", [[2, 1], [3, 1]]), ("Point", [2, 1]), ("Point", [2, 2]))
+    ]
+    document = f'{{"type": "FeatureCollection", "features": [{", ".join(parts)}]}}'
+    assert read(document, "a.geojson").left_out == ("Point Farm",)
 
 
 def test_spaces_in_coordinates_take_linear_time(tmp_path):

@@ -297,6 +297,8 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     assert "none: not a number: yaw_deg (missing_telemetry); give --heading unknown" in unknown.out
     plain = json.loads(run(*one, "--heading", "unknown", "--json").out)
     assert plain["fixes"] is None and plain["positions"][0]["lat_deg"] == pytest.approx(lat)
+    both = run(*one, "--dem", path)
+    assert both[0] == 1 and "above ground of the views: give it or --dem" in both[2]
     refused = run("localize", MAP, tmp_path)
     assert refused[0] == 1 and "give --out FILE, or --out - for stdout" in refused[2]
 

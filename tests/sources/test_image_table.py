@@ -77,6 +77,22 @@ def test_columns_by_many_names(images, header, delimiter):
 
 
 @pytest.mark.parametrize(
+    "columns, text, seconds",
+    [
+        ("date,time", "2024/05/01,10:00:01.5", 1_714_557_601.5),
+        ("time", "10:00:01.5", 36_001.5),
+        ("timestamp", "1714557601500", 1_714_557_601.5),
+        ("timestamp", "1714557601500000000", 1_714_557_601.5),
+        ("DateTimeOriginal", "2024:05:01 12:00:01.5+02:00", 1_714_557_601.5),
+        ("date", "2024-05-01 10:00:01.5", 1_714_557_601.5),
+    ],
+)
+def test_times_in_many_forms(images, columns, text, seconds):
+    found = views_of(images, f"file,yaw,{columns}\na.png,1,{text}\n")
+    assert found.by["a.png"].telemetry.time_ns == round(seconds * 1e9)
+
+
+@pytest.mark.parametrize(
     "column, pitch, expected, said",
     [
         ("pitch", -90, 0, True),

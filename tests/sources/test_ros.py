@@ -367,6 +367,14 @@ def test_several_recordings_in_a_folder_are_not_one(tmp_path, messages, topics):
         open_source(path)
 
 
+def test_a_database_that_was_cut_short_names_the_tool(tmp_path, messages, topics):
+    path = record(tmp_path / "flight", topics, messages, "db3")
+    file = next(path.glob("*.db3"))
+    file.write_bytes(file.read_bytes()[:-30_000])
+    with pytest.raises(FlightError, match=r"sqlite3 BAG.db3 \.recover"):
+        open_source(path)
+
+
 def test_a_bag_without_an_index_names_the_tool(tmp_path):
     messages = Messages(ros1=True)
     path = record(tmp_path / "flight", flight(messages), messages, "bag")

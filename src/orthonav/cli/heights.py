@@ -31,6 +31,8 @@ def dem_of(options: argparse.Namespace) -> "Dem | None":
         return None
     if getattr(options, "ground_alt_m", None) is not None:
         raise FlightError("--ground-alt-m assumes level ground: give it or --dem")
+    if hasattr(options, "fov_deg") and options.agl_m is not None:  # of a recording, not of a plan
+        raise FlightError("--agl-m is the height above ground of the views: give it or --dem")
     from orthonav.imagery.terrain import open_dem
 
     return open_dem(options.dem, options.dem_datum)

@@ -28,10 +28,15 @@ def reading(what: str, path: Path, *, silent: bool = False) -> Iterator[None]:
     except OrthonavError:
         raise
     except Exception as error:
-        message = " ".join(str(error).split())[:200] or "no details"
+        message = without_plea(" ".join(str(error).split()))[:200] or "no details"
         raise FlightError(
             f"{what} cannot be read ({type(error).__name__}: {message}): {path}"
         ) from error
+
+
+def without_plea(message: str) -> str:
+    """A library's message without its request to report the error to its authors."""
+    return message.partition("; please report")[0]
 
 
 @contextlib.contextmanager

@@ -41,7 +41,8 @@ _SYNONYMS = {
     "alt": "altitude alt gpsaltitude absolutealtitude absalt elevation z",
     "lat": "lat latitude gpslatitude",
     "lon": "lon lng long longitude gpslongitude",
-    "time": "time timestamp datetime utc utctime timeutc datetimeoriginal captured gpstime date",
+    "time": "timestamp datetime datetimeoriginal time utc utctime timeutc captured gpstime",
+    "date": "date day gpsdate",
 }
 _BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
 _FEET = ("ft", "feet", "foot")
@@ -50,7 +51,8 @@ _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
-_EXIF_TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) ")
+_DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
+_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _LARGEST_S = 9e9
 
 
@@ -131,7 +133,7 @@ def read_image_table(path: Path) -> ImageTable:
     numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
     gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
     rows = [
-        (texts["file"], _row(order, values, _time_ns(texts.get("time", ""), line, path), gimbal))
+        (texts["file"], _row(order, values, _time_ns(_moment(texts), line, path), gimbal))
         for order, (line, texts, values) in enumerate(numbers)
         if texts["file"]
     ]
@@ -188,7 +190,7 @@ def _numbers(
     values = {}
     for field, (name, metres) in columns.items():
         text = texts[field]
-        if field in ("file", "time") or text.lower() in _EMPTY:
+        if field in ("file", "time", "date") or text.lower() in _EMPTY:
             continue
         if comma and "." not in text:
             text = text.replace(",", ".")
@@ -235,8 +237,15 @@ def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: b
     )
 
 
+def _moment(texts: Mapping[str, str]) -> str:
+    """The time of a row, with the date where that is in a column of its own."""
+    time, date = texts.get("time", ""), texts.get("date", "")
+    return f"{date} {time}".strip() if _CLOCK.fullmatch(time) else time or date
+
+
 def _time_ns(text: str, line: int, path: Path) -> int | None:
-    """Nanoseconds of seconds, or of ms, us or ns since 1970, or of a date; UTC where no zone."""
+    """Nanoseconds of seconds, or of ms, us or ns since 1970, of a time of day, or of a date with
+    time; UTC where no zone."""
     if text.lower() in _EMPTY:
         return None
     number = number_of(text)
@@ -245,8 +254,11 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
         while abs(seconds) > _LARGEST_S:
             seconds /= 1000
         return round(seconds * 10**9)
+    if clock := _CLOCK.fullmatch(text):
+        hours, minutes, seconds = map(Decimal, clock.groups())
+        return round((hours * 3600 + minutes * 60 + seconds) * 10**9)
     try:
-        moment = datetime.fromisoformat(_EXIF_TIME.sub(r"\1-\2-\3 ", text))
+        moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
     except ValueError as error:
         raise FlightError(
             f"line {line}: time must be seconds or a date such as 2024-05-01T10:00:00Z, got "

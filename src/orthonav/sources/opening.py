@@ -85,10 +85,10 @@ def _folder_kind(path: Path) -> str:
         return "ros"
     if is_flight_log(path):
         return "log"
-    if storage_files(path):
-        return "ros"
     if photo_paths(path):
         return "photos"
+    if storage_files(path):
+        return "ros"
     raise FlightError(
         "expected a flight folder (flight.json), photographs, a ROS 2 bag (.mcap, .db3) or a "
         f"flight log: {path}"

@@ -15,7 +15,7 @@ from typing import Any
 
 from orthonav.errors import FlightError
 from orthonav.files import require_file
-from orthonav.sources.guard import needed, reading
+from orthonav.sources.guard import needed, reading, without_plea
 from orthonav.sources.mcap_chunks import MAGIC, complete_bytes, partial_records
 from orthonav.sources.ros_limits import bound_inflation, check_held
 from orthonav.sources.ros_topics import ParsableReader
@@ -83,11 +83,11 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
         except Exception as error:
             if not files:
                 raise
-            doubt = " ".join(str(error).split())[:160].partition("; please")[0]
+            doubt = without_plea(" ".join(str(error).split()))[:160]
     if not files:
         raise FlightError(f"folder holds no complete file of a bag (.mcap, .db3): {path}")
     if doubt:
-        warnings.append(f"{METADATA} is not used ({doubt}); read are the files beside it")
+        warnings.append(f"{METADATA} is not used ({doubt}); the files beside it are read")
     return _reader([_whole(file, file, warnings) for file in files], path, stack)
 
 
@@ -114,6 +114,11 @@ def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> An
             raise FlightError(
                 f"ROS 1 bag has no complete index ({error}): it was not closed, or was cut off; "
                 f"run `rosbag reindex` on it: {path}"
+            ) from error
+        if "malformed" in str(error):
+            raise FlightError(
+                "ROS 2 bag was cut off or is damaged; `sqlite3 BAG.db3 .recover | sqlite3 new.db3` "
+                f"may restore it: {path}"
             ) from error
         raise
     check_held(reader.readers)

@@ -253,7 +253,7 @@ class RecordedTrack:
 
     def _agl_m(self, time_ns: int, ground_alt_m: float | None) -> float:
         for series in (*self.heights, self.home):
-            height = float(_at(series, time_ns, 1)[0])
+            height = measured(float(_at(series, time_ns, 1)[0]))
             if math.isfinite(height):
                 return height
         altitude = float(_at(self.altitude, time_ns, 1)[0])

@@ -7,7 +7,6 @@ ellipsoid is hardly ever meant, so without it that is taken as not said); `home_
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 from orthonav.errors import RouteError
@@ -23,7 +22,7 @@ def read_geojson(data: bytes) -> list[Route]:
 def routes_of(plain: dict[str, Any]) -> list[Route]:
     """All lines of a GeoJSON object, in order. Raises `RouteError` if there is none."""
     found: list[Route] = []
-    others: list[tuple[str, str]] = []
+    others: list[tuple[str, str, Any]] = []
     for geometry, properties in _geometries(plain):
         kind = geometry.get("type")
         if kind == "LineString":
@@ -32,13 +31,22 @@ def routes_of(plain: dict[str, Any]) -> list[Route]:
             joined = [point for part in geometry["coordinates"] for point in part]
             found.append(_route(joined, properties))
         elif kind not in ("Feature", "FeatureCollection", "GeometryCollection"):
-            others.append((str(kind)[:40], str(properties.get("name") or "(no name)")[:40]))
+            name = f"{kind!s:.40} {properties.get('name') or '(no name)'!s:.40}"
+            others.append((str(kind)[:40], name, geometry.get("coordinates")))
     if not found:
-        kinds = sorted({kind for kind, _ in others})
+        kinds = sorted({kind for kind, _, _ in others})
         held = f"it holds {', '.join(kinds)}" if kinds else "it is empty"
         raise RouteError(f"GeoJSON holds no LineString; {held}")
-    points = tuple(f"{kind} {name}" for kind, name in others if kind.endswith("Point"))
-    return [replace(route, left_out=points) for route in found]
+    points = [
+        (name, place if kind == "Point" and _is_place(place) else [])
+        for kind, name, place in others
+        if kind in ("Point", "MultiPoint")
+    ]
+    return [route.leaving_out(points) for route in found]
+
+
+def _is_place(place: Any) -> bool:
+    return isinstance(place, list) and all(type(each) in (int, float) for each in place)
 
 
 def to_geojson(routes: Sequence[Route]) -> str:

@@ -1,13 +1,12 @@
 """Routes as GPX 1.0 and 1.1 (topografix.com/GPX/1/1): routes, else tracks."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from xml.etree.ElementTree import Element
 
 from orthonav.errors import RouteError
 from orthonav.geo.routes.markup import read_markup, text_of
 from orthonav.geo.routes.record import Height, Route
-from orthonav.geo.routes.values import parsed
+from orthonav.geo.routes.values import numbers_in, parsed
 
 
 def read_gpx(data: bytes) -> list[Route]:
@@ -27,9 +26,12 @@ def read_gpx(data: bytes) -> list[Route]:
         raise RouteError(f"GPX holds no route (rte) and no track (trk); it holds {held}")
     # Planned routes take precedence over recorded tracks.
     planned = [route for route in routes if route is not None]
-    lost = [f"waypoint {_name(each)}" for each in root.iterfind("wpt")]
-    lost += [f"track {_name(each)}" for each in root.iterfind("trk") if planned]
-    return [replace(route, left_out=tuple(lost)) for route in planned or found]
+    points = [
+        (f"waypoint {_name(each)}", numbers_in(f"{each.get('lon')},{each.get('lat')}"))
+        for each in root.iterfind("wpt")
+    ]
+    points += [(f"track {_name(each)}", []) for each in root.iterfind("trk") if planned]
+    return [route.leaving_out(points) for route in planned or found]
 
 
 def _name(element: Element) -> str:

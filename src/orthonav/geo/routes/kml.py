@@ -5,14 +5,13 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
-from dataclasses import replace
 from io import BytesIO
 from xml.etree.ElementTree import Element
 
 from orthonav.errors import RouteError
 from orthonav.geo.routes.markup import read_markup, text_of
 from orthonav.geo.routes.record import Height, HeightFrame, Route, require_few_waypoints
-from orthonav.geo.routes.values import parsed
+from orthonav.geo.routes.values import numbers_in, parsed
 from orthonav.geo.routes.wpml import read_wpml
 
 MAX_KML_BYTES = 20_000_000
@@ -64,8 +63,8 @@ def read_kml(data: bytes) -> list[Route]:
     marks = list(root.iter("Placemark"))
     found = [route for mark in marks for route in _routes(mark)]
     if found:
-        points = tuple(_point_name(mark) for mark in marks if mark.find(".//Point") is not None)
-        return [replace(route, left_out=points) for route in found]
+        points = [_named(mark, point) for mark in marks for point in mark.iter("Point")]
+        return [route.leaving_out(points) for route in found]
     if any(element.tag == "missionConfig" for element in root.iter()):
         raise RouteError(
             "KML is the template of a DJI mission; give its waylines.wpml, or the whole KMZ"
@@ -75,8 +74,9 @@ def read_kml(data: bytes) -> list[Route]:
     raise RouteError(f"KML holds no LineString and no gx:Track; it holds {', '.join(held)}")
 
 
-def _point_name(mark: Element) -> str:
-    return f"point {text_of(mark, 'name') or '(no name)'!s:.40}"
+def _named(mark: Element, point: Element) -> tuple[str, list[float]]:
+    name = f"point {text_of(mark, 'name') or '(no name)':.40}"
+    return name, numbers_in(text_of(point, "coordinates") or "")
 
 
 def _routes(mark: Element) -> list[Route]:

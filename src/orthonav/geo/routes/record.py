@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -114,6 +114,17 @@ class Route:
             raise RouteError(
                 f"height of the take-off position must be finite, got {self.home_amsl_m}"
             )
+
+    def leaving_out(self, points: Sequence[tuple[str, Sequence[float]]]) -> "Route":
+        """The route with the names of those `points` (longitude, latitude, ..) that are none of its
+        waypoints in `left_out`."""
+        visited = {(round(lat, 6), round(lon, 6)) for lat, lon in self.waypoints}
+        lost = [
+            name
+            for name, place in points
+            if len(place) < 2 or (round(place[1], 6), round(place[0], 6)) not in visited
+        ]
+        return replace(self, left_out=tuple(lost))
 
     @property
     def legs(self) -> int:

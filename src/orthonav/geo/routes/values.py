@@ -32,6 +32,15 @@ def parsed(text: str, what: str) -> float:
     return value
 
 
+def numbers_in(text: str) -> list[float]:
+    """The numbers of a text with commas, such as longitude, latitude, height; none where it holds
+    something else."""
+    try:
+        return [float(each) for each in text.split(",")]
+    except ValueError:
+        return []
+
+
 def decoded(data: bytes) -> str:
     """Text of UTF-8 bytes, with or without a byte order mark. Raises `RouteError`."""
     if not data.strip():

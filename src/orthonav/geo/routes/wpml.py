@@ -4,13 +4,12 @@ https://developer.dji.com/doc/cloud-api-tutorial/en/api-reference/dji-wpml/wayli
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from xml.etree.ElementTree import Element
 
 from orthonav.errors import RouteError
 from orthonav.geo.routes.markup import read_markup, text_of
 from orthonav.geo.routes.record import Height, HeightFrame, Route, require_few_waypoints
-from orthonav.geo.routes.values import parsed
+from orthonav.geo.routes.values import numbers_in, parsed
 
 _HEIGHT_FRAMES: dict[str, HeightFrame] = {
     "relativeToStartPoint": "home",
@@ -34,8 +33,14 @@ def read_wpml(data: bytes) -> list[Route]:
         raise RouteError("WPML holds no wayline with waypoints")
     read = {mark for folder in folders for mark in _waypoints(folder)}
     lost = [mark for mark in root.iter("Placemark") if _has_point(mark) and mark not in read]
-    names = tuple(f"placemark {text_of(mark, 'index') or '(no index)'!s:.40}" for mark in lost)
-    return [replace(route, left_out=names) for route in found]
+    points = [
+        (f"placemark {text_of(mark, 'index') or '(no index)':.40}", _numbers(mark)) for mark in lost
+    ]
+    return [route.leaving_out(points) for route in found]
+
+
+def _numbers(mark: Element) -> list[float]:
+    return numbers_in(mark.findtext("Point/coordinates") or "")
 
 
 def _has_point(mark: Element) -> bool:
