@@ -341,6 +341,8 @@ def _print_counts(
 ) -> None:
     import numpy as np
 
+    from orthonav.files import is_stdout
+
     counts = Counts.of(results)
     latencies = np.array([result.latency_ms for result in results])
     latencies = latencies[np.isfinite(latencies)]
@@ -374,6 +376,6 @@ def _print_counts(
     for each in options.export:
         print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
-    print(f"written to {options.out}{guesses}")
+    print(f"written to {'stdout' if is_stdout(options.out) else options.out}{guesses}")
     for line in changes_text(options, changed):
         print(line)
