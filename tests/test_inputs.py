@@ -79,6 +79,25 @@ def test_fixes_of_another_run_are_named(run, fixes, few, map_path, tmp_path):
     assert done.code == 0 and of_flight in done.err and of_map not in done.err
 
 
+def test_swapped_true_positions_end_every_command(run, fixes, few, map_path, tmp_path):
+    rows = [line.split(",") for line in (few / "truth.csv").read_text().splitlines()]
+    swapped = tmp_path / "swapped.csv"
+    swapped.write_text("\n".join(",".join([row[0], row[2], row[1]]) for row in rows[1:]))
+    swapped.write_text("frame,lat_deg,lon_deg\n" + swapped.read_text() + "\n")
+    none = tmp_path / "none.jsonl"
+    none.write_text(fixes.read_text().replace('"status": "fix"', '"status": "no_fix"'))
+    none.write_text(none.read_text().replace('"reason": null', '"reason": "blank"'))
+    for command in (
+        ["evaluate", fixes, "--truth", swapped],
+        ["evaluate", none, "--truth", swapped, "--map", map_path],
+        ["view", fixes, "--map", map_path, "--truth", swapped, "--no-browser"],
+        ["calibrate", map_path, few, "--out", tmp_path / "m", "--gnss-positions", swapped],
+    ):
+        done = run(*command)
+        assert (done.code, done.out) == (1, ""), command
+        assert "latitude and longitude seem to be swapped" in done.err
+
+
 def test_lines_of_health_are_skipped(run, fixes, few, tmp_path):
     lines = fixes.read_text().splitlines()
     mixed = tmp_path / "lines.jsonl"

@@ -8,10 +8,12 @@ import pytest
 
 from orthonav.errors import FlightError
 from orthonav.flight.mount import Bias, Mount
+from orthonav.geo.camera import Camera
 from orthonav.onboard.calibrate import MountCorrected, calibrate_mount, model_of
 from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.track import Model
 
+CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)
 TRUE = {"heading_bias": 4.0, "log_scale_bias": -0.1, "pitch_bias": 6.0, "roll_bias": -1.0}
 SCATTER = {"heading_bias": 1.5, "log_scale_bias": 0.02, "pitch_bias": 0.4, "roll_bias": 0.4}
 
@@ -106,7 +108,7 @@ MOUNT = Mount(
 def test_a_mount_corrected_locator_gets_corrected_telemetry():
     locator = VehicleState()
     mounted, telemetry = MountCorrected(locator, MOUNT), Telemetry(0, 10.0, 0.0, 1.0, 100.0)
-    mounted.locate(View(np.zeros((4, 4), np.uint8), None, telemetry))
+    mounted.locate(View(np.zeros((4, 4), np.uint8), CAMERA, telemetry))
     reason = NoFix("bad_image", "it is broken")
     assert mounted.passed(telemetry, reason) is reason
     assert [(t.yaw_deg, t.pitch_deg, t.roll_deg) for t in locator.telemetry] == [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from orthonav.errors import FlightError
+from orthonav.geo.camera import Camera
 from orthonav.onboard.calibrate_views import (
     RecordedSingleViews,
     calibrate_mount_by_views,
@@ -15,6 +16,7 @@ from orthonav.onboard.calibrate_views import (
 )
 from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 
+CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)
 MOUNT = {"heading": 4.0, "log_scale": -0.05, "pitch": 5.0, "roll": -1.5}
 HORIZON_DEG, REPORTED_STD_DEG = 0.8, 3.0
 
@@ -112,7 +114,7 @@ class Failing:
 def test_the_telemetry_of_every_view_is_kept_once():
     alone, reason = RecordedSingleViews(Failing()), NoFix("bad_image", "it is broken")
     all_reported = [Telemetry(n, 0.0, 0.0, 0.0, 100.0) for n in range(3)]
-    views = [View(np.zeros((4, 4), np.uint8), None, each) for each in all_reported]
+    views = [View(np.zeros((4, 4), np.uint8), CAMERA, each) for each in all_reported]
     alone.locate(views[0])
     with pytest.raises(ValueError, match="it failed"):
         alone.locate(views[1])

@@ -95,6 +95,7 @@ def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_trac
 def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     """The mount by the smoothed track of the flight, and True; by its single views, and False,
     where these make no track."""
+    from orthonav.evaluate.truth import check_truth
     from orthonav.flight import read_truth
     from orthonav.flight.recording import WithTelemetry
     from orthonav.localizer import Localizer
@@ -109,6 +110,9 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
     places = read_truth(options.gnss_positions) if options.gnss_positions else {}
+    if places:
+        frame = opened.manifest.sheets[0].frame
+        check_truth(places, (), (frame.lat_deg, frame.lon_deg), options.gnss_positions)
     priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
     localizer, heading_known = Localizer(opened), options.heading == "known"
 

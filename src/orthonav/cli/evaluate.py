@@ -4,7 +4,6 @@ import argparse
 import json
 import logging
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,10 +28,6 @@ if TYPE_CHECKING:
     from orthonav.records import ViewResult
     from orthonav.report import Background
 
-_FAR_M = 50_000.0
-"""A larger median error is none of the method: maps of one sheet are smaller."""
-_SWAPPED_M = 1000.0
-"""Nearer true positions are not examined: latitude and longitude may be nearly equal."""
 log = logging.getLogger(__name__)
 
 
@@ -186,6 +181,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     from orthonav.evaluate.gnss import measure_gnss
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.track import measure_track
+    from orthonav.evaluate.truth import check_truth
     from orthonav.flight import open_flight, read_truth
     from orthonav.flight.fixes import read_results
 
@@ -199,7 +195,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         results = read_results(fixes)
         known = read_truth(truth)
         comparison = compare(known, results, local)
-        _refuse_swapped(known, results, opened, truth)
+        check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
         _warn_of_another_run(fixes, truth, folders[i] if folders else None, opened)
         worst: tuple[Row, ...] = ()
         if opened and layer:
@@ -209,47 +205,6 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         gnss = measure_gnss(comparison, results)
         flights.append(FlightReport(names[i], comparison, metrics, background, track, worst, gnss))
     return flights
-
-
-def _refuse_swapped(
-    truth: "Mapping[str, tuple[float, float]]",
-    results: "list[ViewResult]",
-    opened: "MapFile | None",
-    path: Path,
-) -> None:
-    """Raise `FlightError` where swapping brings the true positions to the fixes or, without any,
-    to the map; log a warning where they are far away as they are."""
-    import numpy as np
-
-    from orthonav.errors import FlightError
-    from orthonav.geo.frames import distances_m
-    from orthonav.geo.swapped import HINT
-    from orthonav.records import Fix
-
-    both = [
-        (truth[result.frame], (result.outcome.lat_deg, result.outcome.lon_deg))
-        for result in results
-        if isinstance(result.outcome, Fix) and result.frame in truth
-    ]
-    if not both and opened is not None:
-        frame = opened.manifest.sheets[0].frame
-        both = [(place, (frame.lat_deg, frame.lon_deg)) for place in truth.values()]
-    if not both:
-        return
-    true, expected = np.array(both).transpose(1, 0, 2)
-    far_m, swapped_m = (
-        float(np.nanmedian(distances_m(places, expected))) for places in (true, true[:, ::-1])
-    )
-    if far_m > _SWAPPED_M and swapped_m < far_m / 10:
-        raise FlightError(
-            f"true positions are {far_m / 1000:,.0f} km from the fixes (median); {HINT}: {path}"
-        )
-    if far_m > _FAR_M:
-        log.warning(
-            "true positions are %s km from the fixes (median); are these of the same flight?: %s",
-            f"{far_m / 1000:,.0f}",
-            path,
-        )
 
 
 def _warn_of_another_run(

@@ -361,6 +361,8 @@ def _print_counts(
 ) -> None:
     import numpy as np
 
+    from orthonav.files import is_stdout
+
     counts = Counts.of(results)
     latencies = np.array([result.latency_ms for result in results])
     latencies = latencies[np.isfinite(latencies)]
@@ -394,7 +396,7 @@ def _print_counts(
     for each in options.export:
         print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
-    if options.out is not None and not is_stdout(options.out):
-        print(f"written to {options.out}{guesses}")
+    if options.out is not None:
+        print(f"written to {'stdout' if is_stdout(options.out) else options.out}{guesses}")
     for line in changes_text(options, changed):
         print(line)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
+from orthonav.evaluate.truth import check_truth
 from orthonav.files import with_paths
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.identity import Identity, Source, flight_source, read_identity
@@ -49,6 +50,9 @@ def open_run(request: ViewRequest) -> Run:
     feed = _feed(request)
     images = _images(request, feed)
     truth, truth_name = _truth(request)
+    if truth:
+        centre = sheet.frame.lat_deg, sheet.frame.lon_deg
+        check_truth(truth, (), centre, Path(truth_name))
     labels = RunLabels(
         name=request.run.name or str(request.run),
         map_name=request.map_path.name,
