@@ -25,7 +25,6 @@ from orthonav.cli.positions import (
 from orthonav.cli.setups import Counts, SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
-from orthonav.files import is_stdout
 
 if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
