@@ -5,6 +5,7 @@
 # make bench   measure speed, memory and accuracy, and compare with other methods
 # make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
+# make figures   renew the figures of the documentation by running a tutorial, minutes
 # make clean   remove .venv and what was made here
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 EXTRAS ?= dev
 DEPENDS := pyproject.toml constraints.txt
 
-.PHONY: demo test test-long test-slow lint format bench paper docs clean
+.PHONY: demo test test-long test-slow lint format bench paper docs figures clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
@@ -51,9 +52,11 @@ paper: $(VENV)/.dev-installed
 	$(BIN)/python -m experiments.paper report
 
 docs: $(VENV)/.docs-installed
-	$(BIN)/python tools/docs/pictures.py
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs site
 	@echo "open site/index.html"
+
+figures: $(VENV)/.docs-installed
+	$(BIN)/python tools/docs/pictures.py
 
 $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
@@ -76,4 +79,4 @@ $(VENV)/.%-installed: $(DEPENDS) | $(BIN)/python
 	@touch $@
 
 clean:
-	rm -rf $(VENV) demo site docs/pictures bench_results paper_results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) demo site bench_results paper_results .mypy_cache .ruff_cache .pytest_cache .hypothesis

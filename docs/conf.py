@@ -13,8 +13,7 @@ author = "the authors of orthonav"
 project_copyright = "the authors of orthonav. Apache License 2.0"
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "commands", "optional_pictures"]
-exclude_patterns = ["pictures"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "commands"]
 source_suffix = {".md": "markdown"}
 highlight_language = "none"  # most blocks without a language are commands and what they print
 

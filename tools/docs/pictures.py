@@ -1,14 +1,11 @@
-"""Makes the pictures of the documentation by running the tutorial of the operator.
+"""Renews the figures of the documentation, docs/figures, by running the tutorial of the operator.
 
-    python tools/docs/pictures.py [--force]
+    python tools/docs/pictures.py
 
-They go to docs/pictures, and are made again only where the commands, the program or this script
-changed. Pages of the program are photographed with chromium; where there is none, those pictures
-are left out (see `optional_pictures`).
+They are part of the repository, so that its pages can be read there. Pages of the program are
+photographed with chromium; where there is none, their figures stay as they are.
 """
 
-import argparse
-import hashlib
 import json
 import math
 import shutil
@@ -25,8 +22,9 @@ import matplotlib.figure
 import numpy as np
 import pyproj
 import rasterio
-from console import ROOT, Step, check_page, read_steps
+from console import ROOT, check_page, read_steps
 from matplotlib.patches import Ellipse
+from PIL import Image
 from rasterio.windows import Window
 
 from orthonav import represent
@@ -37,8 +35,7 @@ from orthonav.records import Telemetry, View
 from orthonav.variants import make_variant
 
 TUTORIAL = ROOT / "docs" / "tutorials" / "operator.md"
-PICTURES = ROOT / "docs" / "pictures"
-MADE_FROM = "made_from.txt"
+FIGURES = ROOT / "docs" / "figures"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PAST, PRESENT = "area/2016-07.tif", "area/2021-10.tif"
 SHOWN_EN_PX = (560, 300, 640)
@@ -49,24 +46,18 @@ WINDOW_M, ZOOM_M = 460.0, 36.0
 TRUE, FIXED = "#E69F00", "#0072B2"
 SIGMAS_95 = math.sqrt(-2 * math.log(0.05))
 BROWSER_S = 90
-OPTIONS: dict[str, dict[str, Any]] = {"jpg": {"quality": 88, "optimize": True}, "png": {}}
+JPEG: dict[str, Any] = {"quality": 80, "optimize": True}
+WIDEST_PX = 1200
+COLOURS = 256
 
 
 def main() -> int:
-    """Make the pictures that are out of date."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--force", action="store_true", help="make them in any case")
-    options = parser.parse_args()
+    """Make all figures."""
+    FIGURES.mkdir(exist_ok=True)
     steps = [step for step in read_steps(TUTORIAL.read_text("utf-8")) if step.is_run]
-    digest = _digest(steps)
-    stamp = PICTURES / MADE_FROM
-    if not options.force and stamp.is_file() and stamp.read_text("utf-8") == digest:
-        return 0
-    shutil.rmtree(PICTURES, ignore_errors=True)
-    PICTURES.mkdir(parents=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "tutorial"
-        print(f"running {TUTORIAL.relative_to(ROOT)} for its pictures", flush=True)
+        print(f"running {TUTORIAL.relative_to(ROOT)} for its figures", flush=True)
         differences = check_page(TUTORIAL, folder, steps)
         if differences:
             print("\n".join(differences), file=sys.stderr)
@@ -74,18 +65,7 @@ def main() -> int:
             return 1
         _draw(folder)
         _photograph(folder)
-    stamp.write_text(digest, "utf-8")
     return 0
-
-
-def _digest(steps: list[Step]) -> str:
-    """Digest of the sources of the pictures."""
-    made = hashlib.sha256(json.dumps([[step.command, step.shown] for step in steps]).encode())
-    sources = [*ROOT.glob("src/orthonav/**/*"), *Path(__file__).parent.glob("*.py")]
-    for path in sorted(sources):
-        if path.is_file() and "__pycache__" not in path.parts:
-            made.update(path.read_bytes())
-    return made.hexdigest()
 
 
 def _draw(folder: Path) -> None:
@@ -93,18 +73,25 @@ def _draw(folder: Path) -> None:
     _figure("landscape.jpg", (9, 4.7), lambda figure: _draw_landscape(figure, folder))
     _figure("evidence.jpg", (9, 6.5), lambda figure: _draw_evidence(figure, folder))
     _figure("fix.jpg", (9, 9.2), lambda figure: _draw_fix(figure, folder))
-    for name in ("error-curve", "reliability", "map"):
-        shutil.copy(folder / "report" / "figures" / f"{name}.png", PICTURES)
-    shutil.copy(folder / "tracked" / "figures" / "worst-views.png", PICTURES)
-    exceptions = str(PICTURES / "exceptions.jpg")
-    command = [sys.executable, "-m", "experiments.paper.exceptions", "--out", exceptions]
-    subprocess.run(command, cwd=ROOT, check=True)
+    _shrink(folder / "report" / "figures" / "reliability.png", FIGURES / "reliability.png")
+    _shrink(folder / "tracked" / "figures" / "worst-views.png", FIGURES / "worst-views.jpg")
 
 
 def _figure(name: str, size_in: tuple[float, float], draw: Callable[[Any], None]) -> None:
     figure = matplotlib.figure.Figure(size_in, layout="constrained")
     draw(figure)
-    figure.savefig(PICTURES / name, dpi=150, facecolor="white", pil_kwargs=OPTIONS[name[-3:]])
+    figure.savefig(FIGURES / name, dpi=110, facecolor="white", pil_kwargs=JPEG)
+
+
+def _shrink(source: Path, out: Path) -> None:
+    """A copy of a picture of few bytes, because the repository keeps every version of it."""
+    picture = Image.open(source).convert("RGB")
+    picture.thumbnail((WIDEST_PX, WIDEST_PX))
+    if out.suffix == ".jpg":
+        picture.save(out, **JPEG)
+    else:
+        few = picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(out, optimize=True)
 
 
 def _read(path: Path, left: float, top: float, side: float) -> np.ndarray:
@@ -171,7 +158,7 @@ def _draw_fix(figure: Any, folder: Path) -> None:
     turn = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
     near.add_patch(Ellipse((0, 0), sides[1], sides[0], angle=turn, fill=False, color=FIXED, lw=2))
     near.plot(0, 0, "+", color=FIXED, markersize=18, markeredgewidth=2.5, label="fix, 95 % ellipse")
-    near.plot(*true_en_m, "o", color=TRUE, markersize=10, label="truth")
+    near.plot(*true_en_m, "o", color=TRUE, markersize=10, label="ground truth")
     near.legend(loc="lower right")
 
 
@@ -225,34 +212,35 @@ def _photograph(folder: Path) -> None:
     """Pages of the program, where there is a browser."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
-        print("no chromium: pages of the program are not shown", flush=True)
+        print("no chromium: figures of pages stay as they are", flush=True)
         return
     report = folder / "check" / "index.html"
     if report.is_file():
-        _shoot(browser, report.as_uri(), PICTURES / "check.png", (1180, 1100))
+        _shoot(browser, report.as_uri(), FIGURES / "check.png", (1180, 900))
     command = [Path(sys.executable).with_name("orthonav"), "view", "tracked.jsonl"]
     command += ["--map", "area.onav", "--flight", "flight", "--no-browser"]
     server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, encoding="utf-8")
     try:
         address = (server.stdout.readline() if server.stdout else "").split()
         if address:
-            _shoot(browser, address[0], PICTURES / "view.png", (1366, 900))
+            _shoot(browser, address[0], FIGURES / "view.png", (1200, 800))
     finally:
         server.terminate()
         server.wait(timeout=BROWSER_S)
 
 
 def _shoot(browser: str, address: str, out: Path, size_px: tuple[int, int]) -> None:
-    """A picture of a page; if the browser fails, the site is built without it."""
+    """A picture of a page; if the browser fails, the figure stays as it is."""
     with tempfile.TemporaryDirectory() as profile:
+        taken = Path(profile) / "page.png"
         command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
         command += [f"--user-data-dir={profile}", f"--window-size={size_px[0]},{size_px[1]}"]
-        command += ["--virtual-time-budget=8000", f"--screenshot={out}", address]
+        command += ["--virtual-time-budget=20000", f"--screenshot={taken}", address]
         try:
             subprocess.run(command, capture_output=True, timeout=BROWSER_S, check=True)
+            _shrink(taken, out)
         except (subprocess.SubprocessError, OSError) as error:
-            print(f"{out.name} is left out: {error}", file=sys.stderr)
-            out.unlink(missing_ok=True)
+            print(f"{out.name} is not renewed: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":
