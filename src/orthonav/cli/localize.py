@@ -176,7 +176,7 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
-    from orthonav.flight.identity import FlightDigest, Identity, Source
+    from orthonav.flight.identity import FlightDigest, Identity
     from orthonav.flight.mount import MountedFlight
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
@@ -212,7 +212,7 @@ def _on_map(options: argparse.Namespace) -> None:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
     results, advisor = [], SetupAdvice(options, flight, localizer, mount, heights)
-    digest, used = FlightDigest(), Source(options.map.name, opened.manifest.sha256)
+    digest = FlightDigest()
     with progress(options) as shown:
         for result in localize_flight(
             locator,
@@ -230,7 +230,7 @@ def _on_map(options: argparse.Namespace) -> None:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
-        write_results(options.out, results, Identity(used, digest.source(options.flight)))
+        write_results(options.out, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
@@ -311,7 +311,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    write_results(options.out, results, Identity(flight=digest.source(options.flight)))
+    write_results(options.out, results, Identity(flight_sha256=digest.sha256))
     export_all(exports, results, None)
     _print_summary(options, results, accept)
 
