@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +14,7 @@ from orthonav.confidence.accept import Acceptance
 from orthonav.errors import FlightError, VariantError
 from orthonav.flight import open_flight
 from orthonav.flight.fixes import read_results
-from orthonav.flight.identity import Identity, Source, flight_source, read_identity
+from orthonav.flight.identity import Identity, flight_digest, read_identity
 from orthonav.geo.camera import Camera
 from orthonav.grey import grey_levels
 from orthonav.mapfile import open_map
@@ -55,13 +55,12 @@ def test_the_truth_is_that_of_the_flight(run, fixes, few):
 
 def test_fixes_state_their_map_and_flight(fixes, few, map_path):
     first, *others = (json.loads(line) for line in fixes.read_text().splitlines())
-    assert first["map"] == {"name": "area.onav", "sha256": open_map(map_path).manifest.sha256}
-    assert first["flight"]["name"] == "flight" and not any("map" in each for each in others)
-    flight = flight_source(few, open_flight(few).views)
-    assert read_identity(fixes).flight == flight
-    assert read_identity(fixes).differences(Identity(None, flight)) == []
-    assert len(read_results(fixes)) == 4
-    assert Identity().differences(Identity(Source("a", "1"), flight)) == []
+    stated = Identity(open_map(map_path).manifest.sha256, flight_digest(open_flight(few).views))
+    assert (first["map_sha256"], first["flight_sha256"]) == astuple(stated)
+    assert not any("map_sha256" in each for each in others)
+    assert read_identity(fixes) == stated and len(read_results(fixes)) == 4
+    assert stated.differences(stated, map_path, few) == ""
+    assert Identity().differences(stated, map_path, few) == ""
 
 
 def test_fixes_of_another_run_are_named(run, fixes, few, map_path, tmp_path):
@@ -72,7 +71,7 @@ def test_fixes_of_another_run_are_named(run, fixes, few, map_path, tmp_path):
     stated = fixes.read_text().replace(open_map(map_path).manifest.sha256, "0" * 64)
     fixes = tmp_path / "fixes.jsonl"
     fixes.write_text(stated)
-    of_map, of_flight = "map area.onav (00000000), not area.onav", "flight flight ("
+    of_map, of_flight = f"another map (00000000) than {map_path}", "another flight ("
     done = run("evaluate", fixes, "--truth", other / "truth.csv", "--map", map_path)
     assert done.code == 0 and of_map in done.err and of_flight in done.err
     done = run("locate-pixel", fixes, "0001.jpg", 10, 20, "--flight", other)

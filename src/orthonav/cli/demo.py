@@ -112,7 +112,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.evaluate.report import MadeFrom, write_report
     from orthonav.flight import open_flight, read_truth
     from orthonav.flight.fixes import write_results
-    from orthonav.flight.identity import Identity, Source, flight_source
+    from orthonav.flight.identity import Identity, flight_digest
     from orthonav.geo.route import read_route
     from orthonav.localizer import Localizer
     from orthonav.mapfile import open_map
@@ -163,8 +163,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     for result in localize_flight(SingleViews(Localizer(opened), use_prior=False), flight):
         results.append(result)
         shown("localize", len(results) / len(flight.views))
-    of_map = Source(map_path.name, opened.manifest.sha256)
-    identity = Identity(of_map, flight_source(request.out, flight.views))
+    identity = Identity(opened.manifest.sha256, flight_digest(flight.views))
     write_results(folder / "fixes.jsonl", results, identity)
     comparison = compare(read_truth(request.out / "truth.csv"), results, frame)
     metrics = measure(comparison, RADIUS_M)

@@ -216,17 +216,19 @@ def _warn_of_another_run(
     """
     from orthonav.errors import OrthonavError
     from orthonav.flight import open_flight
-    from orthonav.flight.identity import Identity, Source, flight_source, read_identity
+    from orthonav.flight.identity import Identity, flight_digest, read_identity
 
     if flight is None and (truth.parent / "telemetry.csv").is_file():
         with suppress(OrthonavError):
             flight = open_flight(truth.parent, images_needed=False)
     given = Identity(
-        Source(opened.path.name, opened.manifest.sha256) if opened else None,
-        flight_source(flight.path, flight.views) if flight else None,
+        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
     )
-    for difference in read_identity(fixes).differences(given):
-        log.warning("fixes are of another run: %s: %s", difference, fixes)
+    other = read_identity(fixes).differences(
+        given, opened.path if opened else None, flight.path if flight else None
+    )
+    if other:
+        log.warning("fixes are of %s: %s", other, fixes)
 
 
 def _grey_layer(opened: "MapFile") -> "GreyLayer":

@@ -20,7 +20,7 @@ from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
 from orthonav.flight import read_camera
-from orthonav.flight.identity import Identity, Source
+from orthonav.flight.identity import Identity
 from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
@@ -315,9 +315,9 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        used = Identity(Source(options.map.name, digest))
         lines: list[ViewOutput] = [
-            JsonOut(None if each == "-" else Path(each), identity=used) for each in options.jsonl
+            JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
+            for each in options.jsonl
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error

@@ -190,7 +190,7 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.identity import FlightDigest, Identity, Source
+    from orthonav.flight.identity import FlightDigest, Identity
     from orthonav.flight.mount import MountedFlight
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
@@ -226,7 +226,7 @@ def _on_map(options: argparse.Namespace) -> None:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
     results, advisor = [], SetupAdvice(options, flight, localizer, mount, heights)
-    digest, used = FlightDigest(), Source(options.map.name, opened.manifest.sha256)
+    digest = FlightDigest()
     with progress(options) as shown:
         for result in localize_flight(
             locator,
@@ -244,7 +244,7 @@ def _on_map(options: argparse.Namespace) -> None:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
-        write_positions(options, results, Identity(used, digest.source(_source_path(options))))
+        write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
@@ -269,12 +269,6 @@ def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptan
     if made.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
     return made
-
-
-def _source_path(options: argparse.Namespace) -> Path:
-    """The recording; of several photographs the folder of the first."""
-    first: Path = options.flight[0]
-    return first if len(options.flight) == 1 else first.parent
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
@@ -330,7 +324,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    write_positions(options, results, Identity(flight=digest.source(_source_path(options))))
+    write_positions(options, results, Identity(flight_sha256=digest.sha256))
     export_all(exports, results, None)
     _print_summary(options, results, accept)
 

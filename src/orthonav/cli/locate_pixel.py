@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import print_json
 
 if TYPE_CHECKING:
-    from orthonav.flight.identity import Source
     from orthonav.mapfile.terrain import TerrainLayer
 
 log = logging.getLogger(__name__)
@@ -54,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.errors import FlightError
     from orthonav.flight import open_flight
     from orthonav.flight.fixes import read_results
-    from orthonav.flight.identity import Identity, flight_source, read_identity
+    from orthonav.flight.identity import Identity, flight_digest, read_identity
     from orthonav.flight.mount import read_mount
     from orthonav.flight.pixel import locate_pixel
     from orthonav.publish.estimate import ellipse_95
@@ -77,9 +76,10 @@ def run(options: argparse.Namespace) -> None:
     if options.mount is not None:
         telemetry = read_mount(options.mount).corrected(telemetry)
     terrain, used = (None, None) if options.map is None else _terrain(options.map)
-    given = Identity(used, flight_source(options.flight, flight.views))
-    for difference in read_identity(options.fixes).differences(given):
-        log.warning("fixes are of another run: %s: %s", difference, options.fixes)
+    given = Identity(used, flight_digest(flight.views))
+    other = read_identity(options.fixes).differences(given, options.map, options.flight)
+    if other:
+        log.warning("fixes are of %s: %s", other, options.fixes)
     found = locate_pixel(flight.camera, telemetry, fix, (options.x, options.y), terrain)
     ellipse = ellipse_95(found.cov_en_m2)
     height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
@@ -107,10 +107,9 @@ def run(options: argparse.Namespace) -> None:
         print("! the position of this view is a best guess")
 
 
-def _terrain(path: Path) -> "tuple[TerrainLayer, Source]":
-    """The terrain of a map, and the map; raises `FlightError` without one."""
+def _terrain(path: Path) -> "tuple[TerrainLayer, str]":
+    """The terrain of a map, and its digest; raises `FlightError` without one."""
     from orthonav.errors import FlightError
-    from orthonav.flight.identity import Source
     from orthonav.mapfile import open_map
     from orthonav.mapfile.terrain import TerrainLayer
 
@@ -118,4 +117,4 @@ def _terrain(path: Path) -> "tuple[TerrainLayer, Source]":
     terrain = TerrainLayer.of(opened)
     if terrain is None:
         raise FlightError(f"the map has no terrain: {path}")
-    return terrain, Source(path.name, opened.manifest.sha256)
+    return terrain, opened.manifest.sha256

@@ -7,7 +7,7 @@ without them is of an unknown run.
 import hashlib
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,37 +20,28 @@ View = TypeVar("View", bound=RecordedView)
 
 
 @dataclass(frozen=True)
-class Source:
-    """A map or a flight: its name, for messages, and its SHA-256 (hex)."""
-
-    name: str
-    sha256: str
-
-
-@dataclass(frozen=True)
 class Identity:
-    """The map and the flight of a run; None where unknown."""
+    """SHA-256 (hex) of the map and of the flight of a run; None where unknown."""
 
-    map: Source | None = None
-    flight: Source | None = None
+    map_sha256: str | None = None
+    flight_sha256: str | None = None
 
     def added_to(self, line: str) -> str:
-        """A line of JSON with the keys `map` and `flight`, those that are known, at its end."""
-        known = {
-            name: {"name": each.name, "sha256": each.sha256}
-            for name, each in (("map", self.map), ("flight", self.flight))
-            if each is not None
-        }
+        """A line of JSON with the digests that are known at its end."""
+        known = {name: value for name, value in asdict(self).items() if value is not None}
         return line[:-1] + ", " + json.dumps(known)[1:] if known else line
 
-    def differences(self, other: "Identity") -> list[str]:
-        """What is known of both and differs, as `map area.onav (1a2b3c4d), not ...`."""
-        pairs = (("map", self.map, other.map), ("flight", self.flight, other.flight))
-        return [
-            f"{kind} {own.name:.80} ({own.sha256[:8]}), not {its.name:.80} ({its.sha256[:8]})"
-            for kind, own, its in pairs
-            if own is not None and its is not None and own.sha256 != its.sha256
-        ]
+    def differences(self, other: "Identity", map_path: Path | None, flight: Path | None) -> str:
+        """What is known of both and differs: the map or the flight at these paths; else ""."""
+        pairs = (
+            ("map", map_path, self.map_sha256, other.map_sha256),
+            ("flight", flight, self.flight_sha256, other.flight_sha256),
+        )
+        return " and ".join(
+            f"another {kind} ({own[:8]}) than {path} ({its[:8]})"
+            for kind, path, own, its in pairs
+            if own and its and own != its
+        )
 
 
 @dataclass
@@ -70,17 +61,18 @@ class FlightDigest:
             self._sum.update(text.encode("utf-8", "surrogateescape"))
             yield view
 
-    def source(self, path: Path) -> Source:
-        """The flight at `path`, once all of its views have passed."""
-        return Source(Path(path).resolve().name, self._sum.hexdigest())
+    @property
+    def sha256(self) -> str:
+        """The digest (hex) of the views that have passed."""
+        return str(self._sum.hexdigest())
 
 
-def flight_source(path: Path, views: Iterable[RecordedView]) -> Source:
-    """The flight at `path` with these views."""
+def flight_digest(views: Iterable[RecordedView]) -> str:
+    """SHA-256 (hex) of a flight with these views."""
     digest = FlightDigest()
     for _ in digest.watching(views):
         pass
-    return digest.source(path)
+    return digest.sha256
 
 
 def read_identity(path: Path) -> Identity:
@@ -92,12 +84,6 @@ def read_identity(path: Path) -> Identity:
             except (ValueError, RecursionError):
                 return Identity()
             if isinstance(plain, dict) and "frame" in plain:
-                return Identity(_source(plain.get("map")), _source(plain.get("flight")))
+                stated = (plain.get(each.name) for each in fields(Identity))
+                return Identity(*(each if isinstance(each, str) else None for each in stated))
     return Identity()
-
-
-def _source(plain: Any) -> Source | None:
-    known = isinstance(plain, dict) and all(
-        isinstance(plain.get(key), str) for key in ("name", "sha256")
-    )
-    return Source(plain["name"], plain["sha256"]) if known else None

@@ -9,7 +9,7 @@ from orthonav.errors import FlightError, MissingFileError
 from orthonav.evaluate.truth import check_truth
 from orthonav.files import with_paths
 from orthonav.flight import open_flight, read_truth
-from orthonav.flight.identity import Identity, Source, flight_source, read_identity
+from orthonav.flight.identity import Identity, flight_digest, read_identity
 from orthonav.flight.mount import read_mount
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
@@ -120,16 +120,15 @@ def _images_name(request: ViewRequest, images: ViewImages) -> str:
     return (request.flight or request.run).name
 
 
-def _differences(request: ViewRequest, feed: Feed) -> list[str]:
-    """Where a file of fixes states another map or flight folder than the given ones."""
+def _differences(request: ViewRequest, feed: Feed) -> str:
+    """Which other map or flight folder than the given ones a file of fixes states; else ""."""
     if not isinstance(feed, LineFeed) or not request.run.is_file():
-        return []
+        return ""
     flight = None
     if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
-        views = open_flight(request.flight, images_needed=False).views
-        flight = flight_source(request.flight, views)
-    given = Identity(Source(request.map_path.name, map_digest(request.map_path)), flight)
-    return read_identity(request.run).differences(given)
+        flight = flight_digest(open_flight(request.flight, images_needed=False).views)
+    given = Identity(map_digest(request.map_path), flight)
+    return read_identity(request.run).differences(given, request.map_path, request.flight)
 
 
 def _warn(
@@ -139,8 +138,8 @@ def _warn(
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
-    for difference in _differences(request, feed):
-        log.warning("the run is another one: %s: %s", difference, request.run)
+    if other := _differences(request, feed):
+        log.warning("the run is of %s: %s", other, request.run)
     if not run.count:
         return
     if truth and not run.any_known("tx"):
