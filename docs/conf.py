@@ -41,7 +41,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!orthonav\b).*"),
     # Values that are handed on between parts, not documented on pages of their own.
     (r"py:class", r"orthonav\.(confidence|embed\.cells|register)\..*"),
-    (r"py:class", r"orthonav\.(search\.peak|track\.hypotheses)\..*"),
+    (r"py:class", r"orthonav\.(search\.peak|track\.hypotheses|flight\.identity)\..*"),
     (r"py:class", r"orthonav\.sources\.track\..*"),
     (r"py:class", r"orthonav\.(mapfile\.reader\._.*|simulate\.receiver\..*)"),
 ]
