@@ -1,8 +1,9 @@
 """A flight in the loop: true motion, instruments, filter, guidance, camera, orthonav, and back."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +137,13 @@ class Route:
 class Sight:
     """Camera and orthonav of one flight, as `orthonav fly` joins them."""
 
-    def __init__(self, demo: Demo, scenario: Scenario, rule: Rule, seed: int) -> None:
+    def __init__(
+        self,
+        demo: Demo,
+        scenario: Scenario,
+        rule: Callable[[Telemetry, bool], Telemetry],
+        seed: int,
+    ) -> None:
         self._demo, self._scenario, self._rule, self._seed = demo, scenario, rule, seed
         self._tracker, self.gate = Tracker(demo.localizer), Gate(clock=Clock.BOOT)
         self._frozen, self._covariance = FrozenCheck(), FilterCovariance()
@@ -258,7 +265,7 @@ def fly(
     estimator = _started(rng, aircraft, instruments, autopilot, scenario.gnss_s > 0)
     sight = None
     if scenario.send is not None and demo is not None:
-        sight = Sight(demo, scenario, rule, seed)
+        sight = Sight(demo, scenario, partial(rule, autopilot), seed)
     flown, route = Flown(scenario), Route()
     for number in range(round(scenario.seconds / STEP_S)):
         time_s = number * STEP_S

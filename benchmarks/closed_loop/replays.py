@@ -8,6 +8,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,7 @@ from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.inputs import DATA
 from benchmarks.record import Section, Table, number
 from orthonav.localizer.tracker import Tracker
-from orthonav.onboard.aiding import (
-    AIDED_TILT_STD_DEG,
-    UNAIDED_TILT_STD_DEG,
-    UNAIDED_VEL_STD_MPS,
-)
+from orthonav.onboard.aiding import ABSOLUTE, FIX_3D, Aiding
 from orthonav.onboard.run import Locator, SingleViews, locate_view
 from orthonav.publish.estimate import Clock, error_ellipse, estimate_from_result
 from orthonav.publish.gate import Gate
@@ -46,7 +43,8 @@ HEADER = (
     *("velocity m/s", "300 m east", "mirrored"),
 )
 Array = NDArray[np.float64]
-Rule = Callable[[Telemetry, bool], Telemetry]
+Rule = Callable[[str, Telemetry, bool], Telemetry]
+"""From the autopilot (px4, ardupilot), telemetry, and whether GNSS aids it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,14 +91,19 @@ def is_wrong(error_m: float, cov_en_m2: Array | None) -> bool:
     return cov_en_m2 is not None and error_m > max(FAR_M, FAR_STD * error_ellipse(cov_en_m2)[0])
 
 
-def stated(telemetry: Telemetry, gnss: bool) -> Telemetry:
-    """Telemetry with the deviations of an autopilot with and without GNSS."""
+def stated(autopilot: str, telemetry: Telemetry, gnss: bool) -> Telemetry:
+    """Telemetry with the deviations that `orthonav fly` states for an autopilot."""
+    aiding = Aiding()
+    aiding.status(0, 0, ardupilot=autopilot == "ardupilot")
     if gnss:
-        return replace(telemetry, tilt_std_deg=AIDED_TILT_STD_DEG)
-    return replace(telemetry, tilt_std_deg=UNAIDED_TILT_STD_DEG, vel_std_mps=UNAIDED_VEL_STD_MPS)
+        aiding.status(ABSOLUTE, 0, ardupilot=autopilot == "ardupilot")
+        aiding.receiver(0, FIX_3D, 0)
+    vel_std_mps, tilt_std_deg = aiding.stds(0)
+    known = math.isfinite(vel_std_mps)
+    return replace(telemetry, tilt_std_deg=tilt_std_deg, vel_std_mps=vel_std_mps if known else None)
 
 
-def plain(telemetry: Telemetry, gnss: bool) -> Telemetry:
+def plain(autopilot: str, telemetry: Telemetry, gnss: bool) -> Telemetry:
     """Telemetry without deviations, as version 0.1 has it."""
     return telemetry
 
@@ -132,8 +135,9 @@ def replay(
         "track": Tracker(demo.localizer),
     }
     gates = {name: Gate(clock=Clock.BOOT) for name in methods}
+    autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
-    for exposure, view in recorded.views(demo, work / "views", rule):
+    for exposure, view in recorded.views(demo, work / "views", partial(rule, autopilot)):
         alone += exposure.phase == OFF
         too_late = not disturbed and exposure.phase not in (ON, OFF)
         if too_late or (views is not None and alone > views):

@@ -386,7 +386,8 @@ class AutopilotLink:
             self.counts["damaged"] += 1
 
     def _filter_status(self, message: Message, now_ns: int) -> None:
-        self.aiding.status(message.flags, now_ns)
+        ardupilot = message.get_type() == "EKF_STATUS_REPORT"
+        self.aiding.status(message.flags, now_ns, ardupilot=ardupilot)
 
     def _odometry(self, message: Message, now_ns: int) -> None:
         """The accuracy of the velocity, along the first two axes of the message."""
