@@ -44,6 +44,8 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     assert main(["demo", "--out", str(out)]) == 0
     printed = capsys.readouterr()
     assert f"{out}/report/index.html" in printed.out and "5/5" in printed.err
+    (picture,) = [word for word in printed.out.split() if word.endswith(".png")]
+    assert picture.startswith(f"{out}/") and Path(picture).read_bytes().startswith(b"\x89PNG")
     assert f"{out}/check/index.html" in printed.out and "expected to give a correct" in printed.out
     assert json.loads((out / "check" / "check.json").read_text())["route"]["name"] == "demo"
     names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]

@@ -16,13 +16,13 @@ from made_check import EVIL, FILES, small_route
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
-from orthonav.check.outcome import CELL_VALUES
+from orthonav.check.outcome import CELL_VALUES, BlindStretch
 from orthonav.check.write import figures, write_check
 from orthonav.check.write.figures import MAX_SIDE_PX, jpeg, map_image, visible_box
 from orthonav.check.write.page import ZERO_IF_UNKNOWN, _known_cells
 from orthonav.check.write.plain import to_plain
-from orthonav.check.write.risk import RISKS, segments
-from orthonav.check.write.wording import share_text
+from orthonav.check.write.risk import RISKS, segments, shade
+from orthonav.check.write.wording import better_sentence, remedies, share_text
 from orthonav.mapfile import open_map
 from orthonav.report import Drawing, metres_text
 from orthonav.report.leaflet import load_leaflet
@@ -107,7 +107,11 @@ def test_nothing_is_asked_for(page):
     for tag, attributes in page.elements:
         assert tag not in ("link", "iframe", "object", "base")
         for name in ("src", "href", "srcset", "data"):
-            assert attributes.get(name, "data:").startswith(("data:", "#")), (tag, name)
+            downloaded = "download" in attributes and attributes["href"] in FILES
+            assert downloaded or attributes.get(name, "data:").startswith(("data:", "#")), (
+                tag,
+                name,
+            )
         assert "style" not in attributes and not [n for n in attributes if n.startswith("on")]
     for text in page.inside["style"]:
         assert "@import" not in text
@@ -165,13 +169,34 @@ def test_the_script_is_given_the_json_of_the_check(folder, frame):
 
 def test_all_sections_are_there(page, folder):
     text = (folder / "small_route" / "index.html").read_text(encoding="utf-8")
-    for said in ("NO-GO", "Blind stretches", "Lookalikes", "How to read this", "Tolerated:"):
+    for said in (
+        "NO-GO",
+        "What may help:",
+        "Checked for",
+        "Blind stretches",
+        "Lookalikes",
+        "How to read this",
+        "Tolerated:",
+    ):
         assert said in text
+    for name in FILES - {"index.html", "figures"}:
+        assert f'<a href="{name}" download' in text
     assert "© IGN, Licence Ouverte 2.0" in text
     assert sum(t == "h1" for t, _ in page.elements) == 1
     images = [a for t, a in page.elements if t == "img" and "alt" in a]
     assert sum(bool(each["alt"]) for each in images) == 3
     assert "Blind stretches" not in (folder / "tiny" / "index.html").read_text(encoding="utf-8")
+
+
+def test_a_go_needs_no_help_and_a_no_go_names_what_it_tried(frame):
+    assert remedies(made_check.tiny(frame)) == []
+    result = made_check.small_route(frame)
+    assert remedies(result) == [better_sentence(result.alternatives, "agl_m")]
+    lost = BlindStretch(100, 1100, 5, 55, 0.2, drift_m=20, allowed_m=15)
+    (sentence,) = remedies(replace(result, alternatives=(), stretches=(lost,)))
+    assert "drifts by at most 1.5 % (assumed: 2 %)" in sentence
+    (sentence,) = remedies(replace(result, alternatives=(), stretches=()))
+    assert sentence.startswith("No other height was tried")
 
 
 def test_the_picture_lies_where_the_map_does(opened, frame):
@@ -201,7 +226,7 @@ def test_the_route_has_the_colours_of_the_cells():
     """One scale: light is likely, and dark blue is not, on the route as in the cells."""
     for risk in RISKS[:-1]:
         above = min((r.least for r in RISKS[:-1] if r.least > risk.least), default=1.0)
-        wanted = to_rgb(colormaps["cividis"]((risk.least + above) / 2))
+        wanted = to_rgb(colormaps["cividis"](shade((risk.least + above) / 2)))
         np.testing.assert_allclose(to_rgb(risk.colour), wanted, atol=0.02)
 
 

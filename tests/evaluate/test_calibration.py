@@ -346,9 +346,9 @@ def test_unknown_values_are_reported(offsets, confidence, cov, words, tmp_path, 
 
 def test_lines_name_thresholds_and_a_missing_radius() -> None:
     lines = calibration_lines(measure(flown(OFFSETS, 0.9, None, radius_m=math.nan), 35.0))
-    assert "4 state no radius; 35 m is used" in lines[4]
-    assert [line.split(":")[0] for line in lines[5:-1]] == ["  >= 0.5", "  >= 0.9", "  >= 0.99"]
-    assert "50.0 % of them within 35 m (100.0 % of all that are); 2 of 4 wrong" in lines[6]
+    assert "4 state no radius; 35 m is used" in lines[6]
+    assert [line.split(":")[0] for line in lines[7:-1]] == ["  >= 0.5", "  >= 0.9", "  >= 0.99"]
+    assert "50.0 % of them within 35 m (100.0 % of all that are); 2 of 4 wrong" in lines[8]
 
 
 def test_the_command_evaluates_several_flights(tmp_path, capsys) -> None:

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import binom
 
 from orthonav.errors import FlightError
 from orthonav.evaluate.calibration_report import nees_text
+from orthonav.evaluate.figures import upper_bound
 from orthonav.evaluate.flights import verdict
 from orthonav.evaluate.metrics import (
     CRITERIA,
@@ -241,9 +243,28 @@ def test_confident_and_wrong_is_distinguished_from_a_wrong_guess() -> None:
     ("nees", "said"),
     [
         (8.0, "too small: errors are 2.0 times as large as stated"),
-        (0.5, "cautious: errors are 0.5 times as large as stated"),
+        (0.5, "conservative: errors are 0.5 times as large as stated"),
         (2.1, "consistent with the errors"),
     ],
 )
 def test_consistency_is_put_in_words(nees, said) -> None:
     assert nees_text(nees, 1.5, 2.6) == said
+
+
+@pytest.mark.parametrize(("part", "whole"), [(0, 198), (1, 40), (7, 9)])
+def test_the_bound_of_a_rate_is_exact(part, whole) -> None:
+    """At the bound, so few or fewer cases have a probability of 5 %."""
+    assert binom.cdf(part, whole, upper_bound(part, whole)) == pytest.approx(0.05)
+    assert upper_bound(0, 198) == pytest.approx(0.015, abs=1e-4)
+    assert upper_bound(whole, whole) == 1.0 and math.isnan(upper_bound(0, 0))
+
+
+def test_confident_fixes_and_gaps_have_figures_of_their_own() -> None:
+    """Confident at 0 s alone: the gap lasts from the second view to the last, 1 to 3 s."""
+    comparison = replace(three_fixes(), time_ns=(0, 10**9, 2 * 10**9, 3 * 10**9))
+    found = measure(comparison)
+    assert (found.availability, found.of_confident.cep95_m) == (0.25, pytest.approx(5.0))
+    assert found.availability_95[0] < 0.25 < found.availability_95[1]
+    assert found.gap.seconds_s == pytest.approx(2.0)
+    assert found.gap.path_m == pytest.approx(math.hypot(100, 50) + 100, rel=1e-3)
+    assert measure(pool([comparison, comparison])).gap.seconds_s == pytest.approx(2.0)

@@ -14,12 +14,13 @@ import pytest
 
 from orthonav.errors import MissingExtraError
 from orthonav.evaluate import plots
+from orthonav.evaluate.calibration_report import covariance_card
 from orthonav.evaluate.flights import FlightReport, metrics_to_json, table, total
 from orthonav.evaluate.metrics import compare, measure
 from orthonav.evaluate.report import MadeFrom, write_report
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
-from orthonav.report import Background, Drawing
+from orthonav.report import Background, Drawing, measure_text
 
 CENTRE = LocalFrame(48.0, -4.5)
 PICTURES_PER_FLIGHT = 6
@@ -97,7 +98,13 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, only_new) -> None
     )
     html = write_report(tmp_path, [flight], made_from, "Brest at noon").read_text("utf-8")
     assert "<h1>Brest at noon</h1>" in html
-    assert f"{100 * flight.metrics.accuracy:.1f} %" in html
+    metrics = flight.metrics
+    assert f"<b>{100 * metrics.availability:.1f} %</b>" in html
+    assert f"<b>{metrics.n_confident_wrong} of {metrics.n_confident}</b>" in html
+    assert f"below {100 * metrics.wrong_upper_95:.1f} %" in html
+    for figures in (metrics.of_confident, metrics.standard):
+        assert f"<td>{measure_text(figures.cep50_m)}</td>" in html
+    assert covariance_card(metrics.consistency)[1] in html
     for said in vars(made_from).values():
         assert said in html
     worst = flight.comparison.frames[int(np.nanargmax(flight.comparison.errors_m))]

@@ -16,6 +16,7 @@ from orthonav.cli import main
 from orthonav.errors import FlightError
 from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture, worst_first, worst_rows
 from orthonav.evaluate.flights import FlightReport, flights_to_json, metrics_to_json, summary, total
+from orthonav.evaluate.gaps import seconds_since_first
 from orthonav.evaluate.metrics import Comparison, compare, measure
 from orthonav.evaluate.report import write_report
 from orthonav.evaluate.track import (
@@ -25,7 +26,6 @@ from orthonav.evaluate.track import (
     effective_number,
     measure_track,
     nees_mean_bounds,
-    seconds_since_first,
 )
 from orthonav.evaluate.track_plots import (
     STATE_STYLES,

@@ -12,7 +12,7 @@ from browsing import LAPTOP, TABLET, Visit, painted
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
-from orthonav.flight.fixes import result_to_json
+from orthonav.flight.fixes import result_to_json, write_results
 from orthonav.report import metres_text
 from orthonav.web.opening import ViewRequest, open_run
 
@@ -104,6 +104,26 @@ def test_the_run_is_drawn_where_it_is(page, columns):
     figures = page.locator("#figures").inner_text().replace("\n", " ")
     assert figures.startswith("views 6 confident 83.3 % low confidence 0.0 % no fix 16.7 % within")
     assert figures.endswith("confident and wrong 1")
+
+
+def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
+    second = tmp_path / "tracked.jsonl"
+    write_results(second, [result(i) for i in range(WRONG)])
+    request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
+    with serving(open_run(request)) as started:
+        page = visit(started)
+        page.pictured(0)
+        assert "second run: tracked.jsonl" in page.locator("#legend").inner_text()
+        assert page.locator("#list .second").all_inner_texts()[WRONG] == "no fix"
+        assert " / " in page.locator("#figures").inner_text()
+        before = page.locator("#img-view").bounding_box()["width"]
+        page.click("#enlarge")
+        assert page.locator("#img-view").bounding_box()["width"] > 1.3 * before
+        page.click("#copy")
+        fix = json.loads(small.fixes.read_text().splitlines()[0])
+        expect(page.locator("#ground")).to_contain_text(
+            f"{fix['lat_deg']:.7f}, {fix['lon_deg']:.7f}"
+        )
 
 
 def test_the_worst_view_with_its_images_and_values(page, small, ask):
@@ -263,7 +283,8 @@ def test_everything_is_reached_by_tab_in_order(page):
             break
         reached.append(where)
         assert outlined, where
-    expected = ["help-open", "map", "Zoom in", "Zoom out", "opacity", "blink", "on-map", "summary"]
+    expected = ["help-open", "map", "Zoom in", "Zoom out", "copy", "opacity", "blink", "enlarge"]
+    expected += ["on-map", "summary"]
     expected += ["which", "order", "named", "button", "first", "before", "play", "after", "last"]
     expected += ["zoom-in", "zoom-out", "scrub"]
     assert [each for each in reached if each in expected] == expected

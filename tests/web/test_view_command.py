@@ -4,12 +4,15 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from dataclasses import replace
 
 import pytest
+from small_run import NO_FIX, WRONG, result
 
 from orthonav.cli import view as view_module
 from orthonav.flight.fixes import write_results
 from orthonav.records import Fix, ViewResult
+from orthonav.web.opening import ViewRequest, open_run
 
 
 def refused(done, *words):
@@ -34,6 +37,23 @@ def test_it_prints_the_address_and_ends(run, small, served):
     assert done.code == 0 and done.err == ""
     first, last = done.out.splitlines()
     assert first.startswith("http://127.0.0.1:") and last == "ended"
+
+
+def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
+    """Its errors are beside those of the first; views that it lacks have none."""
+    second = tmp_path / "tracked.jsonl"
+    write_results(second, [result(0), result(NO_FIX), result(WRONG)])
+    request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
+    opened = open_run(request)
+    columns = opened.news(0, 0, 0)["columns"]
+    known = [columns["err"][i] if i in (0, WRONG) else None for i in range(len(columns["err"]))]
+    assert columns["err2"] == known and columns["confident2"][0] == columns["confident"][0]
+    assert opened.summary()["second"] == "tracked.jsonl"
+    assert "second_lat_deg" in opened.detail(0) and "second_lat_deg" not in opened.detail(1)
+    refused(run("view", small.fixes, tmp_path / "no.jsonl", "--map", small.map_path), "no.jsonl")
+    write_results(second, [replace(result(0), frame="other.png")])
+    done = run("view", small.fixes, second, "--map", small.map_path)
+    assert done.code == 0 and "no view has a position in the second run" in done.err
 
 
 def test_a_public_address_is_warned_about(run, small, served):

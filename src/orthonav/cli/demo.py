@@ -69,15 +69,16 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _how_to_view(out: Path) -> str:
-    """The reports, and the command that shows the flight."""
+    """A picture, the reports, and the command that shows the flight."""
     files = [f"{out}/fixes.jsonl", "--map", f"{out}/area.onav", "--flight", f"{out}/flight"]
     command = shlex.join([*_this_program(), "view", *files])
     return "\n".join(
         (
-            "open in a browser:",
-            f"  {out}/check/index.html    before the flight: where fixes are expected on this map",
-            f"  {out}/report/index.html   after the flight: errors, confidence, worst views",
-            f"step through the views:\n  {command}",
+            "look at:",
+            f"  {out}/report/figures/map.png   picture: fixes and true positions on the map",
+            f"  {out}/check/index.html         before the flight: where fixes are expected",
+            f"  {out}/report/index.html        after the flight: errors, confidence, worst views",
+            f"step through the views in a browser:\n  {command}",
         )
     )
 

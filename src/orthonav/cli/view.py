@@ -25,6 +25,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         "the name given to --log)",
     )
     parser.add_argument(
+        "second",
+        type=Path,
+        nargs="?",
+        metavar="SECOND",
+        help="another run of the same flight to compare, such as single and tracked fixes",
+    )
+    parser.add_argument(
         "--map", type=Path, required=True, metavar="MAP.onav", help="map of the flight"
     )
     parser.add_argument(
@@ -75,6 +82,7 @@ def run(options: argparse.Namespace) -> None:
 
     request = ViewRequest(
         run=options.run,
+        second=options.second,
         map_path=options.map,
         flight=options.flight,
         truth=options.truth,

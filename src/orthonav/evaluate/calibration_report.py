@@ -68,13 +68,19 @@ def consistency_to_json(consistency: CovarianceConsistency) -> dict[str, object]
 
 def calibration_lines(metrics: Metrics) -> list[str]:
     """Standard figures, confidence and covariance in lines for a terminal."""
-    standard = metrics.standard
-    cep50, cep95 = (measure_text(each, " m") for each in (standard.cep50_m, standard.cep95_m))
+    standard, of_confident = metrics.standard, metrics.of_confident
+    low, high = map(percent_text, metrics.availability_95)
     frames = f"{RPE_FRAMES} frame{'s' * (RPE_FRAMES != 1)}"
     rows = [row for row in metrics.criteria if row.name == "confidence"]
     accepted = [f"  >= {row.threshold:g}: {_accepted(row, metrics.radius_m)}" for row in rows]
     return [
-        f"CEP50 {cep50}, CEP95 {cep95}",
+        f"availability: {percent_text(metrics.availability)} of views have a confident fix (95 % "
+        f"interval {low} to {high}); longest gap {measure_text(metrics.gap.seconds_s, ' s')}, "
+        f"{measure_text(metrics.gap.path_m, ' m')}",
+        f"CEP50: {measure_text(of_confident.cep50_m, ' m')} of confident fixes, "
+        f"{measure_text(standard.cep50_m, ' m')} of all",
+        f"CEP95: {measure_text(of_confident.cep95_m, ' m')} of confident fixes, "
+        f"{measure_text(standard.cep95_m, ' m')} of all",
         f"APE: {_statistics_text(standard.ape)}",
         f"RPE over {frames}: {_statistics_text(standard.rpe_frames)}",
         f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
@@ -98,18 +104,17 @@ def standard_rows(
     metrics: Metrics,
 ) -> tuple[list[tuple[str, ...]], list[tuple[str, str]]]:
     """Rows of the table of standard figures, and definitions of those that are not in it."""
-    standard = metrics.standard
-    named = (
-        ("APE", standard.ape),
-        (f"RPE over {RPE_FRAMES} frame", standard.rpe_frames),
-        (f"RPE over {standard.distance_m:g} m", standard.rpe_distance),
-    )
     rows = []
-    for name, found in named:
-        values = (found.rmse_m, found.mean_m, found.median_m, found.std_m, found.max_m)
-        rows.append((name, *map(measure_text, values), str(found.n)))
+    for kind, standard in (("confident", metrics.of_confident), ("all", metrics.standard)):
+        named = (
+            ("APE", standard.ape),
+            (f"RPE over {RPE_FRAMES} frame", standard.rpe_frames),
+            (f"RPE over {standard.distance_m:g} m", standard.rpe_distance),
+        )
+        for name, found in named:
+            values = (found.rmse_m, found.mean_m, found.median_m, found.std_m, found.max_m)
+            rows.append((name, kind, *map(measure_text, values), str(found.n)))
     more = [
-        ("CEP50, CEP95", f"{measure_text(standard.cep50_m)}, {measure_text(standard.cep95_m)} m"),
         ("ECE", plain_text(metrics.calibration.ece)),
         ("NEES (mean, 2 expected)", plain_text(metrics.consistency.nees_mean)),
         ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
@@ -182,6 +187,17 @@ def confidence_text(metrics: Metrics) -> str:
     )
 
 
+def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str]:
+    """A word on the stated covariances, and its explanation."""
+    if not consistency.nees.size:
+        return "-", "covariance: no correct fix states one"
+    found = nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
+    word, _, times = found.partition(": ")
+    why = f"{times}; " if times else ""
+    word = word if times else "right"
+    return word, f"covariance: {why}NEES {consistency.nees_mean:.3g}, 2 expected"
+
+
 def covariance_verdict(consistency: CovarianceConsistency) -> str:
     """A sentence that answers whether the stated covariances can be used."""
     if not consistency.nees.size:
@@ -213,7 +229,7 @@ def nees_text(nees: float, low: float, high: float) -> str:
     times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
     if nees > high:
         return f"too small: {times}"
-    return f"cautious: {times}" if nees < low else "consistent with the errors"
+    return f"conservative: {times}" if nees < low else "consistent with the errors"
 
 
 def _accepted(row: CriterionRow, radius_m: float) -> str:

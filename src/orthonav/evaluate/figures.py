@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betaincinv
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -42,6 +43,17 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
     low = 0.0 if part == 0 else max(middle - half, 0.0)
     high = 1.0 if part == whole else min(middle + half, 1.0)
     return low, high
+
+
+def upper_bound(part: int, whole: int) -> float:
+    """The one-sided 95 % upper bound of a rate, given `part` of `whole`; NaN for a `whole` of 0.
+
+    Clopper and Pearson, "The use of confidence or fiducial limits", 1934: exact for independent
+    cases; for 0 of n it is 1 - 0.05^(1 / n), about 3 / n.
+    """
+    if not whole:
+        return math.nan
+    return 1.0 if part == whole else float(betaincinv(part + 1, whole - part, 0.95))
 
 
 def frozen(values: FloatArray | Sequence[float]) -> FloatArray:

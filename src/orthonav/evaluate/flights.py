@@ -104,8 +104,14 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "n_low_confidence": metrics.n_fixes - metrics.n_confident,
         "n_confident_wrong": metrics.n_confident_wrong,
         "wrong_above_m": metrics.wrong_above_m,
-        "confident_error_median_m": or_none(metrics.confident_median_m),
-        "confident_error_max_m": or_none(metrics.confident_max_m),
+        "wrong_upper_95": or_none(metrics.wrong_upper_95),
+        "availability": or_none(metrics.availability),
+        "availability_95": [or_none(each) for each in metrics.availability_95],
+        "longest_gap_s": or_none(metrics.gap.seconds_s),
+        "longest_gap_m": or_none(metrics.gap.path_m),
+        "confident_error_median_m": or_none(metrics.of_confident.cep50_m),
+        "confident_error_p95_m": or_none(metrics.of_confident.cep95_m),
+        "confident_error_max_m": or_none(metrics.of_confident.ape.max_m),
         "n_without_truth": metrics.n_without_truth,
         "n_without_result": metrics.n_without_result,
         "radius_m": metrics.radius_m,
@@ -121,6 +127,7 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "reasons": dict(metrics.reasons),
         "criteria": [row_to_json(row) for row in metrics.criteria],
         "standard": standard_to_json(metrics.standard),
+        "standard_of_confident": standard_to_json(metrics.of_confident),
         "curves": {
             curve.name: {
                 "threshold": [or_none(value) for value in curve.thresholds],
@@ -173,15 +180,20 @@ def verdict(metrics: Metrics) -> str:
         guesses = metrics.n_fixes
         return f"No fix is confident: rely on no position ({guesses} are best guesses)."
     errors = (
-        f"median error {measure_text(metrics.confident_median_m, ' m')}, largest "
-        f"{measure_text(metrics.confident_max_m, ' m')}"
+        f"median error {measure_text(metrics.of_confident.cep50_m, ' m')}, largest "
+        f"{measure_text(metrics.of_confident.ape.max_m, ' m')}"
     )
+    bound = f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
     if not wrong:
         return (
-            f"No confident fix is wrong: none of {confident} has an error above {above}; {errors}."
+            f"No confident fix is wrong: none of {confident} has an error above {above} ({bound}); "
+            f"{errors}."
         )
     verb = "is" if wrong == 1 else "are"
-    return f"{wrong} of {confident} confident fixes {verb} WRONG, by more than {above}; {errors}."
+    return (
+        f"{wrong} of {confident} confident fixes {verb} WRONG, by more than {above} ({bound}); "
+        f"{errors}."
+    )
 
 
 def table_header(flights: Sequence[FlightReport]) -> list[str]:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from orthonav.evaluate.figures import FloatArray, frozen, or_none, percentile, runs
+from orthonav.evaluate.gaps import seconds_since_first
 from orthonav.evaluate.metrics import Comparison
-from orthonav.evaluate.track import seconds_since_first
 from orthonav.flight.gnss import BIASES, biases_of, fault_of, gnss_of
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import ViewResult

@@ -9,6 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
@@ -20,7 +21,16 @@ from orthonav.evaluate.calibration import (
     calibrate,
     check_covariance,
 )
-from orthonav.evaluate.figures import BoolArray, FloatArray, frozen, percentile, share
+from orthonav.evaluate.figures import (
+    BoolArray,
+    FloatArray,
+    frozen,
+    percentile,
+    share,
+    upper_bound,
+    wilson,
+)
+from orthonav.evaluate.gaps import Longest, longest, path_so_far_m, seconds_since_first
 from orthonav.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
@@ -129,14 +139,18 @@ class Metrics:
     `n_views`, `n_fixes`, `n_without_truth`, `n_without_result`: counts, see `Comparison`.
     `n_confident`, `n_confident_wrong`: confident fixes, and those of them that err by more than
     `wrong_above_m` and the radius they state.
-    `confident_median_m`, `confident_max_m`: errors of the confident fixes.
-    `coverage`: share of the true positions with a fix, guesses included.
+    `wrong_upper_95`: one-sided 95 % upper bound of the rate of wrong ones among confident fixes.
+    `availability`: share of the true positions with a confident fix; `availability_95`: its 95 %
+    interval. Both bounds are those of independent views.
+    `coverage`: share of the true positions with a fix, low confidence included.
+    `gap`: the longest stretch without a confident fix, of one flight.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
+    `accuracy_of_confident`: share of the confident fixes within `radius_m`.
     `latency_*_ms`: of all views.
     `reasons`: number of views without a fix by reason.
     `criteria`, `curves`: what thresholds of the confidence criteria accept.
     `calibration`, `consistency`: of confidence and covariance; right is within the own radius.
-    `standard`: errors of fixes: APE, RPE, CEP50 and CEP95.
+    `standard`, `of_confident`: errors of all and of confident fixes: APE, RPE, CEP50 and CEP95.
     """
 
     radius_m: float
@@ -147,11 +161,14 @@ class Metrics:
     n_confident: int
     n_confident_wrong: int
     wrong_above_m: float
-    confident_median_m: float
-    confident_max_m: float
+    wrong_upper_95: float
+    availability: float
+    availability_95: tuple[float, float]
     coverage: float
+    gap: Longest
     acc_at_m: Mapping[float, float]
     acc_fixes_at_m: Mapping[float, float]
+    accuracy_of_confident: float
     latency_median_ms: float
     latency_p95_ms: float
     reasons: Mapping[str, int]
@@ -160,6 +177,7 @@ class Metrics:
     calibration: ConfidenceCalibration
     consistency: CovarianceConsistency
     standard: StandardFigures
+    of_confident: StandardFigures
 
     @property
     def accuracy(self) -> float:
@@ -272,7 +290,9 @@ def measure(
     errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     of_fixes_m = errors_m[np.isfinite(errors_m)]
     of_confident_m = errors_m[comparison.confident & np.isfinite(errors_m)]
+    n_confident = of_confident_m.size
     wrong_above_m, n_views = float(max(far_m, radius_m)), comparison.n_views
+    n_wrong = int(np.count_nonzero(comparison.confident_wrong(wrong_above_m)))
     reasons = Counter(reason for reason in comparison.reasons if reason)
     if comparison.n_without_result:
         reasons[NO_RESULT] += comparison.n_without_result
@@ -282,14 +302,17 @@ def measure(
         n_fixes=of_fixes_m.size,
         n_without_truth=comparison.n_without_truth,
         n_without_result=comparison.n_without_result,
-        n_confident=of_confident_m.size,
-        n_confident_wrong=int(np.count_nonzero(comparison.confident_wrong(wrong_above_m))),
+        n_confident=n_confident,
+        n_confident_wrong=n_wrong,
         wrong_above_m=wrong_above_m,
-        confident_median_m=percentile(of_confident_m, 50.0),
-        confident_max_m=percentile(of_confident_m, 100.0),
+        wrong_upper_95=upper_bound(n_wrong, n_confident),
+        availability=share(n_confident, n_views),
+        availability_95=wilson(n_confident, n_views),
         coverage=share(of_fixes_m.size, n_views),
+        gap=_longest_gap(comparison),
         acc_at_m=_within(of_fixes_m, radii, n_views),
         acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
+        accuracy_of_confident=share(int(np.count_nonzero(of_confident_m <= radius_m)), n_confident),
         latency_median_ms=percentile(comparison.latency_ms, 50.0),
         latency_p95_ms=percentile(comparison.latency_ms, 95.0),
         reasons=MappingProxyType(dict(reasons.most_common())),
@@ -303,6 +326,12 @@ def measure(
         ),
         standard=standard_figures(
             comparison.truth_en_m, comparison.fix_en_m, comparison.starts, rpe_distance_m
+        ),
+        of_confident=standard_figures(
+            comparison.truth_en_m,
+            np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
+            comparison.starts,
+            rpe_distance_m,
         ),
     )
 
@@ -369,6 +398,17 @@ def _criterion_row(
         n_far=n_far,
         share_far=share(n_far, n_accepted),
     )
+
+
+def _longest_gap(comparison: Comparison) -> Longest:
+    """The longest stretch without a confident fix of any flight; time and path each by itself."""
+    gaps: list[tuple[float, float]] = []
+    for first, last in pairwise((*comparison.starts, len(comparison.frames))):
+        seconds_s = seconds_since_first(comparison.time_ns[first:last])
+        path_m = path_so_far_m(comparison.truth_en_m[first:last])
+        gap = longest(~comparison.confident[first:last], seconds_s, path_m)
+        gaps.append((gap.seconds_s, gap.path_m))
+    return Longest(*(float(value) for value in np.fmax.reduce(gaps)))  # of those that are known
 
 
 def _covariance(outcome: Fix | NoFix) -> FloatArray:

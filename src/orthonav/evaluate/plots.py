@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthonav.evaluate.figures import BoolArray, FloatArray, runs
+from orthonav.evaluate.gaps import seconds_since_first
 from orthonav.evaluate.metrics import FAR_M, Comparison, CriterionCurve, Metrics
-from orthonav.evaluate.track import seconds_since_first
 from orthonav.report.canvas import (
     BACKING,
     GREY,
@@ -91,7 +91,7 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
         x = np.concatenate([[low], shown_m, [high]])
         axes.step(x, [*shares, shares[-1]], where="post", color=RIGHT, linewidth=2)
         axes.axhline(100 * metrics.coverage, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
-        coverage = f"{100 * metrics.coverage:.0f} % have a position, guesses included"
+        coverage = f"{100 * metrics.coverage:.0f} % have a position, low confidence included"
         axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **OFFSET, color=SOFT)
         axes.axvline(radius_m, color=WRONG, linewidth=1.2)
         axes.plot([radius_m], [100 * metrics.accuracy], "o", color=WRONG, zorder=5)

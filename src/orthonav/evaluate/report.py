@@ -10,6 +10,7 @@ from orthonav.evaluate.calibration_report import (
     bins_rows,
     calibration_figures,
     confidence_text,
+    covariance_card,
     covariance_text,
     criteria_header,
     criteria_rows,
@@ -93,6 +94,7 @@ def page_of(
         "verdict": verdict(whole),
         "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
         "cards": _cards(whole),
+        "compared": _compared(whole),
         "notes": _notes(whole),
         "radius": f"{whole.radius_m:g} m",
         "wrong_above": f"{whole.wrong_above_m:g} m",
@@ -110,16 +112,52 @@ def page_of(
 
 
 def _cards(metrics: Metrics) -> tuple[tuple[str, str], ...]:
-    radius = f"{metrics.radius_m:g} m"
-    confident = share(metrics.n_confident, metrics.n_views)
+    of_confident, of_all = metrics.of_confident, metrics.standard
+    low, high = (100 * each for each in metrics.availability_95)
+    bound = f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
     return (
-        (percent_text(confident), f"of {metrics.n_views} views have a confident fix"),
-        (str(metrics.n_confident_wrong), "confident fixes are wrong"),
-        (percent_text(metrics.accuracy), f"of all views have a fix within {radius}"),
-        (measure_text(metrics.standard.cep50_m, " m"), "CEP50, median error, guesses included"),
-        (measure_text(metrics.standard.cep95_m, " m"), "CEP95, 95 % err less, guesses included"),
-        (measure_text(metrics.latency_median_ms, " ms"), "median time per view"),
+        (
+            percent_text(metrics.availability),
+            f"availability: {metrics.n_confident} of {metrics.n_views} views have a confident fix "
+            f"(95 % interval {low:.0f} to {high:.0f} %)",
+        ),
+        (
+            f"{metrics.n_confident_wrong} of {metrics.n_confident}",
+            "confident fixes are wrong" + f" ({bound})" * (metrics.n_confident > 0),
+        ),
+        (
+            measure_text(of_confident.cep50_m, " m"),
+            f"CEP50 of confident fixes; {measure_text(of_all.cep50_m, ' m')} of all fixes",
+        ),
+        (
+            measure_text(of_confident.cep95_m, " m"),
+            f"CEP95 of confident fixes; {measure_text(of_all.cep95_m, ' m')} of all fixes",
+        ),
+        covariance_card(metrics.consistency),
+        (
+            measure_text(metrics.gap.seconds_s, " s"),
+            f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}",
+        ),
     )
+
+
+def _compared(metrics: Metrics) -> list[tuple[str, ...]]:
+    """Confident and all fixes side by side."""
+    kinds = (
+        ("confident fixes", metrics.accuracy_of_confident, metrics.of_confident),
+        ("all fixes", metrics.accuracy_of_fixes, metrics.standard),
+    )
+    return [
+        (
+            name,
+            str(figures.ape.n),
+            percent_text(share(figures.ape.n, metrics.n_views)),
+            percent_text(within),
+            *map(measure_text, (figures.cep50_m, figures.cep95_m)),
+            *map(measure_text, (figures.ape.rmse_m, figures.ape.max_m)),
+        )
+        for name, within, figures in kinds
+    ]
 
 
 def _notes(metrics: Metrics) -> list[str]:

@@ -8,7 +8,6 @@ figures in seconds are undefined: NaN, and null in JSON.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
@@ -21,13 +20,19 @@ from orthonav.evaluate.calibration import (
     normalized_squared,
 )
 from orthonav.evaluate.figures import (
-    BoolArray,
     FloatArray,
     frozen,
     mean,
     percentile,
     runs,
     share,
+)
+from orthonav.evaluate.gaps import (
+    Longest,
+    longest,
+    longest_stretch,
+    path_so_far_m,
+    seconds_since_first,
 )
 from orthonav.evaluate.metrics import FAR_M, Comparison
 from orthonav.flight.fixes import STATES
@@ -68,14 +73,6 @@ class Spread:
     mean_m: float
     std_m: float
     rmse_m: float
-
-
-@dataclass(frozen=True)
-class Longest:
-    """The longest of several stretches in time, and in metres of the true path."""
-
-    seconds_s: float
-    path_m: float
 
 
 @dataclass(frozen=True)
@@ -197,12 +194,12 @@ def measure_track(
         share_of_views=_shares(states, np.ones(len(states))),
         share_of_time=_shares(states, _until_next(seconds_s)),
         n_lost=len(runs(states == "lost")),
-        low_confidence=_longest(low_confidence, seconds_s, path_m),
-        low_confidence_after=_longest(low_confidence[first:], seconds_s[first:], path_m[first:]),
+        low_confidence=longest(low_confidence, seconds_s, path_m),
+        low_confidence_after=longest(low_confidence[first:], seconds_s[first:], path_m[first:]),
         far_m=far_m,
         n_confident_wrong=int(np.count_nonzero(wrong)),
         n_false_locks=len(runs(wrong)),
-        false_lock_longest_s=_longest_stretch(wrong, seconds_s[rows]),
+        false_lock_longest_s=longest_stretch(wrong, seconds_s[rows]),
         along=_spread(series.along_m[tracking[rows]]),
         across=_spread(series.across_m[tracking[rows]]),
         consistency=check_consistency(
@@ -211,19 +208,6 @@ def measure_track(
         ),
         series=series,
     )
-
-
-def seconds_since_first(times_ns: Sequence[float]) -> FloatArray:
-    """(N,) seconds since the first view; all NaN where times are unknown, fall or stand still.
-
-    Nanoseconds since 1970 do not fit a float64: they are subtracted before they become one.
-    """
-    unknown = np.full(len(times_ns), math.nan)
-    if not times_ns or not all(math.isfinite(time) for time in times_ns):
-        return unknown
-    seconds = np.array([(time - times_ns[0]) / 1e9 for time in times_ns], dtype=np.float64)
-    rises = bool((np.diff(seconds) >= 0.0).all()) and seconds[-1] > 0.0
-    return seconds if rises or len(seconds) == 1 else unknown
 
 
 def course_en(truth_en_m: FloatArray) -> FloatArray:
@@ -314,9 +298,7 @@ def _autocorrelation_time(part: FloatArray) -> float:
 
 def _path_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:
     """(n,) metres flown until each result, by the true positions of the results `rows`."""
-    steps_m = [float(np.hypot(*(b - a))) for a, b in pairwise(truth_en_m)]
-    flown_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    return np.asarray(np.interp(np.arange(n), rows, flown_m))
+    return np.asarray(np.interp(np.arange(n), rows, path_so_far_m(truth_en_m)))
 
 
 def _until_next(values: FloatArray) -> FloatArray:
@@ -329,19 +311,6 @@ def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float
     found = {name: float(weights[states == name].sum()) for name in STATES}
     known = whole > 0.0  # not NaN
     return MappingProxyType({k: part / whole if known else math.nan for k, part in found.items()})
-
-
-def _longest_stretch(flags: BoolArray, until: FloatArray) -> float:
-    """The largest rise of `until` from the start of a run to its end; 0 without runs."""
-    last = len(flags) - 1
-    steps = [until[min(stop, last)] - until[start] for start, stop in runs(flags)]
-    return float(max(steps, default=0.0 if np.isfinite(until).all() else math.nan))
-
-
-def _longest(flags: BoolArray, seconds_s: FloatArray, path_m: FloatArray) -> Longest:
-    if not flags.size:
-        return Longest(math.nan, math.nan)
-    return Longest(_longest_stretch(flags, seconds_s), _longest_stretch(flags, path_m))
 
 
 def _after(errors_m: FloatArray, radius_m: float) -> After:

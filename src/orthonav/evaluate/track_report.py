@@ -7,8 +7,9 @@ from typing import Any
 from orthonav.evaluate.calibration import nees_bound
 from orthonav.evaluate.calibration_report import nees_text
 from orthonav.evaluate.figures import FloatArray, or_none
+from orthonav.evaluate.gaps import Longest
 from orthonav.evaluate.metrics import radius_key
-from orthonav.evaluate.track import Longest, Spread, TrackConsistency, TrackMetrics, TrackSeries
+from orthonav.evaluate.track import Spread, TrackConsistency, TrackMetrics, TrackSeries
 from orthonav.flight.fixes import STATES
 from orthonav.report.numbers import percent_text
 
@@ -34,8 +35,8 @@ def track_rows(track: TrackMetrics) -> tuple[tuple[str, str], ...]:
         ("states", _states_text(track)),
         (
             "longest without a confident fix",
-            f"{_longest_text(track.low_confidence)}; from the first confirmed fix on "
-            f"{_longest_text(track.low_confidence_after)}",
+            f"{longest_text(track.low_confidence)}; from the first confirmed fix on "
+            f"{longest_text(track.low_confidence_after)}",
         ),
         (
             "false locks",
@@ -136,7 +137,8 @@ def _states_text(track: TrackMetrics) -> str:
     return f"{by_view} of views; {by_time} of the time; {lost}"
 
 
-def _longest_text(longest: Longest) -> str:
+def longest_text(longest: Longest) -> str:
+    """Time and path of a stretch."""
     return f"{_s(longest.seconds_s)}, {_m(longest.path_m)}"
 
 

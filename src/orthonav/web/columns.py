@@ -28,6 +28,7 @@ def columns_of(
     truth: Mapping[str, tuple[float, float]],
     sheet: SheetImagery,
     radius_m: float,
+    second: Mapping[str, ViewResult] | None = None,
 ) -> dict[str, list[Any]]:
     """The columns of `results`, in order; times count from `first_ns`.
 
@@ -42,6 +43,7 @@ def columns_of(
     `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
     `confident`: 1 if confident, 0 for a best guess or no fix.
     `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
+    `x2`, `y2`, `err2`, `confident2`: the same of the results of a second run, by frame, if given.
     """
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
     fix_en_m = _places([None if f is None else (f.lat_deg, f.lon_deg) for f in fixes], sheet)
@@ -58,7 +60,7 @@ def columns_of(
     axes_m, turn_deg = _ellipses(fixes)
     x, y = _drawn(fix_en_m, sheet)
     tx, ty = _drawn(truth_en_m, sheet)
-    return {
+    columns: dict[str, list[Any]] = {
         "frame": [r.frame for r in results],
         "t": [round((r.time_ns - first_ns) / 1e9, 3) for r in results],
         "x": _rounded(x, 2),
@@ -84,6 +86,21 @@ def columns_of(
         "confident": [int(r.is_confident) for r in results],
         "wrong": [int(each) for each in wrong],
     }
+    if second is not None:
+        found = [second.get(r.frame) for r in results]
+        places = [
+            (r.outcome.lat_deg, r.outcome.lon_deg) if r and isinstance(r.outcome, Fix) else None
+            for r in found
+        ]
+        second_en_m = _places(places, sheet)
+        x2, y2 = _drawn(second_en_m, sheet)
+        columns |= {
+            "x2": _rounded(x2, 2),
+            "y2": _rounded(y2, 2),
+            "err2": _rounded(np.hypot(*(second_en_m - truth_en_m).T), 4),
+            "confident2": [int(r is not None and r.is_confident) for r in found],
+        }
+    return columns
 
 
 def _places(latlon_deg: Sequence[tuple[float, float] | None], sheet: SheetImagery) -> Array:

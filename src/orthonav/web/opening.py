@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
@@ -13,6 +13,7 @@ from orthonav.flight.identity import Identity, flight_digest, read_identity
 from orthonav.flight.mount import read_mount
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
+from orthonav.records import ViewResult
 from orthonav.sources.flightlog import is_flight_log
 from orthonav.web.feed import Feed, LineFeed
 from orthonav.web.images import FolderImages, NoImages, ViewImages
@@ -29,6 +30,7 @@ class ViewRequest:
 
     run: Path
     map_path: Path
+    second: Path | None = None
     flight: Path | None = None
     truth: Path | None = None
     mount: Path | None = None
@@ -36,7 +38,7 @@ class ViewRequest:
     live: bool = False
 
     def __post_init__(self) -> None:
-        with_paths(self, "run", "map_path", "flight", "truth", "mount")
+        with_paths(self, "run", "map_path", "second", "flight", "truth", "mount")
 
 
 def open_run(request: ViewRequest) -> Run:
@@ -59,9 +61,11 @@ def open_run(request: ViewRequest) -> Run:
         images=_images_name(request, images),
         truth=truth_name,
         live=request.live,
+        second=request.second.name if request.second else "",
     )
     mount = None if request.mount is None else read_mount(request.mount)
-    run = Run(labels, feed, images, sheet, truth, request.radius_m, mount)
+    second = _second(request)
+    run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
     for problem in run.problems:
         log.warning("%s", problem)
     _warn(request, run, feed, truth)
@@ -84,6 +88,18 @@ def _feed(request: ViewRequest) -> Feed:
     if path.is_dir():
         raise FlightError(f"expected fixes.jsonl or a flight log, got a folder without one: {path}")
     return LineFeed(path, live=request.live)
+
+
+def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
+    """Results of the second run by frame, None without one; its health is not read."""
+    if request.second is None:
+        return None
+    batch = _feed(replace(request, run=request.second, live=False)).poll()
+    for problem in batch.problems:
+        log.warning("%s", problem)
+    if not batch.results:
+        raise FlightError(f"run has no views: {request.second}")
+    return {result.frame: result for result in batch.results}
 
 
 def _images(request: ViewRequest, feed: Feed) -> ViewImages:
@@ -144,5 +160,7 @@ def _warn(
         return
     if truth and not run.any_known("tx"):
         log.warning("no view of the run has a true position in %s", run.labels.truth)
+    if request.second is not None and not run.any_known("x2"):
+        log.warning("no view has a position in the second run: %s", request.second)
     if run.any_known("x") and not run.any_on_map():
         log.warning("no position of the run lies on this map: %s", request.map_path)

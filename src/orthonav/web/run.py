@@ -34,13 +34,15 @@ AT = ("fix", "truth")
 
 @dataclass(frozen=True)
 class RunLabels:
-    """Names of run, map, images and truth for the page; `live` while the run is in progress."""
+    """Names of run, map, images, truth and second run for the page; `live` while the run is in
+    progress."""
 
     name: str
     map_name: str
     images: str
     truth: str
     live: bool
+    second: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +67,17 @@ class Run:
         truth: Mapping[str, tuple[float, float]],
         radius_m: float,
         mount: Mount | None = None,
+        second: Mapping[str, ViewResult] | None = None,
     ) -> None:
-        """Read what exists. `mount`: None: that of the flight log, where the feed is one.
+        """Read what exists. `mount`: None: that of the flight log, where the feed is one. `second`:
+        results of another run of the same flight by frame, to compare.
 
         Raises what the feed raises, and `FlightError` for an empty run.
         """
         self._mount = mount
         self.labels, self.sheet = labels, sheet
         self._feed, self._images = feed, images
-        self._truth, self._radius_m = truth, radius_m
+        self._truth, self._radius_m, self._second = truth, radius_m, second
         self._lock = threading.Lock()
         self._generation = 1
         self._results: list[ViewResult] = []
@@ -150,6 +154,10 @@ class Run:
             plain |= {"lat_deg": outcome.lat_deg, "lon_deg": outcome.lon_deg}
         else:
             plain |= {"reason": outcome.reason, "detail": outcome.detail}
+        other = (self._second or {}).get(result.frame)
+        if other is not None and isinstance(other.outcome, Fix):
+            plain |= {"second_lat_deg": other.outcome.lat_deg}
+            plain |= {"second_lon_deg": other.outcome.lon_deg}
         truth = self._truth.get(result.frame)
         if truth is not None:
             plain |= {"true_lat_deg": truth[0], "true_lon_deg": truth[1]}
@@ -240,7 +248,9 @@ class Run:
             return
         self._results += batch.results
         began_ns = self._results[0].time_ns
-        made = columns_of(batch.results, began_ns, self._truth, self.sheet, self._radius_m)
+        made = columns_of(
+            batch.results, began_ns, self._truth, self.sheet, self._radius_m, self._second
+        )
         for name, values in made.items():
             self._columns.setdefault(name, []).extend(values)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, BlindStretch, CheckResult, Envelope
 from orthonav.check.write.plain import summarize
-from orthonav.check.write.risk import EDGE_PX, RISKS, segments
+from orthonav.check.write.risk import EDGE_PX, RISKS, segments, shade
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.wording import share_text, tolerance_sentence
 from orthonav.mapfile.layer import GreyLayer, preview
@@ -39,7 +39,7 @@ _QUALITIES = (72, 60, 45, 30, 15)
 Grey = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
 _BACKGROUND_PX = 900
-_STEPS = 10
+_STEPS = 20
 _NUMBERED = 0.01
 """Recoverable stretches shorter than this share of the route get no number in the profile."""
 _LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
@@ -82,9 +82,11 @@ def _map(result: CheckResult, image: Background) -> Figure:
 
 
 def _draw_cells(axes: "Axes", result: CheckResult) -> None:
-    import matplotlib
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
 
     cells = result.cells
+    shades = shade((np.arange(_STEPS) + 0.5) / _STEPS)  # few colours: a PNG has a palette
     rows, cols = cells.probability.shape
     extent = (
         *(cells.west_m, cells.west_m + cols * cells.side_m),
@@ -92,7 +94,7 @@ def _draw_cells(axes: "Axes", result: CheckResult) -> None:
     )
     shown = axes.imshow(
         np.ma.masked_invalid(cells.probability),
-        cmap=matplotlib.colormaps["cividis"].resampled(_STEPS),  # few colours: a PNG has a palette
+        cmap=ListedColormap(colormaps["cividis"](shades)),
         vmin=0,
         vmax=1,
         alpha=0.55,

@@ -8,7 +8,7 @@ import numpy as np
 from orthonav.check.outcome import CELL_VALUES, CheckResult
 from orthonav.check.write.figures import MAX_LOOKALIKES, jpeg, visible_box
 from orthonav.check.write.plain import Plain, plain, summarize, to_plain
-from orthonav.check.write.risk import EDGE_PX, RISKS, segments
+from orthonav.check.write.risk import EDGE_PX, KNEE, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.wording import (
     SIMULATED,
@@ -17,6 +17,7 @@ from orthonav.check.write.wording import (
     better_sentence,
     conditions_text,
     lookalike_sentence,
+    remedies,
     seconds_text,
     share_text,
     stretch_row,
@@ -42,6 +43,21 @@ LAYERS = {
     "changed": "changed since the map was made",
 }
 """Layers of cells that the map can show."""
+INPUTS = (
+    "height above ground",
+    "footprint of a view",
+    "error of prior position",
+    "error of reported heading",
+    "error of the reported tilt",
+    "drift without fixes",
+)
+"""Conditions shown beside the results."""
+DOWNLOADS = {
+    "check.geojson": "GeoJSON: route, blind stretches, cells, lookalikes",
+    "check.tif": "GeoTIFF: a band per layer",
+    "check.json": "JSON: everything on this page",
+}
+"""Files beside the page."""
 ZERO_IF_UNKNOWN = frozenset({"trials", "changed"})
 """Values that are 0, not None, in cells of which nothing is known."""
 
@@ -50,6 +66,7 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
     """The page as HTML. Raises `MissingExtraError` without Jinja2."""
     about = result.about
     scripts = (leaflet.script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
+    conditions = conditions_text(result.conditions, result.band_m)
     values = {
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
         "kind": "Check before take-off",
@@ -71,7 +88,10 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
         "tolerance": tolerance_sentence(result.envelope) if result.envelope else "",
         "alternatives": _alternatives(result),
         "radius": metres_text(result.conditions.radius_m),
-        "conditions": conditions_text(result.conditions, result.band_m).items(),
+        "conditions": conditions,
+        "inputs": [(name, conditions[name]) for name in INPUTS],
+        "remedies": remedies(result),
+        "downloads": DOWNLOADS,
         "made_from": _made_from(result),
         "data": _page_data(result, image),
         "image": data_url(jpeg(image.grey), "image/jpeg"),
@@ -81,7 +101,7 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
 
 
 def _cards(result: CheckResult) -> list[tuple[str, str]]:
-    summary, conditions = summarize(result), result.conditions
+    summary = summarize(result)
     km2 = result.area_km2
     area = f"{km2:.3g} km²" if km2 < 100 else f"{km2:.0f} km²"
     shown = [(share_text(result.mean), f"mean probability of a fix over {area}")]
@@ -92,21 +112,18 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
             _longest(result, summary["longest_stretch"]),
         ]
     shown.append((metres_text(summary["error_m"]), "expected error of a correct fix"))
-    prior = conditions.prior_std_m
-    if prior is None:
-        shown.append(("no prior", "the whole map is searched"))
-    else:
-        shown.append((metres_text(prior), "prior, standard deviation per axis"))
-    shown.append((metres_text(conditions.agl_m), "above ground"))
     if result.along is None:
         shown.append((str(int(result.cells.trials.sum())), "trial views"))
-        shown.append((str(len(result.lookalikes)), "pairs of lookalikes"))
+    else:
+        worst_m = float(result.along.drift_m.max())
+        shown.append((metres_text(worst_m), "largest expected position error along the route"))
+    shown.append((str(len(result.lookalikes)), "pairs of lookalikes"))
     return shown
 
 
 def _longest(result: CheckResult, number: int | None) -> tuple[str, str]:
     if number is None:
-        return "none", "blind stretches along the route"
+        return "0", "blind stretches along the route"
     longest = result.stretches[number - 1]
     duration = seconds_text(longest.end_s - longest.start_s)
     error = metres_text(longest.drift_m)
@@ -185,6 +202,7 @@ def _page_data(result: CheckResult, image: Background) -> str:
         "confident": CONFIDENT,
         "risks": [vars(risk) for risk in RISKS],
         "edge_px": EDGE_PX,
+        "knee": KNEE,
         "most": {
             "error_m": float(f"{max(most_m, 1.0):.2g}"),
             "wrong": float(f"{max(0.05, most_wrong):.2g}"),

@@ -1,4 +1,5 @@
-"""Classes of risk along the route, in the colours of the cells, and differing in width and dash."""
+"""The colour scale of probabilities, and classes of risk along the route in its colours, which
+differ in width and dash too."""
 
 from dataclasses import dataclass
 
@@ -6,6 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.records import CONFIDENT
+
+KNEE = 0.5, 0.2
+"""A probability and its place on the colour scale: most of the scale is for what is likely."""
+
+
+def shade(probability: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Place on the colour scale, 0 to 1, of probabilities of any shape."""
+    return np.asarray(np.interp(probability, [0.0, KNEE[0], 1.0], [0.0, KNEE[1], 1.0]))
 
 
 @dataclass(frozen=True)
@@ -30,10 +39,10 @@ class Risk:
 
 _DARK, _LIGHT = "#1a1a1a", "#ffffff"
 RISKS = (
-    Risk("confident", CONFIDENT, "#f3db42", _DARK, 4.0, (), "0.9 or more"),
-    Risk("likely", 0.7, "#c8b866", _DARK, 2.5, (), "0.7 to 0.9"),
-    Risk("doubtful", 0.5, "#948e77", _LIGHT, 5.0, (9, 4), "0.5 to 0.7"),
-    Risk("unlikely", 0.0, "#434e6c", _LIGHT, 6.5, (), "below 0.5"),
+    Risk("confident", CONFIDENT, "#ead34c", _DARK, 4.0, (), "0.9 or more"),
+    Risk("likely", 0.7, "#a99f73", _DARK, 2.5, (), "0.7 to 0.9"),
+    Risk("doubtful", 0.5, "#5e626e", _LIGHT, 5.0, (9, 4), "0.5 to 0.7"),
+    Risk("unlikely", 0.0, "#083370", _LIGHT, 6.5, (), "below 0.5"),
     Risk("unknown", float("nan"), "#ffffff", _DARK, 4.0, (4, 6), "unknown"),
 )
 EDGE_PX = 3.0

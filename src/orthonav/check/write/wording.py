@@ -157,6 +157,25 @@ def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
     )
 
 
+def remedies(result: CheckResult) -> list[str]:
+    """What may help, of what the check tried or computed, a sentence each; empty for a go."""
+    if result.verdict.word is Word.GO:
+        return []
+    found = [better_sentence(result.alternatives, what) for what in WHAT]
+    found = [sentence for sentence in found if sentence.startswith("A ")]
+    lost = [each for each in result.stretches if not each.recoverable and not each.ends_lost]
+    if lost:
+        drift = min(each.allowed_m / each.length_m for each in lost)
+        assumed = f"{100 * result.conditions.drift:g} %"
+        found.append(
+            f"Dead reckoning that drifts by at most {100 * drift:.1f} % (assumed: {assumed}) "
+            "bridges all blind stretches."
+        )
+    tried = any(each.what == "agl_m" for each in result.alternatives)
+    heights = "None of the other heights tried is better" if tried else "No other height was tried"
+    return found or [f"{heights}; check another route or map."]
+
+
 def text(result: CheckResult) -> str:
     """Verdict, reasons, key figures and blind stretches, in about 25 lines at most.
 
@@ -168,9 +187,8 @@ def text(result: CheckResult) -> str:
     width = max(len(name) for name, _ in rows)
     lines += ["", *(f"{name:<{width}}  {value}" for name, value in rows)]
     lines += _stretches(result)
-    sentences = [better_sentence(result.alternatives, what) for what in ("agl_m", "band_m")]
-    better = [sentence for sentence in sentences if sentence.startswith("A ")]
-    lines += ["", *better] if better else []
+    helpful = remedies(result)
+    lines += ["", "what may help:", *(f"  {each}" for each in helpful)] if helpful else []
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
 
 

@@ -21,6 +21,32 @@ export class Compare {
     this.find("on-map").addEventListener("change", () => this.#fade());
     this.find("blink").addEventListener("click", () => this.blink());
     this.find("img-view").addEventListener("click", (event) => this.#ground(event));
+    this.find("enlarge").addEventListener("click", () => this.enlarge());
+    this.find("copy").addEventListener("click", () => this.#copy());
+  }
+
+  /** Makes images and map of the selected view larger, or as large as before. */
+  enlarge() {
+    const on = this.find("enlarge").getAttribute("aria-pressed") !== "true";
+    this.find("enlarge").setAttribute("aria-pressed", String(on));
+    this.find("main").classList.toggle("enlarged", on);
+    this.map.invalidateSize();
+  }
+
+  /** Copies the coordinates of the point that was clicked last, otherwise of the fix. */
+  async #copy() {
+    let said = this.copied;
+    try {
+      await navigator.clipboard.writeText(said);
+      said = `Copied: ${said}`;
+    } catch { // not allowed: they are shown to be copied by hand
+    }
+    this.find("ground").textContent = said;
+  }
+
+  #offer(text) {
+    this.copied = text;
+    this.find("copy").hidden = !text;
   }
 
   /** Says what ground a point of the view shows. */
@@ -36,6 +62,7 @@ export class Compare {
       const height = g.height_m === null ? "" : `, ${metres(g.height_m)} above sea`;
       said = g.confident ? "" : "Best guess, not a confident position: ";
       said += place(g.lat_deg, g.lon_deg) + height;
+      if (asked === this.asked) this.#offer(place(g.lat_deg, g.lon_deg));
       if (ellipse !== null) {
         said += `; 95 % ellipse ${metres(ellipse.major_m)} x ${metres(ellipse.minor_m)}, `
           + `major axis at ${number(ellipse.direction_deg, 0)}°`;
@@ -66,6 +93,7 @@ export class Compare {
     this.over = null;
     for (const part of ["compare", "no-compare", "overlay"]) this.find(part).hidden = true;
     this.find("known").replaceChildren();
+    this.#offer("");
     this.find("ground").textContent = "";
     this.find("chosen-name").textContent = "No view yet";
   }
@@ -82,6 +110,7 @@ export class Compare {
     // Another was selected meanwhile, or the run started over.
     if (asked !== this.asked || generation !== this.store.generation) return;
     this.detail = detail;
+    this.#offer("lat_deg" in detail ? place(detail.lat_deg, detail.lon_deg) : "");
     this.#pictures(i, detail);
     this.#known(detail);
   }
@@ -149,7 +178,7 @@ export class Compare {
     cross.hidden = !(x > 0 && x < 1 && y > 0 && y < 1);
     cross.style.left = `${100 * x}%`;
     // The image is square and as wide as its figure; the caption below it is not counted.
-    cross.style.top = `${y * cross.parentElement.clientWidth}px`;
+    cross.style.top = `${100 * y}cqw`;
   }
 
   #layOver([x, y], window, url, known) {
@@ -210,6 +239,7 @@ export class Compare {
     const rows = [["time", detail.time_s && `${detail.time_s} s`], ["state", detail.state]];
     if ("lat_deg" in detail) rows.push(["position", place(detail.lat_deg, detail.lon_deg)]);
     if ("true_lat_deg" in detail) rows.push(["true position", place(detail.true_lat_deg, detail.true_lon_deg)]);
+    if ("second_lat_deg" in detail) rows.push(["second run", place(detail.second_lat_deg, detail.second_lon_deg)]);
     if (detail.reason) rows.push(["no fix", `${detail.reason}: ${detail.detail}`]);
     for (const [name, value] of Object.entries(detail.telemetry ?? {})) rows.push([`reported ${name}`, number(value ?? NaN, 3)]);
     for (const [name, value] of Object.entries(detail.evidence ?? {})) {
@@ -239,7 +269,16 @@ export function sentence(store, i) {
   if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} high`);
   if (Number.isFinite(c.ms[i])) parts.push(`${number(c.ms[i], 0)} ms`);
   if (health && health.level !== "OK") parts.push(`health ${health.level}: ${health.reasons.join(", ")}`);
+  if (c.err2) parts.push(`second run: ${second(store, i)}`);
   return parts.join(", ");
+}
+
+/** Error and confidence of the second run. */
+export function second(store, i) {
+  const { x2, err2, confident2 } = store.columns;
+  if (!Number.isFinite(x2[i])) return "no fix";
+  const error = Number.isFinite(err2[i]) ? metres(err2[i]) : "fix";
+  return confident2[i] ? error : `${error}, low confidence`;
 }
 
 /** The health at the time of a view, undefined without one. */

@@ -103,7 +103,7 @@ export class Course extends Chart {
     const { withTruth, withGnss } = this.store.stats;
     const gnss = withTruth ? c.gerr : c.gdiff;
     let [low, high] = [this.store.run.radius_m / 10, this.store.run.radius_m * 2];
-    for (const values of withTruth ? [c.err, c.a, gnss] : [c.a, gnss]) {
+    for (const values of withTruth ? [c.err, c.a, gnss, c.err2 ?? []] : [c.a, gnss]) {
       for (const v of values) {
         if (v > 0) [low, high] = [Math.min(low, Math.max(v, FLOOR_M)), Math.max(high, v)];
       }
@@ -117,6 +117,7 @@ export class Course extends Chart {
     const positive = c.a.map((v) => (v > 0 ? v : NaN));
     this.area(context, this.places, null, positive, y, colour("shade"), bottom);
     if (withGnss) this.#points(context, gnss, (v) => Math.max(y(v), top), () => "gnss");
+    if (c.err2) this.#points(context, c.err2, (v) => Math.max(y(v), top), () => "second");
     this.#points(context, c.err, (v) => Math.max(y(v), top), (i) => (c.wrong[i] ? "wrong" : this.store.trust(i)));
     const text = withTruth ? "error; shaded: stated 1 σ" : "stated 1 σ";
     const more = withTruth ? "; green: error of GNSS" : "; green: GNSS from the map";

@@ -1,6 +1,7 @@
 // The list of views, filtered and ordered, one page at a time.
 
 import { clock, metres, number } from "./format.js";
+import { second } from "./compare.js";
 import { MARKS, described } from "./look.js";
 
 const PAGE = 40;
@@ -93,6 +94,7 @@ export class List {
       [`mark ${this.store.trust(i)}`, MARKS[this.store.state(i)]],
       ["name", name],
       [c.wrong[i] ? "bad" : "", c.wrong[i] ? `${error} confident!` : error],
+      ...(c.err2 ? [["second", second(this.store, i).replace(", low confidence", "?")]] : []),
       ["soft", Number.isFinite(c.conf[i]) ? number(c.conf[i], 2) : ""],
     ];
     for (const [kind, text] of parts) {

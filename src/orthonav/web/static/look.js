@@ -1,7 +1,7 @@
 // Colours and marks, the same on map, course and list.
 
 const COLOURS = ["confident", "low", "none", "truth", "wrong", "ink", "soft", "line",
-  "paper", "shade", "strong", "good", "warn", "bad", "gnss"];
+  "paper", "shade", "strong", "good", "warn", "bad", "gnss", "second"];
 let colours = {};
 
 /** A colour of style.css, in the current scheme. */
@@ -62,7 +62,7 @@ export function drawMark(context, state, x, y, size) {
   }
 }
 
-const KINDS = [...Object.keys(TRUST), "wrong", "ink", "gnss"];
+const KINDS = [...Object.keys(TRUST), "wrong", "ink", "gnss", "second"];
 const SHAPES = Object.keys(MARKS);
 
 /** Of many thousand marks most cover equal ones: one in a small square is enough. */

@@ -19,7 +19,7 @@ async function begin() {
   const run = await getJson("api/run");
   const store = new Store(run);
   document.title = `${run.name} – orthonav view`;
-  find("run-name").textContent = run.name;
+  find("run-name").textContent = run.second ? `${run.name} / ${run.second}` : run.name;
   find("about").textContent = about(run);
   const map = makeMap("map", run.sheet);
   const marks = new Marks(store).addTo(map);
@@ -139,6 +139,7 @@ function steps({ store, map, compare, course }, play) {
     play: () => play(),
     blink: () => compare.blink(),
     fade: (percent) => compare.fadeBy(percent),
+    enlarge: () => compare.enlarge(),
     onMap: () => compare.toggleOnMap(),
     zoom: () => compare.zoomTo(),
     whole: () => fitRun(map, store),
@@ -175,8 +176,9 @@ function drawProblems(problems) {
 
 function drawFigures(store) {
   const { stats, count, run } = store;
-  const errors = (store.columns.err ?? []).filter((v) => v >= 0).sort((p, q) => p - q);
-  const quantile = (part) => { // interpolated, as in reports
+  const sorted = (values = []) => values.filter((v) => v >= 0).sort((p, q) => p - q);
+  const both = [store.columns.err, store.columns.err2].filter(Boolean).map(sorted);
+  const quantile = (errors, part) => { // interpolated, as in reports
     const at = part * (errors.length - 1), low = Math.floor(at);
     return errors.length ? errors[low] + (at - low) * (errors[Math.ceil(at)] - errors[low]) : NaN;
   };
@@ -184,7 +186,9 @@ function drawFigures(store) {
   rows.push(["low confidence", ratio(stats.fixes - stats.confident, count)], ["no fix", ratio(count - stats.fixes, count)]);
   if (stats.withTruth) {
     rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
-    rows.push(["CEP50", metres(quantile(0.5))], ["CEP95", metres(quantile(0.95))]);
+    for (const [name, part] of [["CEP50", 0.5], ["CEP95", 0.95]]) {
+      rows.push([name, both.map((errors) => metres(quantile(errors, part))).join(" / ")]);
+    }
     rows.push(["confident and wrong", stats.wrong]);
   }
   if (stats.withGnss || stats.gnssAlarms) rows.push(["GNSS alarms", stats.gnssAlarms]);
@@ -209,6 +213,7 @@ function drawLegend(store) {
   }
   if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "confident and wrong", "var(--wrong)"]);
   if (store.stats.withGnss) rows.push(["—", "GNSS", "var(--gnss)"]);
+  if (store.run.second) rows.push(["■", `second run: ${store.run.second}`, "var(--second)"]);
   find("legend").replaceChildren(...rows.map(([mark, name, paint]) => {
     const [part, sign] = [document.createElement("span"), document.createElement("i")];
     [sign.textContent, sign.style.color] = [mark, paint];

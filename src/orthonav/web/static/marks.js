@@ -78,6 +78,7 @@ export const Marks = L.Layer.extend({
     this._line(context, view, c.tx, c.ty, "truth");
     if (this._store.stats.withGnss) this._line(context, view, c.gx, c.gy, "gnss");
     this._ellipses(context, view);
+    if (c.x2) this._second(context, view);
     const size = count > 4000 ? 2.2 : count > MANY ? 3 : 4;
     const rings = new Path2D(); // drawn together on top: one by one is slower
     for (const faded of [true, false]) {
@@ -117,6 +118,19 @@ export const Marks = L.Layer.extend({
     for (const [width, name, alpha] of [[4.5, "paper", 0.65], [1.6, paint, 1]]) {
       [context.lineWidth, context.strokeStyle, context.globalAlpha] = [width, colour(name), alpha];
       context.stroke(path);
+    }
+    context.globalAlpha = 1;
+  },
+
+  /** The fixes of the second run, squares behind the marks; those of low confidence are faint. */
+  _second(context, view) {
+    const { columns: c, isShown } = this._store;
+    context.fillStyle = colour("second");
+    for (let i = 0; i < c.x2.length; i++) {
+      const [x, y] = [view.x + c.x2[i] * view.scale, view.y + c.y2[i] * view.scale];
+      if (!(x > 0 && y > 0 && x < view.width && y < view.height)) continue;
+      context.globalAlpha = isShown[i] ? (c.confident2[i] ? 1 : 0.5) : 0.15;
+      context.fillRect(x - 5, y - 5, 10, 10);
     }
     context.globalAlpha = 1;
   },

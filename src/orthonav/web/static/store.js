@@ -2,7 +2,7 @@
 // "select", "filter".
 
 const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms",
-  "gx", "gy", "gerr", "gdiff"];
+  "gx", "gy", "gerr", "gdiff", "x2", "y2", "err2"];
 export const CONFIDENT = 0.9;
 
 export class Store extends EventTarget {

@@ -29,7 +29,10 @@ function colourAt(share) {
 /** Position of a value on the colour scale: light is good. */
 function shadeOf(name, value) {
   const most = drawn.most[name];
-  return most ? 1 - value / most : value;
+  if (most) return 1 - value / most;
+  if (name !== "probability" && name !== "low") return value;
+  const [knee, shade] = drawn.knee; // most of the scale is for what is likely
+  return value < knee ? (value / knee) * shade : shade + ((value - knee) / (1 - knee)) * (1 - shade);
 }
 
 function make(kind, text = "", parent = null) {
