@@ -252,9 +252,6 @@ class NoFix:
 
     is_confident = False
 
-    def __bool__(self) -> bool:
-        return False
-
     def __repr__(self) -> str:
         return f"NoFix({self.reason}: {self.detail})"
 
