@@ -132,16 +132,16 @@ def _images_name(request: ViewRequest, images: ViewImages) -> str:
     return (request.flight or request.run).name
 
 
-def _differences(request: ViewRequest, feed: Feed) -> list[str]:
+def _differences(request: ViewRequest, run: Path) -> list[str]:
     """Where a file of fixes states another map or flight folder than the given ones."""
-    if not isinstance(feed, LineFeed) or not request.run.is_file():
+    if not run.is_file() or is_log(run):
         return []
     flight = None
     if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
         views = open_flight(request.flight, images_needed=False).views
         flight = flight_source(request.flight, views)
     given = Identity(Source(request.map_path.name, map_digest(request.map_path)), flight)
-    return read_identity(request.run).differences(given)
+    return read_identity(run).differences(given)
 
 
 def _warn(
@@ -151,8 +151,9 @@ def _warn(
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
-    for difference in _differences(request, feed):
-        log.warning("the run is another one: %s: %s", difference, request.run)
+    for path in filter(None, (request.run, request.second)):
+        for difference in _differences(request, path):
+            log.warning("the run is another one: %s: %s", difference, path)
     if not run.count:
         return
     if truth and not run.any_known("tx"):
