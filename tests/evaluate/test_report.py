@@ -100,7 +100,7 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, only_new) -> None
     assert "<h1>Brest at noon</h1>" in html
     metrics = flight.metrics
     assert f"<b>{100 * metrics.availability:.1f} %</b>" in html
-    assert f"<b>{metrics.n_confident_wrong} of {metrics.n_confident}</b>" in html
+    assert f'<b class="bad">{metrics.n_confident_wrong} of {metrics.n_confident}</b>' in html
     assert f"below {100 * metrics.wrong_upper_95:.1f} %" in html
     for figures in (metrics.of_confident, metrics.standard):
         assert f"<td>{measure_text(figures.cep50_m)}</td>" in html

@@ -187,15 +187,16 @@ def confidence_text(metrics: Metrics) -> str:
     )
 
 
-def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str]:
-    """A word on the stated covariances, and its explanation."""
+def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str, str]:
+    """A word on the stated covariances, its explanation, and "bad" where they are too small."""
     if not consistency.nees.size:
-        return "-", "covariance: no correct fix states one"
+        return "-", "covariance: no correct fix states one", ""
     found = nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
     word, _, times = found.partition(": ")
     why = f"{times}; " if times else ""
     word = word if times else "right"
-    return word, f"covariance: {why}NEES {consistency.nees_mean:.3g}, 2 expected"
+    label = f"covariance: {why}NEES {consistency.nees_mean:.3g}, 2 expected"
+    return word, label, "bad" if found.startswith("too small") else ""
 
 
 def covariance_verdict(consistency: CovarianceConsistency) -> str:

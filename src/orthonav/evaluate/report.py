@@ -111,7 +111,7 @@ def page_of(
     return page, [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
 
 
-def _cards(metrics: Metrics) -> tuple[tuple[str, str], ...]:
+def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     of_confident, of_all = metrics.of_confident, metrics.standard
     low, high = (100 * each for each in metrics.availability_95)
     bound = f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
@@ -124,6 +124,7 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, str], ...]:
         (
             f"{metrics.n_confident_wrong} of {metrics.n_confident}",
             "confident fixes are wrong" + f" ({bound})" * (metrics.n_confident > 0),
+            "bad" if metrics.n_confident_wrong else "",
         ),
         (
             measure_text(of_confident.cep50_m, " m"),

@@ -136,15 +136,15 @@ def _images_name(request: ViewRequest, images: ViewImages) -> str:
     return (request.flight or request.run).name
 
 
-def _differences(request: ViewRequest, feed: Feed) -> str:
+def _differences(request: ViewRequest, run: Path) -> str:
     """Which other map or flight folder than the given ones a file of fixes states; else ""."""
-    if not isinstance(feed, LineFeed) or not request.run.is_file():
+    if not run.is_file() or is_log(run):
         return ""
     flight = None
     if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
         flight = flight_digest(open_flight(request.flight, images_needed=False).views)
     given = Identity(map_digest(request.map_path), flight)
-    return read_identity(request.run).differences(given, request.map_path, request.flight)
+    return read_identity(run).differences(given, request.map_path, request.flight)
 
 
 def _warn(
@@ -154,8 +154,9 @@ def _warn(
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
-    if other := _differences(request, feed):
-        log.warning("the run is of %s: %s", other, request.run)
+    for path in filter(None, (request.run, request.second)):
+        if other := _differences(request, path):
+            log.warning("the run is of %s: %s", other, path)
     if not run.count:
         return
     if truth and not run.any_known("tx"):
