@@ -5,7 +5,7 @@
 # make bench   measure speed, memory and accuracy, and compare with other methods
 # make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
-# make figures   renew the figures of the documentation by running a tutorial, minutes
+# make figures  renew the figures of the documentation by running a tutorial, minutes
 # make clean   remove .venv and what was made here
 
 PYTHON ?= python3

@@ -48,7 +48,7 @@ SIGMAS_95 = math.sqrt(-2 * math.log(0.05))
 BROWSER_S = 90
 JPEG: dict[str, Any] = {"quality": 80, "optimize": True}
 WIDEST_PX = 1200
-COLOURS = 256
+COLOURS = 192
 
 
 def main() -> int:
@@ -133,7 +133,7 @@ def _draw_evidence(figure: Any, folder: Path) -> None:
 
 
 def _draw_fix(figure: Any, folder: Path) -> None:
-    """One view: as taken, turned north, where it was put on the map, and that place from near."""
+    """One view: as taken, rotated north up, its position on the map, and a detail of the fix."""
     flight = open_flight(folder / "flight")
     fix, telemetry = _usual_fix(folder, flight)
     picture = read_image(folder / "flight" / "frames" / fix["frame"])
@@ -143,15 +143,15 @@ def _draw_fix(figure: Any, folder: Path) -> None:
     _show(
         north,
         _north_up(picture, flight, fix, telemetry),
-        "turned north, at the map's scale",
+        "rotated north up, at the map's scale",
         cmap="gray",
     )
     true_en_m = place.en_of(*read_truth(folder / "flight" / "truth.csv")[fix["frame"]])
-    _show_place(wide, place, WINDOW_M, "where it was put on the map of July 2016")
+    _show_place(wide, place, WINDOW_M, "its position on the map of July 2016")
     outline = footprint_en_m(flight.camera, fix["heading_deg"], 0.0, 0.0, fix["agl_m"])
     wide.plot(*np.vstack([outline, outline[:1]]).T, color=FIXED, linewidth=2)
     wide.plot(0, 0, "+", color=FIXED, markersize=16, markeredgewidth=2.5)
-    title = f"from near: {math.hypot(*true_en_m):.1f} m off, confidence {fix['confidence']:.2f}"
+    title = f"detail: {math.hypot(*true_en_m):.1f} m off, confidence {fix['confidence']:.2f}"
     _show_place(near, place, ZOOM_M, title)
     values, vectors = np.linalg.eigh(np.array(fix["cov_en_m2"]))
     sides = 2 * SIGMAS_95 * np.sqrt(values)
