@@ -28,13 +28,13 @@ from scipy.optimize import minimize
 from benchmarks.inputs import file_of, map_of
 from benchmarks.record import Table, provenance
 from benchmarks.trust_views import Pair, pairs
-from orthonav.check.places import CellGrid
-from orthonav.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
-from orthonav.check.request import CheckRequest
-from orthonav.check.run import check_map
-from orthonav.check.verdict import GO_LOW, NARROW_PX
 from orthonav.files import write_text
 from orthonav.flight import open_flight, read_truth
+from orthonav.ground.check.places import CellGrid
+from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
+from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.run import check_map
+from orthonav.ground.check.verdict import GO_LOW, NARROW_PX
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight

@@ -31,11 +31,11 @@ from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number, provenance, save, sources_digest
 from benchmarks.verdicts import percent
-from orthonav.evaluate.calibration import nees_bound, normalized_squared
 from orthonav.files import replacing
 from orthonav.flight import open_flight, read_truth
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
+from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from benchmarks.inputs import DATA, file_of
 from benchmarks.record import Table, provenance
-from orthonav.check.outcome import Cells
-from orthonav.check.request import CheckRequest
-from orthonav.check.run import check_map
 from orthonav.flight import open_flight, read_truth
+from orthonav.ground.check.outcome import Cells
+from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.run import check_map
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight

@@ -38,8 +38,8 @@ from orthonav.confidence.registered import (
     RegisteredConfidence,
     features_of,
 )
-from orthonav.evaluate.calibration import calibrate
 from orthonav.files import write_text
+from orthonav.ground.evaluate.calibration import calibrate
 from orthonav.records import CONFIDENT
 
 RIDGE = 1e-5

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.evaluate.calibration import calibrate, check_covariance
+from orthonav.ground.evaluate.calibration import calibrate, check_covariance
 from orthonav.records import CONFIDENT
 
 FAR_M = 35.0

@@ -2,8 +2,8 @@
 
 `python -m experiments.persistence` renders landscapes of several seeds and resolutions at several
 dates, compares the gradients of every ordered pair of dates patch by patch, and writes the
-regression to `src/orthonav/check/persistence.json`. Takes some five minutes. Seeds here are used
-nowhere else, so that landscapes of others test it.
+regression to `src/orthonav/ground/check/persistence.json`. Takes some five minutes. Seeds here are
+used nowhere else, so that landscapes of others test it.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.persistence import (
+from orthonav.ground.check.persistence import (
     MODEL,
     PATCH_PX,
     PersistenceModel,

@@ -92,7 +92,7 @@ def undrawn(monkeypatch):
     """Reports have no pictures, which take longest."""
     nothing = Drawing(b"", "", (1.0, 1.0))
     for name in ("plots.draw_axes", "calibration_plots.draw_axes", "calibration_plots.draw_figure"):
-        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: nothing)
+        monkeypatch.setattr(f"orthonav.ground.evaluate.{name}", lambda *_: nothing)
 
 
 @pytest.fixture(scope="module")

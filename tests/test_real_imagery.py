@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.evaluate.metrics import compare
 from orthonav.flight import open_flight, read_truth
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
+from orthonav.ground.evaluate.metrics import compare
 from orthonav.imagery.terrain import open_dem
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map

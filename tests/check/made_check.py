@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from orthonav.check.outcome import (
+from orthonav.ground.check.outcome import (
     Along,
     Alternative,
     BlindStretch,

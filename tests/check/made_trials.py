@@ -2,8 +2,8 @@
 
 import math
 
-from orthonav.check.outcome import Conditions
-from orthonav.check.trials import Trial
+from orthonav.ground.check.outcome import Conditions
+from orthonav.ground.check.trials import Trial
 
 NOWHERE = (math.nan, math.nan)
 CONDITIONS = Conditions(

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from helpers import textured
-from orthonav.check import change
-from orthonav.check.change import another_year, displaced
+from orthonav.ground.check import change
+from orthonav.ground.check.change import another_year, displaced
 
 SIZE = 192
 

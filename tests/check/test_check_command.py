@@ -11,17 +11,17 @@ from made_trials import lost, right
 
 from helpers import write_dem
 from orthonav.changes.record import ChangedGround, ChangeGrid, write_changes
-from orthonav.check import run as check_run
-from orthonav.check.outcome import Word
-from orthonav.check.request import CheckRequest
-from orthonav.check.run import check_map
-from orthonav.check.verdict import Verdict
-from orthonav.check.write import to_json
 from orthonav.cli import main
 from orthonav.errors import AreaError, CameraError, CheckError, MapFileError, MissingFileError
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
+from orthonav.ground.check import run as check_run
+from orthonav.ground.check.outcome import Word
+from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.run import check_map
+from orthonav.ground.check.verdict import Verdict
+from orthonav.ground.check.write import to_json
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
 
@@ -377,7 +377,7 @@ def test_command(run, untried, half_blank, route_path, tmp_path):
 @pytest.fixture
 def unwritten(untried, monkeypatch):
     """Nothing is written."""
-    monkeypatch.setattr("orthonav.check.write.write_check", lambda result, opened, out: out)
+    monkeypatch.setattr("orthonav.ground.check.write.write_check", lambda result, opened, out: out)
 
 
 def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):

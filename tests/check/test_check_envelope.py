@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_trials import lost, right
 
-from orthonav.check.envelope import (
+from orthonav.ground.check.envelope import (
     AGL_OFF,
     HEIGHTS,
     TOLERATED,
@@ -18,8 +18,8 @@ from orthonav.check.envelope import (
     heights_work,
     right_share,
 )
-from orthonav.check.request import CheckRequest
-from orthonav.check.views import TrialPlan
+from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.views import TrialPlan
 
 PLAN = TrialPlan(CheckRequest(Path("a.onav")), 100.0)
 PLACES = np.zeros((20, 2))

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_trials import lost, misplaced, right
 
-from orthonav.check import estimate
-from orthonav.check.estimate import Predictor
+from orthonav.ground.check import estimate
+from orthonav.ground.check.estimate import Predictor
 
 SIDE_M = 1000.0
 

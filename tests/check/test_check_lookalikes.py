@@ -5,8 +5,8 @@ import math
 import pytest
 from made_trials import lost, misplaced, right
 
-from orthonav.check.lookalikes import MAX_PAIRS, SIMILAR, found_lookalikes
 from orthonav.geo.frames import LocalFrame
+from orthonav.ground.check.lookalikes import MAX_PAIRS, SIMILAR, found_lookalikes
 
 FRAME = LocalFrame(46.0, 3.0)
 HERE, THERE = (0.0, 0.0), (800.0, 300.0)

@@ -16,13 +16,13 @@ from made_check import EVIL, FILES, small_route
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
-from orthonav.check.outcome import CELL_VALUES, BlindStretch
-from orthonav.check.write import figures, write_check
-from orthonav.check.write.figures import MAX_SIDE_PX, jpeg, map_image, visible_box
-from orthonav.check.write.page import ZERO_IF_UNKNOWN, _known_cells
-from orthonav.check.write.plain import to_plain
-from orthonav.check.write.risk import RISKS, segments, shade
-from orthonav.check.write.wording import better_sentence, remedies, share_text
+from orthonav.ground.check.outcome import CELL_VALUES, BlindStretch
+from orthonav.ground.check.write import figures, write_check
+from orthonav.ground.check.write.figures import MAX_SIDE_PX, jpeg, map_image, visible_box
+from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN, _known_cells
+from orthonav.ground.check.write.plain import to_plain
+from orthonav.ground.check.write.risk import RISKS, segments, shade
+from orthonav.ground.check.write.wording import better_sentence, remedies, share_text
 from orthonav.mapfile import open_map
 from orthonav.report import Drawing, metres_text
 from orthonav.report.leaflet import load_leaflet
@@ -83,7 +83,7 @@ def folder(opened, frame, tmp_path_factory):
         path = write_check(small_route(frame), opened, root / "small_route")
         assert path == root / "small_route" / "index.html"
         for name in ("draw_axes", "draw_figure"):  # drawing takes longest
-            patch.setattr(f"orthonav.check.write.figures.{name}", lambda *_: UNDRAWN)
+            patch.setattr(f"orthonav.ground.check.write.figures.{name}", lambda *_: UNDRAWN)
         for kind in ("tiny", "long_route", "nearly_empty"):
             write_check(getattr(made_check, kind)(frame), opened, root / kind)
         about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)

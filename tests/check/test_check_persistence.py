@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from orthonav.check.persistence import (
+from orthonav.ground.check.persistence import (
     MARGIN_PX,
     MAX_PERSISTENCE,
     MIN_PERSISTENCE,
@@ -17,7 +17,7 @@ from orthonav.check.persistence import (
     features,
     terms,
 )
-from orthonav.check.views import PERSISTENCE_LEVELS, reported_persistence
+from orthonav.ground.check.views import PERSISTENCE_LEVELS, reported_persistence
 
 SIZE = 256
 
@@ -99,5 +99,5 @@ def test_terms_are_all_products():
 
 
 def test_a_model_survives_a_file():
-    text = resources.files("orthonav.check").joinpath(MODEL).read_text(encoding="utf-8")
+    text = resources.files("orthonav.ground.check").joinpath(MODEL).read_text(encoding="utf-8")
     assert default_model().to_plain() == json.loads(text)["model"]

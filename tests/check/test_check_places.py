@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.check.places import (
+from orthonav.errors import AreaError
+from orthonav.geo.area import Area
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.route import Route
+from orthonav.ground.check.places import (
     FEWEST_TRIALS,
     MAX_CELLS,
     MAX_TRIALS,
@@ -18,10 +22,6 @@ from orthonav.check.places import (
     checked_m2,
     trial_places,
 )
-from orthonav.errors import AreaError
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from orthonav.check.recalibrate import LEARNT, PLAIN, Recalibration
+from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration
 
 SHARES = np.linspace(0.02, 0.98, 25)
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from orthonav.changes.record import ChangedGround, ChangeGrid
-from orthonav.check import trials, views
-from orthonav.check.persistence import MARGIN_PX
-from orthonav.check.request import CheckRequest
-from orthonav.check.trials import run_many
-from orthonav.check.views import OrthoPyramid, TrialPlan, require_overlap
 from orthonav.errors import AreaError, MapFileError, MissingFileError, WorkerError
 from orthonav.geo.camera import Camera
+from orthonav.ground.check import trials, views
+from orthonav.ground.check.persistence import MARGIN_PX
+from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.trials import run_many
+from orthonav.ground.check.views import OrthoPyramid, TrialPlan, require_overlap
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.check.outcome import Along, BlindStretch, Lookalike, Word
-from orthonav.check.verdict import verdict_of
+from orthonav.ground.check.outcome import Along, BlindStretch, Lookalike, Word
+from orthonav.ground.check.verdict import verdict_of
 
 ZEROS = np.zeros(11)
 ALONG = Along(

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from made_check import EVIL, FILES, lost_in, made_cells, small_route
 
-from orthonav.check.outcome import Conditions
-from orthonav.check.write import require_free, write_check
-from orthonav.check.write.folder import tif_bytes
-from orthonav.check.write.plain import to_json, to_plain
-from orthonav.check.write.shapes import features, to_geojson
-from orthonav.check.write.wording import text
 from orthonav.errors import MissingExtraError, OutputError
 from orthonav.geo.frames import LocalFrame
+from orthonav.ground.check.outcome import Conditions
+from orthonav.ground.check.write import require_free, write_check
+from orthonav.ground.check.write.folder import tif_bytes
+from orthonav.ground.check.write.plain import to_json, to_plain
+from orthonav.ground.check.write.shapes import features, to_geojson
+from orthonav.ground.check.write.wording import text
 from orthonav.mapfile import open_map
 from orthonav.report import Drawing
 
@@ -54,7 +54,7 @@ def undrawn(monkeypatch):
     """Figures are not drawn, which takes longest."""
     nothing = Drawing(b"png", "<svg/>", (1.0, 1.0))
     for name in ("draw_axes", "draw_figure"):
-        monkeypatch.setattr(f"orthonav.check.write.figures.{name}", lambda *_: nothing)
+        monkeypatch.setattr(f"orthonav.ground.check.write.figures.{name}", lambda *_: nothing)
 
 
 @pytest.fixture
@@ -338,7 +338,7 @@ def test_an_interrupt_leaves_nothing(opened, frame, tmp_path, monkeypatch, undra
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("orthonav.check.write.folder.tif_bytes", interrupted)
+    monkeypatch.setattr("orthonav.ground.check.write.folder.tif_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_check(small_route(frame), opened, tmp_path / "check")
     assert list(tmp_path.iterdir()) == []

@@ -17,14 +17,14 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of accuracy are not drawn."""
-    monkeypatch.setattr("orthonav.evaluate.plots.draw_axes", lambda *_: NOTHING)
+    monkeypatch.setattr("orthonav.ground.evaluate.plots.draw_axes", lambda *_: NOTHING)
 
 
 @pytest.fixture
 def no_calibration_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of confidence and covariance are not drawn."""
     for name in CALIBRATION:
-        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: NOTHING)
+        monkeypatch.setattr(f"orthonav.ground.evaluate.{name}", lambda *_: NOTHING)
 
 
 @pytest.fixture

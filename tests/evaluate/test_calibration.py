@@ -11,7 +11,9 @@ import pytest
 from scipy.stats import chi2
 
 from orthonav.errors import FlightError
-from orthonav.evaluate.calibration import (
+from orthonav.flight.fixes import result_from_json, result_to_json
+from orthonav.geo.frames import LocalFrame
+from orthonav.ground.evaluate.calibration import (
     N_BINS,
     NEES_LEVELS,
     ConfidenceCalibration,
@@ -21,18 +23,23 @@ from orthonav.evaluate.calibration import (
     nees_bound,
     normalized_squared,
 )
-from orthonav.evaluate.calibration_plots import nees_picture, reliability_picture
-from orthonav.evaluate.calibration_report import (
+from orthonav.ground.evaluate.calibration_plots import nees_picture, reliability_picture
+from orthonav.ground.evaluate.calibration_report import (
     calibration_lines,
     calibration_to_json,
     consistency_to_json,
 )
-from orthonav.evaluate.figures import wilson
-from orthonav.evaluate.flights import FlightReport, metrics_to_json, summary
-from orthonav.evaluate.metrics import Comparison, compare, criterion_rows, measure, pool, wrong_key
-from orthonav.evaluate.report import write_report
-from orthonav.flight.fixes import result_from_json, result_to_json
-from orthonav.geo.frames import LocalFrame
+from orthonav.ground.evaluate.figures import wilson
+from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, summary
+from orthonav.ground.evaluate.metrics import (
+    Comparison,
+    compare,
+    criterion_rows,
+    measure,
+    pool,
+    wrong_key,
+)
+from orthonav.ground.evaluate.report import write_report
 from orthonav.records import Fix, ViewResult
 
 RADIUS_M = 20.0

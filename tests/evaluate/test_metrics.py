@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from orthonav.errors import FlightError
-from orthonav.evaluate.calibration_report import nees_text
-from orthonav.evaluate.figures import upper_bound
-from orthonav.evaluate.flights import verdict
-from orthonav.evaluate.metrics import (
+from orthonav.geo.frames import LocalFrame
+from orthonav.ground.evaluate.calibration_report import nees_text
+from orthonav.ground.evaluate.figures import upper_bound
+from orthonav.ground.evaluate.flights import verdict
+from orthonav.ground.evaluate.metrics import (
     CRITERIA,
     Comparison,
     compare,
@@ -23,7 +24,6 @@ from orthonav.evaluate.metrics import (
     radius_key,
     worst_views,
 )
-from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
 
 CENTRE = LocalFrame(48.0, -4.5)

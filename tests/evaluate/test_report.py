@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from orthonav.errors import MissingExtraError
-from orthonav.evaluate import plots
-from orthonav.evaluate.calibration_report import covariance_card
-from orthonav.evaluate.flights import FlightReport, metrics_to_json, table, total
-from orthonav.evaluate.metrics import compare, measure
-from orthonav.evaluate.report import MadeFrom, write_report
 from orthonav.geo.frames import LocalFrame
+from orthonav.ground.evaluate import plots
+from orthonav.ground.evaluate.calibration_report import covariance_card
+from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, table, total
+from orthonav.ground.evaluate.metrics import compare, measure
+from orthonav.ground.evaluate.report import MadeFrom, write_report
 from orthonav.records import Fix, NoFix, ViewResult
 from orthonav.report import Background, Drawing, measure_text
 
@@ -261,10 +261,10 @@ def test_pictures_leave_the_users_settings_alone() -> None:
 @pytest.mark.long
 def test_matplotlib_is_imported_for_drawing_and_pyplot_never() -> None:
     code = (
-        "import sys, orthonav.evaluate.report\n"
+        "import sys, orthonav.ground.evaluate.report\n"
         "unwanted = {'matplotlib', 'jinja2', 'PIL', 'torch', 'rasterio', 'pyproj'}\n"
         "assert not unwanted & set(sys.modules)\n"
-        "from orthonav.evaluate import metrics, plots\n"
+        "from orthonav.ground.evaluate import metrics, plots\n"
         "from orthonav.records import NoFix, ViewResult\n"
         "result = ViewResult('a', 0, NoFix('blank', ''), 1.0)\n"
         "plots.map_picture(metrics.compare({'a': (48.0, -4.5)}, [result]), 15.0)\n"

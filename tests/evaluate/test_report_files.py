@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from orthonav.errors import MissingExtraError, OutputError
-from orthonav.evaluate.flights import FlightReport
-from orthonav.evaluate.metrics import compare, measure
-from orthonav.evaluate.plots import fix_classes, map_picture, over_time_picture
-from orthonav.evaluate.report import write_report
 from orthonav.geo.frames import LocalFrame
+from orthonav.ground.evaluate.flights import FlightReport
+from orthonav.ground.evaluate.metrics import compare, measure
+from orthonav.ground.evaluate.plots import fix_classes, map_picture, over_time_picture
+from orthonav.ground.evaluate.report import write_report
 from orthonav.records import Fix, NoFix, ViewResult
 from orthonav.report.figures import LIST
 

@@ -14,12 +14,29 @@ from scipy.stats import chi2
 from helpers import textured
 from orthonav.cli import main
 from orthonav.errors import FlightError
-from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture, worst_first, worst_rows
-from orthonav.evaluate.flights import FlightReport, flights_to_json, metrics_to_json, summary, total
-from orthonav.evaluate.gaps import seconds_since_first
-from orthonav.evaluate.metrics import Comparison, compare, measure
-from orthonav.evaluate.report import write_report
-from orthonav.evaluate.track import (
+from orthonav.flight.fixes import write_results
+from orthonav.flight.writer import FlightWriter
+from orthonav.geo.camera import Camera, camera_from_en
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
+from orthonav.ground.evaluate.contact_sheet import (
+    Row,
+    row_text,
+    sheet_picture,
+    worst_first,
+    worst_rows,
+)
+from orthonav.ground.evaluate.flights import (
+    FlightReport,
+    flights_to_json,
+    metrics_to_json,
+    summary,
+    total,
+)
+from orthonav.ground.evaluate.gaps import seconds_since_first
+from orthonav.ground.evaluate.metrics import Comparison, compare, measure
+from orthonav.ground.evaluate.report import write_report
+from orthonav.ground.evaluate.track import (
     TrackMetrics,
     check_consistency,
     course_en,
@@ -27,18 +44,13 @@ from orthonav.evaluate.track import (
     measure_track,
     nees_mean_bounds,
 )
-from orthonav.evaluate.track_plots import (
+from orthonav.ground.evaluate.track_plots import (
     STATE_STYLES,
     error_picture,
     track_figures,
     track_map_picture,
 )
-from orthonav.evaluate.track_report import track_rows
-from orthonav.flight.fixes import write_results
-from orthonav.flight.writer import FlightWriter
-from orthonav.geo.camera import Camera, camera_from_en
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
+from orthonav.ground.evaluate.track_report import track_rows
 from orthonav.mapfile import open_map
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.records import Fix, NoFix, Telemetry, ViewResult

@@ -95,9 +95,9 @@ def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_trac
 def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     """The mount by the smoothed track of the flight, and True; by its single views, and False,
     where these make no track."""
-    from orthonav.evaluate.truth import check_truth
     from orthonav.flight import read_truth
     from orthonav.flight.recording import WithTelemetry
+    from orthonav.ground.evaluate.truth import check_truth
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map

@@ -26,10 +26,10 @@ _REFERENCES = {
 
 if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
-    from orthonav.check.outcome import CheckedInputs
-    from orthonav.check.request import CheckRequest
     from orthonav.geo.route import Route
     from orthonav.geo.terrain import LegProfile
+    from orthonav.ground.check.outcome import CheckedInputs
+    from orthonav.ground.check.request import CheckRequest
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -185,8 +185,8 @@ def run(options: argparse.Namespace) -> int:
     """Check, write, print the verdict; return its exit status."""
     import json
 
-    from orthonav.check.run import check_map
-    from orthonav.check.write import require_free, to_json, verdict_text, write_check
+    from orthonav.ground.check.run import check_map
+    from orthonav.ground.check.write import require_free, to_json, verdict_text, write_check
 
     require_free(options.out)
     request = _request(options)
@@ -213,10 +213,10 @@ def _accepted(text: str) -> float:
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.check.request import CheckRequest
     from orthonav.errors import CheckError
     from orthonav.geo.planning import DEFAULT_CAMERA
     from orthonav.geo.route import read_route
+    from orthonav.ground.check.request import CheckRequest
     from orthonav.sources.cameras import read_camera_file
 
     if options.band_m is not None and options.route is None:
@@ -328,8 +328,8 @@ def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProf
 
 def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "CheckedInputs":
     from orthonav import __version__
-    from orthonav.check.outcome import CheckedInputs
     from orthonav.cli.info import imagery_text, recipe_text
+    from orthonav.ground.check.outcome import CheckedInputs
     from orthonav.mapfile import open_map
 
     manifest = open_map(options.map).manifest

@@ -14,7 +14,7 @@ from orthonav.cli.common import Progress, print_json, progress
 from orthonav.cli.simulate import HORIZON_STD_DEG, MOUNT_STD_DEG
 
 if TYPE_CHECKING:
-    from orthonav.evaluate.metrics import Metrics
+    from orthonav.ground.evaluate.metrics import Metrics
 
 MARKER = "demo.json"
 """File that marks a folder as an earlier demo, which may be replaced."""
@@ -108,13 +108,13 @@ def _is_earlier_demo(out: Path) -> bool:
 def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[dict[str, Any], str]:
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
-    from orthonav.evaluate.flights import FlightReport, metrics_to_json, table, verdict
-    from orthonav.evaluate.metrics import compare, measure
-    from orthonav.evaluate.report import MadeFrom, write_report
     from orthonav.flight import open_flight, read_truth
     from orthonav.flight.fixes import write_results
     from orthonav.flight.identity import Identity, flight_digest
     from orthonav.geo.route import read_route
+    from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, table, verdict
+    from orthonav.ground.evaluate.metrics import compare, measure
+    from orthonav.ground.evaluate.report import MadeFrom, write_report
     from orthonav.localizer import Localizer
     from orthonav.mapfile import open_map
     from orthonav.onboard.run import SingleViews, localize_flight
@@ -186,12 +186,12 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
 def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
     """The prediction for the route in one line; writes the report of the check to `check`."""
     from orthonav import __version__
-    from orthonav.check.outcome import CheckedInputs
-    from orthonav.check.request import CheckRequest
-    from orthonav.check.run import check_map
-    from orthonav.check.write import write_check
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.geo.route import read_route
+    from orthonav.ground.check.outcome import CheckedInputs
+    from orthonav.ground.check.request import CheckRequest
+    from orthonav.ground.check.run import check_map
+    from orthonav.ground.check.write import write_check
     from orthonav.mapfile import open_map
 
     manifest = open_map(map_path).manifest

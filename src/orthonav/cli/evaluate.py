@@ -19,10 +19,10 @@ from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
-    from orthonav.evaluate.contact_sheet import Row
-    from orthonav.evaluate.flights import FlightReport
-    from orthonav.evaluate.metrics import Comparison, Metrics
     from orthonav.flight import FlightFolder
+    from orthonav.ground.evaluate.contact_sheet import Row
+    from orthonav.ground.evaluate.flights import FlightReport
+    from orthonav.ground.evaluate.metrics import Comparison, Metrics
     from orthonav.mapfile.layer import GreyLayer
     from orthonav.mapfile.reader import MapFile
     from orthonav.records import ViewResult
@@ -90,8 +90,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.flights import flights_to_json, total
     from orthonav.files import write_text
+    from orthonav.ground.evaluate.flights import flights_to_json, total
     from orthonav.mapfile import open_map
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
@@ -146,8 +146,8 @@ def _print(
     plain: dict[str, Any],
     changed: "ChangedGround | None",
 ) -> None:
-    from orthonav.evaluate.calibration_report import covariance_verdict
-    from orthonav.evaluate.flights import summary, table, verdict
+    from orthonav.ground.evaluate.calibration_report import covariance_verdict
+    from orthonav.ground.evaluate.flights import summary, table, verdict
 
     if options.json:
         print_json(plain)
@@ -177,13 +177,13 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     """Metrics of every flight, with its worst views if their images are given."""
-    from orthonav.evaluate.flights import FlightReport
-    from orthonav.evaluate.gnss import measure_gnss
-    from orthonav.evaluate.metrics import compare, measure
-    from orthonav.evaluate.track import measure_track
-    from orthonav.evaluate.truth import check_truth
     from orthonav.flight import open_flight, read_truth
     from orthonav.flight.fixes import read_results
+    from orthonav.ground.evaluate.flights import FlightReport
+    from orthonav.ground.evaluate.gnss import measure_gnss
+    from orthonav.ground.evaluate.metrics import compare, measure
+    from orthonav.ground.evaluate.track import measure_track
+    from orthonav.ground.evaluate.truth import check_truth
 
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None
@@ -250,7 +250,7 @@ def _worst(
     layer: "GreyLayer",
 ) -> "tuple[Row, ...]":
     """Rows of the contact sheet of one flight."""
-    from orthonav.evaluate.contact_sheet import worst_rows
+    from orthonav.ground.evaluate.contact_sheet import worst_rows
 
     grid = opened.manifest.sheets[0].grid
     return tuple(worst_rows(comparison, results, folder, layer, grid))
@@ -271,7 +271,7 @@ def _write_report(
 ) -> None:
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
-    from orthonav.evaluate.report import MadeFrom, write_report
+    from orthonav.ground.evaluate.report import MadeFrom, write_report
 
     made_from = MadeFrom(
         map_name=opened.path.name if opened else "",

@@ -3,7 +3,7 @@
 READ FIRST: `register` is the one way from a view to its best place. It rectifies the view
 (`prepared`), and runs the searches (`view_search`) that `plan` chooses; `candidates` runs each of
 them, and `orthonav.register` judges what they find. `locate` makes a fix of the place, `tracker`,
-`orthonav.atlas` and `orthonav.check` use the place itself.
+`orthonav.atlas` and `orthonav.ground.check` use the place itself.
 """
 
 import math

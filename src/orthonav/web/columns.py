@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.evaluate.calibration import is_covariance
-from orthonav.evaluate.metrics import FAR_M
 from orthonav.flight.fixes import STATES
 from orthonav.flight.gnss import fault_of, gnss_of
+from orthonav.ground.evaluate.calibration import is_covariance
+from orthonav.ground.evaluate.metrics import FAR_M
 from orthonav.records import Fix, ViewResult
 from orthonav.web.sheet import SheetImagery
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
-from orthonav.evaluate.truth import check_truth
 from orthonav.files import with_paths
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.identity import Identity, flight_digest, read_identity
 from orthonav.flight.mount import read_mount
+from orthonav.ground.evaluate.truth import check_truth
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
 from orthonav.records import ViewResult

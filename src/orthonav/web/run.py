@@ -10,10 +10,10 @@ import numpy as np
 
 from orthonav import __version__
 from orthonav.errors import FlightError, OrthonavError
-from orthonav.evaluate.contact_sheet import as_fixed
 from orthonav.flight.fixes import STATES
 from orthonav.flight.mount import Mount
 from orthonav.flight.pixel import locate_pixel
+from orthonav.ground.evaluate.contact_sheet import as_fixed
 from orthonav.publish.estimate import ellipse_95
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.web.columns import columns_of

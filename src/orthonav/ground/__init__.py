@@ -1,0 +1,1 @@
+"""Before and after a flight: predictions for a map, and accuracy of fixes."""

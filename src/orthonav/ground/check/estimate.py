@@ -1,0 +1,154 @@
+"""From trials at scattered places to a probability of a fix for every place.
+
+Nearby trials, weighted by distance, are joined with a logistic regression over all trials of the
+map (on persistence and on the part of a view that the map covers) as a beta distribution, in which
+the regression counts as `PRIOR_TRIALS` trials.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.confidence.logistic import fit_weights
+from orthonav.ground.check.recalibrate import PLAIN, expit, logit
+from orthonav.ground.check.trials import Trial
+
+Array = NDArray[np.float64]
+# Chosen on generated landscapes by the calibration error of `python -m benchmarks.prediction`.
+PRIOR_TRIALS = 3.0
+BANDWIDTH_VIEWS = 0.4
+"""Standard deviation of the distance weights, in sides of a view."""
+BANDWIDTH_SPACINGS = 0.9
+"""Lower limit of that deviation, in distances between trials."""
+OTHER_DATE_WEIGHT = 3.0
+"""Weight of a trial with imagery of a second date, which needs no simulated ageing."""
+SAME_COVERAGE = 0.12
+"""Standard deviation of the weights over the share of a view that the map covers."""
+INTERVAL, INTERVAL_SIGMAS = (0.1, 0.9), 1.2816
+"""Ends of the 80 % interval, and the same in standard deviations of a normal distribution."""
+JEFFREYS = 0.3
+"""Pseudo-counts of good and bad trials that keep the interval off 0 and 1."""
+MIN_WEIGHT, WIDER = 0.05, 4.0
+"""Where nearby trials weigh less than this, the bandwidth is so many times as wide."""
+MIN_REGRESSION = 20
+"""Fewer trials than this do not support a regression."""
+RIDGE = 1e-2
+_PAIRS_AT_ONCE = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Predictions at places (N,); fields as in `Cells`."""
+
+    probability: Array
+    low: Array
+    high: Array
+    error_m: Array
+    wrong: Array
+    persistence: Array
+
+
+class Predictor:
+    """Interpolates the outcomes of trials."""
+
+    def __init__(
+        self,
+        trials: Sequence[Trial],
+        *,
+        view_side_m: float,
+        spacing_m: float,
+        other_date: Sequence[Trial] = (),
+        least_error_m: float = 0.0,
+        coverage: Callable[[Array], Array],
+        recalibrated: Callable[[Array], Array] = np.asarray,
+        scenes_std: float = PLAIN.std,
+    ) -> None:
+        """`trials` of the map's own imagery, `other_date` of a second date.
+
+        `coverage` returns the share (N,) of a view over places (N, 2) that the map covers; trials
+        count for places of similar coverage. `recalibrated` turns shares (N,) of trials into those
+        of views of another date, whose logit varies from scene to scene by `scenes_std`.
+        """
+        every = [*trials, *other_date]
+        self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
+        self._error = np.array([each.error_m for each in every], np.float64)
+        self.right = np.array([each.right for each in every], np.bool_)
+        self.wrong = np.array([each.wrong for each in every], np.bool_)
+        self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
+        self._bandwidth_m = max(BANDWIDTH_VIEWS * view_side_m, BANDWIDTH_SPACINGS * spacing_m)
+        self._least_error_m = least_error_m
+        self._coverage_at, self._coverage = coverage, coverage(self._points)
+        self._persistence = self._persistence_of(trials, other_date)
+        self._recalibrated, self._scenes_std = recalibrated, scenes_std
+        self._expected = self._regression()
+
+    def _persistence_of(self, trials: Sequence[Trial], other: Sequence[Trial]) -> Array:
+        """Expected persistence at every trial; a trial of the second date takes the nearest."""
+        own = np.array([each.expected for each in trials], np.float64)
+        if not other:
+            return own
+        at = self._points[: len(trials)]
+        nearest = [int(np.argmin(((at - each.en_m) ** 2).sum(axis=1))) for each in other]
+        return np.concatenate([own, own[nearest]])
+
+    def _regression(self) -> Array:
+        """Probability (N,) of each trial by regression on persistence and coverage."""
+        # n of n trials do not prove a probability of 1.
+        mean = (self.right @ self._weight + 0.5) / (self._weight.sum() + 1)
+        if self.right.all() or not self.right.any() or len(self.right) < MIN_REGRESSION:
+            return np.full(len(self.right), float(mean))
+        regressors = np.stack([np.log(self._persistence), self._coverage], axis=1)
+        bias, slopes = fit_weights(regressors, self.right, self._weight, RIDGE)
+        return expit(bias + regressors @ slopes)
+
+    def at(self, points_en_m: Array) -> Prediction:
+        """Predictions at places (N, 2)."""
+        chunk = max(1, _PAIRS_AT_ONCE // max(len(self._points), 1))
+        starts = range(0, max(len(points_en_m), 1), chunk)
+        parts = [vars(self._part(points_en_m[start : start + chunk])) for start in starts]
+        return Prediction(*(np.concatenate([part[name] for part in parts]) for name in parts[0]))
+
+    def _part(self, points: Array) -> Prediction:
+        from scipy.stats import beta
+
+        near = self._weights(points, self._bandwidth_m)
+        total = near.sum(axis=1)
+        # Far from all trials the closest few still tell the kind of ground.
+        wide = self._weights(points, WIDER * self._bandwidth_m) + 1e-12
+        kind = np.where((total > MIN_WEIGHT)[:, None], near, wide)
+        kind /= kind.sum(axis=1, keepdims=True)
+        expected = np.clip(kind @ self._expected, 0.0, 1.0)  # rounding
+        good = PRIOR_TRIALS * expected + near @ self.right
+        bad = PRIOR_TRIALS * (1 - expected) + near @ ~self.right
+        probability = good / (good + bad)
+        low, high = (beta.ppf(end, good + JEFFREYS, bad + JEFFREYS) for end in INTERVAL)
+        probability, low, high = (self._recalibrated(each) for each in (probability, low, high))
+        years = INTERVAL_SIGMAS * self._scenes_std
+        squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)
+        overall = float(squares.sum() / max(self.right.sum(), 1))
+        square_error = (near @ squares + overall) / (near @ self.right + 1.0)
+        overall_wrong = float(np.average(self.wrong, weights=self._weight))
+        return Prediction(
+            probability=probability,
+            low=np.minimum(_widened(probability, low, -years), probability),
+            high=np.maximum(_widened(probability, high, years), probability),
+            error_m=np.sqrt(square_error + self._least_error_m**2),
+            wrong=(near @ self.wrong + overall_wrong) / (total + 1.0),
+            persistence=kind @ self._persistence,
+        )
+
+    def _weights(self, points: Array, bandwidth_m: float) -> Array:
+        """Weights (N, K) of the trials by distance and by similarity of coverage."""
+        square = ((points[:, None] - self._points[None]) ** 2).sum(axis=-1)
+        off = self._coverage_at(points)[:, None] - self._coverage[None]
+        square += (off * self._bandwidth_m / SAME_COVERAGE) ** 2
+        return np.asarray(np.exp(-square / (2 * bandwidth_m**2)) * self._weight)
+
+
+def _widened(middle: Array, end: Array, by_logit: float) -> Array:
+    """`end` of an interval moved outwards by the deviation between years, independent of it."""
+
+    off = np.hypot(logit(end) - logit(middle), by_logit)
+    return expit(logit(middle) + np.sign(by_logit) * off)

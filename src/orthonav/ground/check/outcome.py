@@ -1,0 +1,264 @@
+"""Result types of a check: predictions for places and along a route, and the verdict.
+
+`orthonav.ground.check.run` computes them and `orthonav.ground.check.write` writes them. A
+probability refers to one view; NaN means unknown (no imagery, or outside the band of the route).
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.geo.frames import LocalFrame
+
+Array = NDArray[np.float64]
+
+
+class Word(Enum):
+    """The verdict; its value is what is printed and written."""
+
+    GO = "go"
+    MARGINAL = "marginal"
+    NO_GO = "no-go"
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the command: 0 go, 3 marginal, 4 no-go (1 and 2 are errors)."""
+        return {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}[self]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The conditions that a check assumes; fields that are not listed are those of `CheckRequest`.
+
+    `width_m`, `height_m`: footprint of a vertical view on the ground.
+    `agl_m`: height above ground, known here.
+    `radius_m`: largest error of a correct fix, from the map.
+    """
+
+    width_m: float
+    height_m: float
+    agl_m: float
+    yaw_std_deg: float | None
+    agl_std: float
+    prior_std_m: float | None
+    accept: float
+    radius_m: float
+    speed_mps: float
+    drift: float
+    tilt_std_deg: float = 0.0
+    other_sensor: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Predictions for square cells; arrays are (rows, cols), row 0 in the north.
+
+    `west_m`, `north_m`: north-west corner in the plane of the map's sheet.
+    `side_m`: side of a cell.
+    `probability`: probability of a correct, confident fix of one view in the cell, 0 to 1.
+    `low`, `high`: 80 % interval of `probability`.
+    `error_m`: expected error of such a fix (root mean square).
+    `wrong`: share of nearby trials that were confident and wrong, 0 to 1.
+    `trials`: number of views tried in the cell, second date excluded.
+    `persistence`: expected correlation of the ground's gradients with another year, 0 to 1.
+    `changed`: share that changed since the map was made, 0 to 1; 0 where nothing is known of it.
+    """
+
+    west_m: float
+    north_m: float
+    side_m: float
+    probability: Array
+    low: Array
+    high: Array
+    error_m: Array
+    wrong: Array
+    trials: NDArray[np.int32]
+    persistence: Array
+    changed: Array
+
+
+CELL_VALUES = {
+    "probability": "probability of a correct, confident fix of one view",
+    "low": "lower end of its 80 % interval",
+    "high": "upper end of its 80 % interval",
+    "error_m": "expected error of such a fix, root mean square, metres",
+    "wrong": "share of trials that were confident and wrong",
+    "trials": "number of views tried",
+    "persistence": "expected correlation of the ground with another year, 0 to 1",
+    "changed": "share that changed since the map was made",
+}
+"""Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
+
+
+@dataclass(frozen=True, eq=False)
+class Along:
+    """Predictions at points (N,) along the route.
+
+    `distance_m`: distance from the start.
+    `points_en_m`: positions (N, 2), east and north in the plane of the map's sheet.
+    `probability`: as for `Cells`; `low`, `high`: its 80 % interval.
+    `across_low`: lowest probability across the band at that point.
+    `error_m`: expected error of a correct fix (root mean square).
+    `drift_m`: expected position error (one standard deviation) when each fix arrives with its
+    probability and dead reckoning drifts in between.
+    """
+
+    distance_m: Array
+    points_en_m: Array
+    probability: Array
+    low: Array
+    high: Array
+    across_low: Array
+    error_m: Array
+    drift_m: Array
+
+
+@dataclass(frozen=True)
+class BlindStretch:
+    """A part of the route where a fix is unlikely.
+
+    `start_m`, `end_m`, `start_s`, `end_s`: distance and time from the start of the route.
+    `probability`: mean probability of a fix in it.
+    `drift_m`: error of dead reckoning at its end.
+    `allowed_m`: largest error there at which the next view is still searched in the right place;
+    infinite without a prior.
+    `ends_lost`: the route ends inside the stretch.
+    """
+
+    start_m: float
+    end_m: float
+    start_s: float
+    end_s: float
+    probability: float
+    drift_m: float
+    allowed_m: float
+    ends_lost: bool = False
+
+    @property
+    def length_m(self) -> float:
+        """Length along the route."""
+        return self.end_m - self.start_m
+
+    @property
+    def recoverable(self) -> bool:
+        """Whether views can be placed again after it."""
+        return not self.ends_lost and self.drift_m <= self.allowed_m
+
+
+@dataclass(frozen=True)
+class Lookalike:
+    """Two places that can be mistaken for each other.
+
+    `place_latlon_deg`, `other_latlon_deg`: latitude and longitude.
+    `apart_m`: distance between them.
+    `similarity`: score of the other place as a share of that of the true one, 0 to 1.
+    `trials`: number of trials that found the pair.
+    `within_prior`: a view of one place would also be searched at the other.
+    """
+
+    place_latlon_deg: tuple[float, float]
+    other_latlon_deg: tuple[float, float]
+    apart_m: float
+    similarity: float
+    trials: int
+    within_prior: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Envelope:
+    """Share of correct, confident fixes over errors of heading and height.
+
+    `yaw_off_deg` (A,): heading errors added to the reported heading.
+    `agl_off` (B,): height errors added to the reported height, as a share of it.
+    `share` (A, B): share of correct, confident fixes.
+    `tolerated_yaw_deg`, `tolerated_agl_low`, `tolerated_agl_high`: largest error of each alone at
+    which the share stays at 85 % or more of the share without error.
+    """
+
+    yaw_off_deg: Array
+    agl_off: Array
+    share: Array
+    tolerated_yaw_deg: float
+    tolerated_agl_low: float
+    tolerated_agl_high: float
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The mean probability with another value of one planning parameter.
+
+    `what`: "agl_m" or "band_m"; `value`: its value in metres; `probability`: mean along the route,
+    or over the map; `chosen`: this is the value that was checked.
+    """
+
+    what: str
+    value: float
+    probability: float
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One finding behind the verdict: a stable code for programs, a sentence for people."""
+
+    code: str
+    text: str
+    word: Word
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict and its reasons, worst first; the worst reason decides."""
+
+    word: Word
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True)
+class CheckedInputs:
+    """What was checked, as text for reports; empty where it does not apply.
+
+    `height`: where the height above ground comes from.
+    `terms`: attribution and licence of each imagery source.
+    """
+
+    map_name: str = ""
+    imagery: str = ""
+    recipe: str = ""
+    other_date: str = ""
+    route_name: str = ""
+    height: str = ""
+    command: str = ""
+    version: str = ""
+    terms: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class CheckResult:
+    """Everything that a check found.
+
+    `frame`: plane of the map's sheet.
+    `area_km2`: checked area; `mean`: mean probability over it.
+    `second_date`: views of a second date were tried as well.
+    `along`: predictions along the route; None without one.
+    `route_en_m`: waypoints (M, 2); `band_m`: width of the widest band.
+    `envelope`: None where it was not requested.
+    """
+
+    about: CheckedInputs
+    conditions: Conditions
+    frame: LocalFrame
+    cells: Cells
+    verdict: Verdict
+    area_km2: float
+    mean: float
+    second_date: bool
+    along: Along | None = None
+    route_en_m: Array | None = None
+    band_m: float | None = None
+    stretches: tuple[BlindStretch, ...] = ()
+    lookalikes: tuple[Lookalike, ...] = ()
+    envelope: Envelope | None = None
+    alternatives: tuple[Alternative, ...] = ()

@@ -1,0 +1,482 @@
+"""Metrics of the fixes of a flight. Arrays and records only: no files, no plots.
+
+Names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
+criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined. Confidence and
+covariance are checked in `calibration`, standard figures of the field are in `standard`.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+
+import numpy as np
+
+from orthonav.errors import FlightError
+from orthonav.geo.frames import LocalFrame
+from orthonav.ground.evaluate.calibration import (
+    ConfidenceCalibration,
+    CovarianceConsistency,
+    calibrate,
+    check_covariance,
+)
+from orthonav.ground.evaluate.figures import (
+    BoolArray,
+    FloatArray,
+    frozen,
+    percentile,
+    share,
+    upper_bound,
+    wilson,
+)
+from orthonav.ground.evaluate.gaps import Longest, longest, path_so_far_m, seconds_since_first
+from orthonav.ground.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
+from orthonav.records import Fix, NoFix, ViewResult
+
+Positions = Mapping[str, tuple[float, float]]
+"""Frame name -> (latitude, longitude) in degrees."""
+
+FAR_M = 35.0
+"""A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
+NO_RESULT = "no_result"
+"""Reason of true positions that no result belongs to."""
+RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
+CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
+    {
+        "lowe_ratio": (1.13,),  # best tile against second best, threshold of the paper
+        "peak_ratio": (1.05, 1.13, 1.3),  # best peak against the best elsewhere on the map
+        "confidence": (0.5, 0.9, 0.99),
+    }
+)
+"""Confidence criterion -> thresholds; a view is accepted if its value is at least that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Results with their truth: N views that have both, in the order of the results.
+
+    `lat_deg`, `lon_deg`: origin of the east-north plane of positions.
+    `frames`, `time_ns`: name and time of each view.
+    `truth_en_m`, `fix_en_m` (N, 2): positions in metres; fixes NaN where there is none.
+    `errors_m` (N,): distance between them, NaN without a fix.
+    `cov_en_m2` (N, 2, 2), `own_radius_m` (N,): as each fix states, NaN where unknown.
+    `confident` (N,): whether the fix may be relied on; any other one is a best guess.
+    `criteria`: for each name of `CRITERIA` values (N,), NaN where unknown or without a fix.
+    `reasons`: code of each view without a fix, "" for a fix.
+    `latency_ms` (N,): processing time of each view.
+    `n_without_truth`, `n_without_result`: results without truth, and the reverse.
+    `starts`: index at which each pooled flight begins.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    frames: tuple[str, ...]
+    time_ns: tuple[int, ...]
+    truth_en_m: FloatArray
+    fix_en_m: FloatArray
+    errors_m: FloatArray
+    cov_en_m2: FloatArray
+    own_radius_m: FloatArray
+    confident: BoolArray
+    criteria: Mapping[str, FloatArray]
+    reasons: tuple[str, ...]
+    latency_ms: FloatArray
+    n_without_truth: int
+    n_without_result: int
+    starts: tuple[int, ...] = (0,)
+
+    @property
+    def n_views(self) -> int:
+        """Number of true positions: views without a result have no fix either."""
+        return self.errors_m.size + self.n_without_result
+
+    def confident_wrong(self, least_m: float) -> BoolArray:
+        """(N,): confident fixes with an error above `least_m` and above the stated radius."""
+        wrong: BoolArray = self.confident & (self.errors_m > np.fmax(least_m, self.own_radius_m))
+        return wrong
+
+
+@dataclass(frozen=True)
+class CriterionRow:
+    """What one threshold of a criterion accepts. Shares are NaN where they are not defined.
+
+    `share_accepted`: share of all views accepted.
+    `accuracy`: share of the accepted views that are right.
+    `n_accepted`, `n_right`: number of accepted views, and of right ones among them.
+    `recall`: share of all right fixes that is accepted.
+    `far_m`, `n_far`, `share_far`: accepted views wrong by more than `far_m`.
+    """
+
+    name: str
+    threshold: float
+    share_accepted: float
+    accuracy: float
+    n_accepted: int
+    n_right: int
+    recall: float
+    far_m: float
+    n_far: int
+    share_far: float
+
+
+@dataclass(frozen=True, eq=False)
+class CriterionCurve:
+    """The same over all thresholds (K,), from the strictest to the one that accepts every fix."""
+
+    name: str
+    thresholds: FloatArray
+    share_accepted: FloatArray
+    accuracy: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Metrics:
+    """Metrics of one flight, or of several pooled; undefined ones are NaN.
+
+    `radius_m`: a fix within it is right.
+    `n_views`, `n_fixes`, `n_without_truth`, `n_without_result`: counts, see `Comparison`.
+    `n_confident`, `n_confident_wrong`: confident fixes, and those of them that err by more than
+    `wrong_above_m` and the radius they state.
+    `wrong_upper_95`: one-sided 95 % upper bound of the rate of wrong ones among confident fixes.
+    `availability`: share of the true positions with a confident fix; `availability_95`: its 95 %
+    interval. Both bounds are those of independent views.
+    `coverage`: share of the true positions with a fix, low confidence included.
+    `gap`: the longest stretch without a confident fix, of one flight.
+    `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
+    `accuracy_of_confident`: share of the confident fixes within `radius_m`.
+    `latency_*_ms`: of all views.
+    `reasons`: number of views without a fix by reason.
+    `criteria`, `curves`: what thresholds of the confidence criteria accept.
+    `calibration`, `consistency`: of confidence and covariance; right is within the own radius.
+    `standard`, `of_confident`: errors of all and of confident fixes: APE, RPE, CEP50 and CEP95.
+    """
+
+    radius_m: float
+    n_views: int
+    n_fixes: int
+    n_without_truth: int
+    n_without_result: int
+    n_confident: int
+    n_confident_wrong: int
+    wrong_above_m: float
+    wrong_upper_95: float
+    availability: float
+    availability_95: tuple[float, float]
+    coverage: float
+    gap: Longest
+    acc_at_m: Mapping[float, float]
+    acc_fixes_at_m: Mapping[float, float]
+    accuracy_of_confident: float
+    latency_median_ms: float
+    latency_p95_ms: float
+    reasons: Mapping[str, int]
+    criteria: tuple[CriterionRow, ...]
+    curves: tuple[CriterionCurve, ...]
+    calibration: ConfidenceCalibration
+    consistency: CovarianceConsistency
+    standard: StandardFigures
+    of_confident: StandardFigures
+
+    @property
+    def accuracy(self) -> float:
+        """Share of all views with a fix within `radius_m`."""
+        return self.acc_at_m[self.radius_m]
+
+    @property
+    def accuracy_of_fixes(self) -> float:
+        """Share of fixes within `radius_m`."""
+        return self.acc_fixes_at_m[self.radius_m]
+
+
+def radius_key(radius_m: float) -> str:
+    """The name of the accuracy at a radius: `acc_at_15m`."""
+    return f"acc_at_{radius_m:g}m"
+
+
+def wrong_key(far_m: float) -> str:
+    """The name of the share that is wrong by more than a distance: `wrong_by_35m`."""
+    return f"wrong_by_{far_m:g}m"
+
+
+def compare(
+    truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
+) -> Comparison:
+    """Results matched with the truth by frame name.
+
+    `local` is the plane of the positions, by default centred on the first true position. A true
+    position that is not finite counts as missing. Raises `FlightError` where no result has a
+    truth or a frame has two results.
+    """
+    known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
+    _refuse_twice(result.frame for result in results)
+    matched = [result for result in results if result.frame in known]
+    if not matched:
+        raise FlightError(_no_overlap(known, results))
+    local = local or LocalFrame(*known[matched[0].frame])
+    truth_en_m = _local(local, [known[result.frame] for result in matched])
+    fix_en_m = _local(local, [_position(result.outcome) for result in matched])
+    criteria = {name: frozen([_criterion(result, name) for result in matched]) for name in CRITERIA}
+    return Comparison(
+        lat_deg=local.lat_deg,
+        lon_deg=local.lon_deg,
+        frames=tuple(result.frame for result in matched),
+        time_ns=tuple(result.time_ns for result in matched),
+        truth_en_m=truth_en_m,
+        fix_en_m=fix_en_m,
+        errors_m=frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
+        cov_en_m2=frozen(np.array([_covariance(result.outcome) for result in matched])),
+        own_radius_m=frozen([_own_radius(result.outcome) for result in matched]),
+        confident=_flags([result.is_confident for result in matched]),
+        criteria=MappingProxyType(criteria),
+        reasons=tuple(_reason(result.outcome) for result in matched),
+        latency_ms=frozen([result.latency_ms for result in matched]),
+        n_without_truth=len(results) - len(matched),
+        n_without_result=len(known) - len(matched),
+    )
+
+
+def pool(comparisons: Sequence[Comparison]) -> Comparison:
+    """Several flights as one, for metrics; positions stay in their own planes.
+
+    Raises `ValueError` for no flight at all.
+    """
+    if not comparisons:
+        raise ValueError("no results: expected at least one flight")
+    parts = list(comparisons)
+    starts: list[int] = []
+    views = 0
+    for part in parts:
+        starts += [views + start for start in part.starts]
+        views += len(part.frames)
+    joined = {n: frozen(np.concatenate([p.criteria[n] for p in parts])) for n in CRITERIA}
+    return Comparison(
+        lat_deg=parts[0].lat_deg,
+        lon_deg=parts[0].lon_deg,
+        frames=tuple(name for p in parts for name in p.frames),
+        time_ns=tuple(time for p in parts for time in p.time_ns),
+        truth_en_m=frozen(np.concatenate([p.truth_en_m for p in parts])),
+        fix_en_m=frozen(np.concatenate([p.fix_en_m for p in parts])),
+        errors_m=frozen(np.concatenate([p.errors_m for p in parts])),
+        cov_en_m2=frozen(np.concatenate([p.cov_en_m2 for p in parts])),
+        own_radius_m=frozen(np.concatenate([p.own_radius_m for p in parts])),
+        confident=_flags(np.concatenate([p.confident for p in parts])),
+        criteria=MappingProxyType(joined),
+        reasons=tuple(reason for p in parts for reason in p.reasons),
+        latency_ms=frozen(np.concatenate([p.latency_ms for p in parts])),
+        n_without_truth=sum(p.n_without_truth for p in parts),
+        n_without_result=sum(p.n_without_result for p in parts),
+        starts=tuple(starts),
+    )
+
+
+def measure(
+    comparison: Comparison,
+    radius_m: float = 15.0,
+    radii_m: Sequence[float] = RADII_M,
+    far_m: float = FAR_M,
+    rpe_distance_m: float = RPE_DISTANCE_M,
+) -> Metrics:
+    """All metrics of `comparison`; `radius_m` defines right fixes and joins `radii_m`.
+
+    `rpe_distance_m` is the distance of the relative pose error. Raises `ValueError` for a radius
+    that is not a positive finite number, and for a confidence that is not 0 to 1.
+    """
+    radii = sorted({float(r) for r in (*radii_m, radius_m)})
+    if not all(0.0 < radius < math.inf for radius in (*radii, far_m)):
+        raise ValueError(f"a radius must be positive and finite, got {[*radii, far_m]} (metres)")
+    errors_m, own_radius_m = comparison.errors_m, comparison.own_radius_m
+    errors_en_m = comparison.fix_en_m - comparison.truth_en_m
+    of_fixes_m = errors_m[np.isfinite(errors_m)]
+    of_confident_m = errors_m[comparison.confident & np.isfinite(errors_m)]
+    n_confident = of_confident_m.size
+    wrong_above_m, n_views = float(max(far_m, radius_m)), comparison.n_views
+    n_wrong = int(np.count_nonzero(comparison.confident_wrong(wrong_above_m)))
+    reasons = Counter(reason for reason in comparison.reasons if reason)
+    if comparison.n_without_result:
+        reasons[NO_RESULT] += comparison.n_without_result
+    return Metrics(
+        radius_m=float(radius_m),
+        n_views=n_views,
+        n_fixes=of_fixes_m.size,
+        n_without_truth=comparison.n_without_truth,
+        n_without_result=comparison.n_without_result,
+        n_confident=n_confident,
+        n_confident_wrong=n_wrong,
+        wrong_above_m=wrong_above_m,
+        wrong_upper_95=upper_bound(n_wrong, n_confident),
+        availability=share(n_confident, n_views),
+        availability_95=wilson(n_confident, n_views),
+        coverage=share(of_fixes_m.size, n_views),
+        gap=_longest_gap(comparison),
+        acc_at_m=_within(of_fixes_m, radii, n_views),
+        acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
+        accuracy_of_confident=share(int(np.count_nonzero(of_confident_m <= radius_m)), n_confident),
+        latency_median_ms=percentile(comparison.latency_ms, 50.0),
+        latency_p95_ms=percentile(comparison.latency_ms, 95.0),
+        reasons=MappingProxyType(dict(reasons.most_common())),
+        criteria=criterion_rows(comparison, radius_m, far_m),
+        curves=tuple(criterion_curve(comparison, name, radius_m) for name in CRITERIA),
+        calibration=calibrate(
+            comparison.criteria["confidence"], errors_m, own_radius_m, float(radius_m)
+        ),
+        consistency=check_covariance(
+            errors_en_m, comparison.cov_en_m2, own_radius_m, float(radius_m)
+        ),
+        standard=standard_figures(
+            comparison.truth_en_m, comparison.fix_en_m, comparison.starts, rpe_distance_m
+        ),
+        of_confident=standard_figures(
+            comparison.truth_en_m,
+            np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
+            comparison.starts,
+            rpe_distance_m,
+        ),
+    )
+
+
+def criterion_rows(
+    comparison: Comparison, radius_m: float, far_m: float = FAR_M
+) -> tuple[CriterionRow, ...]:
+    """One row per criterion and threshold of `CRITERIA`."""
+    return tuple(
+        _criterion_row(comparison, name, threshold, radius_m, far_m)
+        for name, thresholds in CRITERIA.items()
+        for threshold in thresholds
+    )
+
+
+def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> CriterionCurve:
+    """Share accepted and accuracy at every value that the criterion takes.
+
+    Views of equal value are accepted together. Empty where no view has the criterion.
+    """
+    values = comparison.criteria[name]
+    known = ~np.isnan(values)
+    order = np.argsort(-values[known], kind="stable")
+    ordered = values[known][order]
+    n_right = np.cumsum(comparison.errors_m[known][order] <= radius_m)
+    last = np.ones(ordered.size, dtype=bool)
+    last[:-1] = ordered[1:] != ordered[:-1]
+    n_accepted = np.flatnonzero(last) + 1
+    return CriterionCurve(
+        name=name,
+        thresholds=frozen(ordered[last]),
+        share_accepted=frozen(n_accepted / max(comparison.n_views, 1)),
+        accuracy=frozen(n_right[last] / n_accepted),
+    )
+
+
+def worst_views(comparison: Comparison, n: int = 10, wrong_above_m: float = FAR_M) -> list[int]:
+    """Indices of the `n` fixes with the largest error, confident and wrong ones first."""
+    fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
+    wrong = comparison.confident_wrong(wrong_above_m)
+    order = np.lexsort((-comparison.errors_m[fixes], ~wrong[fixes]))
+    return [int(i) for i in fixes[order[:n]]]
+
+
+def _criterion_row(
+    comparison: Comparison, name: str, threshold: float, radius_m: float, far_m: float
+) -> CriterionRow:
+    values, errors_m = comparison.criteria[name], comparison.errors_m
+    known = bool(np.any(~np.isnan(values)))
+    accepted = values >= threshold  # NaN is never accepted
+    n_accepted = int(np.count_nonzero(accepted))
+    n_right = int(np.count_nonzero(errors_m[accepted] <= radius_m))
+    n_far = int(np.count_nonzero(errors_m[accepted] > far_m))
+    n_all_right = int(np.count_nonzero(errors_m <= radius_m))
+    return CriterionRow(
+        name=name,
+        threshold=threshold,
+        share_accepted=share(n_accepted, comparison.n_views) if known else math.nan,
+        accuracy=share(n_right, n_accepted),
+        n_accepted=n_accepted,
+        n_right=n_right,
+        recall=share(n_right, n_all_right) if known else math.nan,
+        far_m=float(far_m),
+        n_far=n_far,
+        share_far=share(n_far, n_accepted),
+    )
+
+
+def _longest_gap(comparison: Comparison) -> Longest:
+    """The longest stretch without a confident fix of any flight; time and path each by itself."""
+    gaps: list[tuple[float, float]] = []
+    for first, last in pairwise((*comparison.starts, len(comparison.frames))):
+        seconds_s = seconds_since_first(comparison.time_ns[first:last])
+        path_m = path_so_far_m(comparison.truth_en_m[first:last])
+        gap = longest(~comparison.confident[first:last], seconds_s, path_m)
+        gaps.append((gap.seconds_s, gap.path_m))
+    return Longest(*(float(value) for value in np.fmax.reduce(gaps)))  # of those that are known
+
+
+def _covariance(outcome: Fix | NoFix) -> FloatArray:
+    """(2, 2) m2; NaN without one, and for one of another shape."""
+    nothing = np.full((2, 2), np.nan)
+    if not isinstance(outcome, Fix):
+        return nothing
+    stated = np.asarray(outcome.cov_en_m2, dtype=np.float64)
+    return stated if stated.shape == (2, 2) else nothing
+
+
+def _flags(values: Sequence[bool] | BoolArray) -> BoolArray:
+    flags = np.array(values, dtype=np.bool_)
+    flags.setflags(write=False)
+    return flags
+
+
+def _own_radius(outcome: Fix | NoFix) -> float:
+    return outcome.radius_m if isinstance(outcome, Fix) else math.nan
+
+
+def _position(outcome: Fix | NoFix) -> tuple[float, float]:
+    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else (math.nan, math.nan)
+
+
+def _is_fix(outcome: Fix | NoFix) -> bool:
+    return all(map(math.isfinite, _position(outcome)))
+
+
+def _reason(outcome: Fix | NoFix) -> str:
+    if isinstance(outcome, NoFix):
+        return outcome.reason or "not_said"
+    return "" if _is_fix(outcome) else "not_finite"
+
+
+def _criterion(result: ViewResult, name: str) -> float:
+    outcome = result.outcome
+    if not isinstance(outcome, Fix) or not _is_fix(outcome):
+        return math.nan
+    return outcome.confidence if name == "confidence" else outcome.evidence.get(name, math.nan)
+
+
+def _local(local: LocalFrame, positions: Sequence[tuple[float, float]]) -> FloatArray:
+    """(N, 2) metres east and north; NaN where a position is NaN."""
+    lat_lon_deg = np.array(positions, dtype=np.float64)
+    en_m = np.full(lat_lon_deg.shape, np.nan)
+    known = np.isfinite(lat_lon_deg).all(axis=1)
+    if known.any():
+        en_m[known] = local.en_from_latlon(lat_lon_deg[known, 0], lat_lon_deg[known, 1])
+    return frozen(en_m)
+
+
+def _within(errors_m: FloatArray, radii_m: Iterable[float], total: int) -> Mapping[float, float]:
+    shares = {r: share(int(np.count_nonzero(errors_m <= r)), total) for r in radii_m}
+    return MappingProxyType(shares)
+
+
+def _refuse_twice(frames: Iterable[str]) -> None:
+    twice = [name for name, count in Counter(frames).items() if count > 1]
+    if twice:
+        raise FlightError(f"{len(twice)} frames have more than one result, such as {twice[0]!r}")
+
+
+def _no_overlap(known: Positions, results: Sequence[ViewResult]) -> str:
+    first_known = repr(next(iter(known))) if known else "none"
+    first_result = repr(results[0].frame) if results else "none"
+    return (
+        "no view has both a result and a true position: "
+        f"{len(results)} results (first {first_result}), {len(known)} true positions "
+        f"(first {first_known}); are these of the same flight?"
+    )

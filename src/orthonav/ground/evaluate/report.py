@@ -1,0 +1,310 @@
+"""The evaluation of flights as one self-contained page, and its figures as files."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from orthonav.ground.evaluate import plots
+from orthonav.ground.evaluate.calibration_report import (
+    bins_rows,
+    calibration_figures,
+    confidence_text,
+    covariance_card,
+    covariance_text,
+    criteria_header,
+    criteria_rows,
+    levels_rows,
+    standard_rows,
+)
+from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
+from orthonav.ground.evaluate.figures import share
+from orthonav.ground.evaluate.flights import FlightReport, table_header, table_rows, total, verdict
+from orthonav.ground.evaluate.gnss import gnss_figure, gnss_rows
+from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
+from orthonav.ground.evaluate.track_plots import track_figures
+from orthonav.ground.evaluate.track_report import track_rows
+from orthonav.report import (
+    Figure,
+    file_names,
+    measure_text,
+    percent_text,
+    plain_text,
+    render,
+    write_page,
+)
+
+_N_WORST = 10
+
+
+@dataclass(frozen=True)
+class MadeFrom:
+    """What a report was made from, as text; empty where unknown."""
+
+    map_name: str = ""
+    recipe: str = ""
+    imagery: str = ""
+    flight: str = ""
+    command: str = ""
+    version: str = ""
+    date: str = ""
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """The figures of one section: general, of its track, of its worst views."""
+
+    general: tuple[Figure, ...]
+    track: tuple[Figure, ...] = ()
+    worst: tuple[Figure, ...] = ()
+
+
+def write_report(
+    out_dir: Path,
+    flights: Sequence[FlightReport],
+    made_from: MadeFrom | None = None,
+    title: str = "",
+    whole: Metrics | None = None,
+) -> Path:
+    """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
+
+    `whole`: what `total` gives for these flights, computed where it is None. Figures are also
+    written beside the page, as `orthonav.report.write_page` does. Raises `ValueError` as `total`,
+    `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot be written.
+    """
+    page, figures = page_of(flights, whole or total(flights), made_from or MadeFrom(), title)
+    return write_page(out_dir, page, figures)
+
+
+def page_of(
+    flights: Sequence[FlightReport], whole: Metrics, made_from: MadeFrom, title: str = ""
+) -> tuple[str, list[Figure]]:
+    """The page as HTML, and its figures; those of several flights carry the flights' names."""
+    several = len(flights) > 1
+    drawn = [_drawn(flight) for flight in flights]
+    if several:
+        drawn.append(_Drawn(_figures(pool([flight.comparison for flight in flights]), whole)))
+    names = [*(flight.name for flight in flights), "all flights"]
+    files = file_names(names) if several else [""]
+    drawn = [_named(*each) for each in zip(drawn, names, files, strict=False)]
+    subject = f"{len(flights)} flights" if several else flights[0].name
+    values: dict[str, Any] = {
+        "title": title or f"Evaluation of {subject}",
+        "kind": "Evaluation of flights",
+        "verdict": verdict(whole),
+        "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
+        "cards": _cards(whole),
+        "compared": _compared(whole),
+        "notes": _notes(whole),
+        "radius": f"{whole.radius_m:g} m",
+        "wrong_above": f"{whole.wrong_above_m:g} m",
+        "table_header": table_header(flights),
+        "table_rows": table_rows(flights, whole),
+        "sections": [_section(*each) for each in zip(flights, drawn, strict=False)],
+        "total_section": None,
+        "made_from": _made_from(made_from),
+    }
+    if several:
+        figures = {"name": "all flights", "figures": drawn[-1].general}
+        values["total_section"] = {**figures, **_trust(whole)}
+    page = render("orthonav.ground.evaluate", "report.html", values)
+    return page, [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+
+
+def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
+    of_confident, of_all = metrics.of_confident, metrics.standard
+    low, high = (100 * each for each in metrics.availability_95)
+    bound = f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
+    return (
+        (
+            percent_text(metrics.availability),
+            f"availability: {metrics.n_confident} of {metrics.n_views} views have a confident fix "
+            f"(95 % interval {low:.0f} to {high:.0f} %)",
+        ),
+        (
+            f"{metrics.n_confident_wrong} of {metrics.n_confident}",
+            "confident fixes are wrong" + f" ({bound})" * (metrics.n_confident > 0),
+            "bad" if metrics.n_confident_wrong else "",
+        ),
+        (
+            measure_text(of_confident.cep50_m, " m"),
+            f"CEP50 of confident fixes; {measure_text(of_all.cep50_m, ' m')} of all fixes",
+        ),
+        (
+            measure_text(of_confident.cep95_m, " m"),
+            f"CEP95 of confident fixes; {measure_text(of_all.cep95_m, ' m')} of all fixes",
+        ),
+        covariance_card(metrics.consistency),
+        (
+            measure_text(metrics.gap.seconds_s, " s"),
+            f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}",
+        ),
+    )
+
+
+def _compared(metrics: Metrics) -> list[tuple[str, ...]]:
+    """Confident and all fixes side by side."""
+    kinds = (
+        ("confident fixes", metrics.accuracy_of_confident, metrics.of_confident),
+        ("all fixes", metrics.accuracy_of_fixes, metrics.standard),
+    )
+    return [
+        (
+            name,
+            str(figures.ape.n),
+            percent_text(share(figures.ape.n, metrics.n_views)),
+            percent_text(within),
+            *map(measure_text, (figures.cep50_m, figures.cep95_m)),
+            *map(measure_text, (figures.ape.rmse_m, figures.ape.max_m)),
+        )
+        for name, within, figures in kinds
+    ]
+
+
+def _notes(metrics: Metrics) -> list[str]:
+    notes = []
+    if metrics.n_without_truth:
+        notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
+    if metrics.n_without_result:
+        notes.append(
+            f"{metrics.n_without_result} true positions have no result: views without a fix."
+        )
+    if not metrics.n_fixes:
+        notes.append("No view has a fix, so errors are not defined.")
+    return notes
+
+
+def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
+    """What the template shows of one flight."""
+    return {
+        "name": flight.name,
+        "figures": drawn.general,
+        "track": (
+            *(track_rows(flight.track) if flight.track else ()),
+            *(gnss_rows(flight.gnss) if flight.gnss else ()),
+        ),
+        "track_figures": drawn.track,
+        "worst": _worst(flight.comparison, flight.metrics),
+        "worst_figures": drawn.worst,
+        "reasons": [(reason, str(count)) for reason, count in flight.metrics.reasons.items()],
+        **_trust(flight.metrics),
+    }
+
+
+def _trust(metrics: Metrics) -> dict[str, Any]:
+    """Standard figures, criteria and calibration, for one flight or all."""
+    standard, more = standard_rows(metrics)
+    return {
+        "standard": standard,
+        "standard_more": more,
+        "criteria_header": criteria_header(metrics),
+        "criteria": criteria_rows(metrics, plots.LABELS),
+        "confidence": confidence_text(metrics),
+        "bins": bins_rows(metrics.calibration),
+        "covariance": covariance_text(metrics.consistency),
+        "levels": levels_rows(metrics.consistency),
+    }
+
+
+def _drawn(flight: FlightReport) -> _Drawn:
+    comparison, metrics, track = flight.comparison, flight.metrics, flight.track
+    radius_m, background = metrics.radius_m, flight.background
+    general = (
+        Figure(
+            "map",
+            f"Map of {metrics.n_views} true positions, {metrics.n_confident} confident fixes and "
+            f"{metrics.n_fixes - metrics.n_confident} best guesses",
+            "Map, north up: each fix is joined to its true position.",
+            plots.map_picture(comparison, radius_m, background),
+        ),
+        Figure(
+            "error-over-time",
+            f"Error of each view over time; {percent_text(metrics.coverage)} have a fix",
+            "Error over time, confident and of low confidence; shaded where there is no fix.",
+            plots.over_time_picture(comparison, radius_m),
+        ),
+        *_figures(comparison, metrics),
+    )
+    of_track = track_figures(comparison, track, radius_m, background) if track else []
+    of_gnss = [gnss_figure(flight.gnss)] if flight.gnss else []
+    return _Drawn(general, (*of_track, *of_gnss), _contact_sheet(flight))
+
+
+def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:
+    """The worst views as images; empty where these were not requested."""
+    if not flight.worst:
+        return ()
+    caption = (
+        "The worst fixes, those in state tracking first: the view rectified with heading and "
+        "height of its fix, north up, beside the map at the same scale; + fix, ○ true position."
+    )
+    alt = "The worst views. " + "; ".join(map(row_text, flight.worst))
+    return (Figure("worst-views", alt, caption, sheet_picture(flight.worst)),)
+
+
+def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
+    """The figures without positions, which can be drawn of several flights too."""
+    return (
+        Figure(
+            "error-curve",
+            f"Error curve: {percent_text(metrics.accuracy)} of all views within "
+            f"{metrics.radius_m:g} m",
+            "Share of all views with a fix within an error.",
+            plots.error_curve_picture(comparison, metrics),
+        ),
+        Figure(
+            "accepted-against-accuracy",
+            "Share of views accepted against accuracy among them, per confidence criterion",
+            "Share of views that a stricter criterion accepts, and how many of them are correct, "
+            "with thresholds; the ring marks a confidence of 0.9.",
+            plots.criteria_picture(metrics),
+        ),
+        *calibration_figures(metrics),
+    )
+
+
+def _named(drawn: _Drawn, name: str, file_name: str) -> _Drawn:
+    """The same with the flight's name in texts and, if given, in file names.
+
+    Two dashes separate it: neither `file_names` nor the names of figures contain any.
+    """
+    start = f"{file_name}--" if file_name else ""
+
+    def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
+        return tuple(
+            replace(each, name=f"{start}{each.name}", alt=f"{name}: {each.alt}") for each in figures
+        )
+
+    return _Drawn(named(drawn.general), named(drawn.track), named(drawn.worst))
+
+
+def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
+    wrong = comparison.confident_wrong(metrics.wrong_above_m)
+    for i in worst_views(comparison, _N_WORST, metrics.wrong_above_m):
+        east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
+        rows.append(
+            (
+                comparison.frames[i],
+                f"{comparison.time_ns[i] / 1e9:.2f}",
+                measure_text(comparison.errors_m[i]) + (" ✗" if wrong[i] else ""),
+                f"{east_m:+.1f}",
+                f"{north_m:+.1f}",
+                plain_text(comparison.criteria["confidence"][i])
+                + ("" if comparison.confident[i] else ", low confidence"),
+                plain_text(comparison.criteria["peak_ratio"][i]),
+            )
+        )
+    return rows
+
+
+def _made_from(made_from: MadeFrom) -> list[tuple[str, str]]:
+    return [
+        ("map", made_from.map_name),
+        ("recipe", made_from.recipe),
+        ("imagery", made_from.imagery),
+        ("flight", made_from.flight),
+        ("command", made_from.command),
+        ("orthonav", made_from.version),
+        ("date", made_from.date),
+    ]

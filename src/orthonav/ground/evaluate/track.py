@@ -1,0 +1,367 @@
+"""Metrics of a tracked flight (`ViewResult.state`), given the truth.
+
+States and confidence are those of all results, errors those of the views with a true position. A
+view represents the time and the path until the next one. Where times are unknown or do not rise,
+figures in seconds are undefined: NaN, and null in JSON.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.flight.fixes import STATES
+from orthonav.ground.evaluate.calibration import (
+    is_covariance,
+    nees_bound,
+    nees_mean_bounds,
+    normalized_squared,
+)
+from orthonav.ground.evaluate.figures import (
+    FloatArray,
+    frozen,
+    mean,
+    percentile,
+    runs,
+    share,
+)
+from orthonav.ground.evaluate.gaps import (
+    Longest,
+    longest,
+    longest_stretch,
+    path_so_far_m,
+    seconds_since_first,
+)
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison
+from orthonav.records import Fix, ViewResult
+
+RADII_M = (25.0, 60.0)
+"""Radii of accuracy: a usual and a large error of a track."""
+COURSE_M = 5.0
+"""Minimum distance over which a course is measured, in the median."""
+STILL_M = 1.0
+"""Below this distance the aircraft is stationary and has no course."""
+BIASES = ("heading_bias_deg", "log_scale_bias", "pitch_bias_deg", "roll_bias_deg")
+"""Evidence of a track: estimated biases of the telemetry."""
+
+
+@dataclass(frozen=True)
+class After:
+    """Errors from the first confirmed fix on, in any state.
+
+    `n_views`, `n_fixes`: number of views, and of fixes among them.
+    `error_*_m`: of the fixes.
+    `acc_at_m`: for each radius the share of views with a fix within it.
+    """
+
+    n_views: int
+    n_fixes: int
+    error_median_m: float
+    error_p95_m: float
+    error_max_m: float
+    acc_at_m: Mapping[float, float]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean (bias), standard deviation and RMSE of signed errors in metres, over `n_views` views."""
+
+    n_views: int
+    mean_m: float
+    std_m: float
+    rmse_m: float
+
+
+@dataclass(frozen=True)
+class TrackConsistency:
+    """Consistency of a track: NEES (2 degrees of freedom, 2 expected) of the tracking views.
+
+    `n_views`, `n_left_out`: views with and without a usable covariance.
+    `nees_mean`: mean NEES; `nees_within_95`: share below the 95 % bound.
+    `independent_low`, `independent_high`: 95 % interval of the mean of independent views.
+    `n_effective`: effective number of views, as errors of consecutive views are correlated.
+    `effective_low`, `effective_high`: the interval for that number, which decides the verdict.
+    `verdict`: "consistent", "over-confident" or "under-confident"; "" without views.
+    """
+
+    n_views: int
+    n_left_out: int
+    nees_mean: float
+    nees_within_95: float
+    independent_low: float
+    independent_high: float
+    n_effective: float
+    effective_low: float
+    effective_high: float
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class TrackSeries:
+    """Time series over the compared views (N,), for figures.
+
+    `seconds_s`: time since the first view; `states`: state of the track.
+    `sigma_m`: standard deviation along the longer axis of the covariance.
+    `bound_95_m`: the same axis of the 95 % ellipse; a larger error has a NEES above 5.99.
+    `along_m`, `across_m`: error ahead and to the right of the true position.
+    `biases`: estimated biases by the name of their evidence.
+    """
+
+    seconds_s: FloatArray
+    states: tuple[str, ...]
+    sigma_m: FloatArray
+    bound_95_m: FloatArray
+    along_m: FloatArray
+    across_m: FloatArray
+    biases: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackMetrics:
+    """Metrics of one track.
+
+    `n_views`, `n_compared`: all views, and those with a true position.
+    `first_view`, `first_s`: number (from 1) and time of the first confirmed fix, that is, one in
+    state tracking.
+    `after`: errors from then on.
+    `share_of_views`, `share_of_time`: by state; `n_lost`: number of times the track was lost.
+    `low_confidence`: longest stretch without a confident fix (not tracking, or not confident);
+    `low_confidence_after`: the same from the first confirmed fix on.
+    `far_m`: the larger of `FAR_M` and the radius of the evaluation.
+    `n_confident_wrong`: views that are tracking, or confident, with an error above `far_m` and
+    above the radius that the fix states.
+    `n_false_locks`, `false_lock_longest_s`: stretches of such views.
+    `along`, `across`: errors ahead and to the right, of the tracking views.
+    `consistency`, `series`: NEES, and time series for figures.
+    """
+
+    n_views: int
+    n_compared: int
+    first_view: float
+    first_s: float
+    after: After
+    share_of_views: Mapping[str, float]
+    share_of_time: Mapping[str, float]
+    n_lost: int
+    low_confidence: Longest
+    low_confidence_after: Longest
+    far_m: float
+    n_confident_wrong: int
+    n_false_locks: int
+    false_lock_longest_s: float
+    along: Spread
+    across: Spread
+    consistency: TrackConsistency
+    series: TrackSeries
+
+
+def measure_track(
+    comparison: Comparison, results: Sequence[ViewResult], radius_m: float
+) -> TrackMetrics | None:
+    """All metrics of a track; None where no result has a state.
+
+    `comparison` is made of these `results`; raises `ValueError` where it is not.
+    """
+    if not any(result.state for result in results):
+        return None
+    number = {result.frame: i for i, result in enumerate(results)}
+    if not set(comparison.frames) <= set(number):
+        raise ValueError("the comparison has views that are not among the results")
+    rows = np.array([number[frame] for frame in comparison.frames], dtype=np.intp)
+    states = np.array([result.state or "" for result in results])
+    seconds_s = seconds_since_first([result.time_ns for result in results])
+    path_m = _path_m(comparison.truth_en_m, rows, len(results))
+    confident = np.array([result.is_confident for result in results])
+    tracking = states == "tracking"
+    confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
+    first = int(np.argmax(confirmed)) if confirmed.any() else len(results)
+    far_m = max(FAR_M, radius_m)
+    wrong = (confident | tracking)[rows] & (
+        comparison.errors_m > np.fmax(far_m, comparison.own_radius_m)
+    )
+    low_confidence = ~(tracking & confident)
+    found = first < len(results)
+    series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
+    return TrackMetrics(
+        n_views=len(results),
+        n_compared=len(rows),
+        first_view=first + 1 if found else math.nan,
+        first_s=float(seconds_s[first]) if found else math.nan,
+        after=_after(comparison.errors_m[rows >= first], radius_m),
+        share_of_views=_shares(states, np.ones(len(states))),
+        share_of_time=_shares(states, _until_next(seconds_s)),
+        n_lost=len(runs(states == "lost")),
+        low_confidence=longest(low_confidence, seconds_s, path_m),
+        low_confidence_after=longest(low_confidence[first:], seconds_s[first:], path_m[first:]),
+        far_m=far_m,
+        n_confident_wrong=int(np.count_nonzero(wrong)),
+        n_false_locks=len(runs(wrong)),
+        false_lock_longest_s=longest_stretch(wrong, seconds_s[rows]),
+        along=_spread(series.along_m[tracking[rows]]),
+        across=_spread(series.across_m[tracking[rows]]),
+        consistency=check_consistency(
+            (comparison.fix_en_m - comparison.truth_en_m)[tracking[rows]],
+            comparison.cov_en_m2[tracking[rows]],
+        ),
+        series=series,
+    )
+
+
+def course_en(truth_en_m: FloatArray) -> FloatArray:
+    """(N, 2) unit vectors of the course, east and north; NaN where the aircraft stands still.
+
+    Central differences of true positions (N, 2), over 1, 2, 4.. views to either side: the fewest
+    over which at least half of the views move by `COURSE_M`.
+    """
+    number = np.arange(len(truth_en_m))
+    last, reach = len(number) - 1, 1
+    while True:
+        ends = np.minimum(number + reach, last), np.maximum(number - reach, 0)
+        path_m = truth_en_m[ends[0]] - truth_en_m[ends[1]]
+        length_m = np.hypot(path_m[:, 0], path_m[:, 1])
+        if 2 * reach > last // 4 or np.median(length_m) >= COURSE_M:
+            break
+        reach *= 2
+    moves = length_m >= STILL_M
+    course = np.full(path_m.shape, math.nan)
+    course[moves] = path_m[moves] / length_m[moves, None]
+    return course
+
+
+def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> TrackConsistency:
+    """Consistency of errors (N, 2) of consecutive views with their covariances (N, 2, 2).
+
+    n times the mean NEES of n independent views follows chi-square with 2 n degrees of freedom
+    (Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section
+    5.4); for correlated errors the effective number of views replaces n.
+    """
+    usable = is_covariance(cov_en_m2) & np.isfinite(errors_en_m).all(axis=1)
+    errors_en_m, cov_en_m2 = errors_en_m[usable], cov_en_m2[usable]
+    nees = normalized_squared(errors_en_m, cov_en_m2)
+    n_effective = effective_number(_whitened(errors_en_m, cov_en_m2))
+    low, high = nees_mean_bounds(n_effective)
+    found = mean(nees)
+    verdict = "over-confident" if found > high else "consistent"
+    verdict = "under-confident" if found < low else verdict
+    independent = nees_mean_bounds(nees.size)
+    return TrackConsistency(
+        n_views=nees.size,
+        n_left_out=int(np.count_nonzero(~usable)),
+        nees_mean=found,
+        nees_within_95=share(int(np.count_nonzero(nees <= nees_bound(0.95))), nees.size),
+        independent_low=independent[0],
+        independent_high=independent[1],
+        n_effective=n_effective,
+        effective_low=low,
+        effective_high=high,
+        verdict=verdict if nees.size else "",
+    )
+
+
+def effective_number(whitened: FloatArray) -> float:
+    """The effective number of independent views for the mean NEES, 1 to N.
+
+    `whitened` (N, 2) are consecutive errors in units of their covariance, two independent parts.
+    If these are Gaussian with autocorrelation r_k, their squares have autocorrelation r_k^2
+    (Isserlis 1918), so the variance of the mean of N squares is tau / N times that of one, with
+
+        tau = 1 + 2 sum over k of (1 - k / N) r_k^2,    effective number N / tau,
+
+    the mean of both parts. r_k is estimated about zero, since right errors have no bias: a bias is
+    one error seen N times. The sum ends before the first r_k that is not positive, where the
+    estimate is noise (Geyer, "Practical Markov chain Monte Carlo", 1992, truncates alike).
+    """
+    n = len(whitened)
+    if n < 2:
+        return float(n)
+    tau = np.mean([_autocorrelation_time(part) for part in whitened.T])
+    return float(np.clip(n / tau, 1.0, n))
+
+
+def _autocorrelation_time(part: FloatArray) -> float:
+    """`tau` of `effective_number`, 1 to N, of one part (N,)."""
+    n = part.size
+    with np.errstate(over="ignore", invalid="ignore"):  # covariances may be next to nothing
+        power = np.abs(np.fft.rfft(part, 2 * n)) ** 2
+        products = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
+    if not (np.isfinite(products).all() and products[0] > 0.0):
+        return float(n)  # always the same
+    correlation = np.minimum(products[1:] / products[0], 1.0)
+    ends = np.flatnonzero(correlation <= 0.0)
+    stop = int(ends[0]) if ends.size else n - 1
+    weights = 1.0 - np.arange(1, stop + 1) / n
+    return 1.0 + 2.0 * float(weights @ correlation[:stop] ** 2)
+
+
+def _path_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:
+    """(n,) metres flown until each result, by the true positions of the results `rows`."""
+    return np.asarray(np.interp(np.arange(n), rows, path_so_far_m(truth_en_m)))
+
+
+def _until_next(values: FloatArray) -> FloatArray:
+    """Difference from each value to the next; 0 for the last."""
+    return np.append(np.diff(values), 0.0)
+
+
+def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float]:
+    whole = float(weights.sum())
+    found = {name: float(weights[states == name].sum()) for name in STATES}
+    known = whole > 0.0  # not NaN
+    return MappingProxyType({k: part / whole if known else math.nan for k, part in found.items()})
+
+
+def _after(errors_m: FloatArray, radius_m: float) -> After:
+    of_fixes_m = errors_m[np.isfinite(errors_m)]
+    within = {
+        r: share(int(np.count_nonzero(of_fixes_m <= r)), errors_m.size)
+        for r in sorted({float(radius_m), *RADII_M})
+    }
+    return After(
+        n_views=errors_m.size,
+        n_fixes=of_fixes_m.size,
+        error_median_m=percentile(of_fixes_m, 50.0),
+        error_p95_m=percentile(of_fixes_m, 95.0),
+        error_max_m=float(of_fixes_m.max()) if of_fixes_m.size else math.nan,
+        acc_at_m=MappingProxyType(within),
+    )
+
+
+def _spread(errors_m: FloatArray) -> Spread:
+    known = errors_m[np.isfinite(errors_m)]
+    std_m = float(known.std()) if known.size else math.nan
+    return Spread(known.size, mean(known), std_m, math.sqrt(mean(known**2)))
+
+
+def _whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
+    """(N, 2) errors in units of their covariance: the solution z of L z = e where C = L L^T."""
+    if not len(errors_en_m):
+        return errors_en_m
+    lower = np.linalg.cholesky(cov_en_m2)
+    return np.asarray(np.linalg.solve(lower, errors_en_m[..., None])[..., 0])
+
+
+def _series(
+    comparison: Comparison, results: Sequence[ViewResult], seconds_s: FloatArray
+) -> TrackSeries:
+    errors_en_m = comparison.fix_en_m - comparison.truth_en_m
+    course = course_en(comparison.truth_en_m)
+    right = np.stack([course[:, 1], -course[:, 0]], axis=1)
+    usable = is_covariance(comparison.cov_en_m2)
+    sigma_m = np.full(len(results), math.nan)
+    sigma_m[usable] = np.sqrt(np.linalg.eigvalsh(comparison.cov_en_m2[usable])[:, 1])
+    biases = {
+        name: frozen([result.outcome.evidence.get(name, math.nan) for result in results])
+        for name in BIASES
+    }
+    return TrackSeries(
+        seconds_s=frozen(seconds_s),
+        states=tuple(result.state or "" for result in results),
+        sigma_m=frozen(sigma_m),
+        bound_95_m=frozen(sigma_m * math.sqrt(nees_bound(0.95))),
+        along_m=frozen((errors_en_m * course).sum(axis=1)),
+        across_m=frozen((errors_en_m * right).sum(axis=1)),
+        biases=MappingProxyType(biases),
+    )
