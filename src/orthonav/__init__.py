@@ -34,6 +34,8 @@ __all__ = [
     "View",
     "ViewResult",
     "build_map",
+    "check",
+    "evaluate",
     "open_flight",
     "open_map",
     "read_results",
@@ -49,6 +51,8 @@ _HOMES = {
     **dict.fromkeys(("MapFile", "open_map"), "mapfile"),
     **dict.fromkeys(("SimulateRequest", "simulate_flight"), "simulate.flight"),
     "Camera": "geo.camera",
+    "check": "ground.check.run",
+    "evaluate": "ground.evaluate.metrics",
     "OrthonavError": "errors",
     "read_results": "flight.fixes",
 }

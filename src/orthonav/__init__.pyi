@@ -4,6 +4,8 @@ from orthonav.flight import open_flight as open_flight
 from orthonav.flight import read_truth as read_truth
 from orthonav.flight.fixes import read_results as read_results
 from orthonav.geo.camera import Camera as Camera
+from orthonav.ground.check.run import check as check
+from orthonav.ground.evaluate.metrics import evaluate as evaluate
 from orthonav.localizer import Localizer as Localizer
 from orthonav.localizer import Tracker as Tracker
 from orthonav.mapfile import MapFile as MapFile

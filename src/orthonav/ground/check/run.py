@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +74,15 @@ def check_map(
     """
     opened = open_map(request.map_path)
     return _Check(request, opened, progress).result(), opened
+
+
+def check(map_path: Path | str, *, progress: Progress = no_progress, **asked: Any) -> CheckResult:
+    """Predict where on a map views can be localized.
+
+    `asked`: fields of `CheckRequest`, such as `route`, `agl_m`, `camera`, `prior_std_m`. Raises as
+    `check_map`, and `CheckError` for values out of range.
+    """
+    return check_map(CheckRequest(Path(map_path), **asked), progress)[0]
 
 
 class _Check:

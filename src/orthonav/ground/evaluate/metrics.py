@@ -10,11 +10,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from orthonav.errors import FlightError
+from orthonav.flight import read_truth
+from orthonav.flight.fixes import read_results
 from orthonav.geo.frames import LocalFrame
 from orthonav.ground.evaluate.calibration import (
     ConfidenceCalibration,
@@ -235,6 +238,14 @@ def compare(
         n_without_truth=len(results) - len(matched),
         n_without_result=len(known) - len(matched),
     )
+
+
+def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
+    """Metrics of a file of fixes (`fixes.jsonl`) against the true positions of a `truth.csv`.
+
+    Raises `MissingFileError` or `FlightError`.
+    """
+    return measure(compare(read_truth(Path(truth)), read_results(Path(fixes))), radius_m)
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
