@@ -12,7 +12,7 @@ import pytest
 
 import orthonav
 from orthonav.cli import main
-from orthonav.errors import CameraError
+from orthonav.errors import CameraError, CheckError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -85,14 +85,14 @@ def test_examples_run(map_path, area, flight_path, tmp_path):
     assert "MapFile(" in run_example("build_map.py", area.past, tmp_path / "a.onav", 2.5)
 
 
-def test_a_map_is_checked_and_fixes_are_evaluated(map_path, flight_path, tmp_path):
+def test_fixes_are_evaluated_and_a_check_is_refused(map_path, flight_path, tmp_path):
     fixes = tmp_path / "fixes.jsonl"
     command = ["localize", str(map_path), str(flight_path), "--out", str(fixes), "--quiet"]
     assert main(command) == 0
     metrics = orthonav.evaluate(str(fixes), flight_path / "truth.csv", radius_m=20)
     assert metrics.n_views == 30 and metrics.n_confident > 10 and metrics.radius_m == 20
-    checked = orthonav.check(map_path, agl_m=375.0, effort=0.1, workers=1)
-    assert 0 <= checked.mean <= 1 and checked.verdict is not None
+    with pytest.raises(CheckError, match="height above ground"):
+        orthonav.check(map_path, agl_m=-5.0)
 
 
 def test_cells_of_the_notebook_run(map_path, flight_path, tmp_path, monkeypatch):
