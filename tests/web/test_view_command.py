@@ -11,7 +11,7 @@ from small_run import NO_FIX, WRONG, result
 
 from orthonav.cli import view as view_module
 from orthonav.flight.fixes import write_results
-from orthonav.flight.identity import Identity, Source
+from orthonav.flight.identity import Identity
 from orthonav.records import Fix, ViewResult
 from orthonav.web.opening import ViewRequest, open_run
 
@@ -52,11 +52,11 @@ def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
     assert opened.summary()["second"] == "tracked.jsonl"
     assert "second_lat_deg" in opened.detail(0) and "second_lat_deg" not in opened.detail(1)
     refused(run("view", small.fixes, tmp_path / "no.jsonl", "--map", small.map_path), "no.jsonl")
-    another = Identity(Source("other.onav", "0" * 64), None)
+    another = Identity("0" * 64)
     write_results(second, [replace(result(0), frame="other.png")], another)
     done = run("view", small.fixes, second, "--map", small.map_path)
     assert done.code == 0 and "no view has a position in the second run" in done.err
-    assert "the run is another one" in done.err and "other.onav" in done.err
+    assert "the run is of another map (00000000)" in done.err
 
 
 def test_a_public_address_is_warned_about(run, small, served):
