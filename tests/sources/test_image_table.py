@@ -125,7 +125,6 @@ def test_units_and_decimal_commas(images):
 @pytest.mark.parametrize(
     "table, message",
     [
-        ("file,yaw\nx.png,1\n", "names none of the 3 photographs, such as a.png; it names x"),
         ("file,yaw\na.png,north\n", "line 2: yaw is not a number, got 'north'"),
         ("file,lat,lon\na.png,146.5,2.5\n", "line 2: not a latitude and longitude in degrees"),
         ("file,time\na.png,noon\n", "line 2: time must be seconds or a date"),
@@ -136,6 +135,27 @@ def test_units_and_decimal_commas(images):
 def test_tables_that_are_refused(images, table, message):
     with pytest.raises(FlightError, match=message):
         views_of(images, table)
+
+
+def test_a_table_of_other_files_is_used_only_where_it_is_given(images, caplog):
+    table = images / "other.csv"
+    table.write_text("file,yaw\nx.png,1\n")
+    with pytest.raises(FlightError, match="no time in EXIF"):
+        open_source(images, FOV)
+    assert "names none of the photographs is not used" in caplog.text
+    with pytest.raises(FlightError, match=r"names none of the 3 photographs, such as a\.png"):
+        open_source(table, FOV)
+
+
+def test_rows_with_folders_are_of_these_folders(images):
+    for folder in ("a", "b"):
+        (images / folder).mkdir()
+        (images / folder / "same.png").write_bytes((images / "a.png").read_bytes())
+    found = views_of(images, "file,yaw,time\na/same.png,7,20240501100000\n")
+    assert list(found.by) == ["a/same.png"]
+    assert found.by["a/same.png"].telemetry.time_ns == 1714557600 * 10**9
+    with pytest.raises(FlightError, match="several photographs of one name"):
+        views_of(images, "file,yaw\nsame.png,7\n")
 
 
 def test_several_tables_are_not_guessed(images):

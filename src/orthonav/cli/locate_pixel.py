@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import print_json
 
 if TYPE_CHECKING:
+    from orthonav.flight import FlightFolder, FlightView
+    from orthonav.geo.camera import Camera
     from orthonav.mapfile.terrain import TerrainLayer
 
 log = logging.getLogger(__name__)
@@ -80,7 +82,7 @@ def run(options: argparse.Namespace) -> None:
     other = read_identity(options.fixes).differences(given, options.map, options.flight)
     if other:
         log.warning("fixes are of %s: %s", other, options.fixes)
-    found = locate_pixel(flight.camera, telemetry, fix, (options.x, options.y), terrain)
+    found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
     ellipse = ellipse_95(found.cov_en_m2)
     height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
     if options.json:
@@ -105,6 +107,17 @@ def run(options: argparse.Namespace) -> None:
     print(f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera")
     if not result.is_confident:
         print("! the position of this view is a best guess")
+
+
+def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
+    """The camera at the size of the image of a view; as calibrated where that cannot be read."""
+    from orthonav.errors import FlightError, MissingFileError
+
+    try:
+        height_px, width_px = view.grey().shape
+    except (FlightError, MissingFileError):
+        return flight.camera
+    return flight.camera.fitted(width_px, height_px)
 
 
 def _terrain(path: Path) -> "tuple[TerrainLayer, str]":

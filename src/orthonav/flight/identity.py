@@ -48,7 +48,8 @@ class Identity:
 class FlightDigest:
     """SHA-256 of names, times and reported headings of the views of a flight, in order.
 
-    The digest of a recording and of the flight folder that it was imported to is the same.
+    The digest of a recording and of the flight folder that it was imported to is the same unless
+    views were left out or renamed.
     """
 
     _sum: Any = field(default_factory=hashlib.sha256)

@@ -22,7 +22,7 @@ from orthonav.geo import lens
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
-FOV_STD = 0.02
+FOV_STD = 0.05
 """Of a focal length by a stated field of view, as a share of it."""
 _BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
 _HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -79,7 +79,7 @@ class Camera:
     def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
         """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
 
-        The focal length of a data sheet is seldom better than 2 %, which is what is stated.
+        Stated fields of view are often those of the lens or of another mode: good to 5 %.
         """
         if not 0 < fov_deg < 180:
             raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
@@ -91,7 +91,7 @@ class Camera:
     def from_matrix(
         cls,
         matrix: Array,
-        distortion: Sequence[float],
+        distortion: Sequence[float] | None,
         size_px: tuple[int, int],
         model: str = "brown",
     ) -> "Camera":
@@ -104,8 +104,8 @@ class Camera:
             raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
         # OpenCV counts from the centre of the first pixel.
         numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
-        more = tuple(np.ravel(np.asarray(distortion, np.float64)).tolist())
-        return cls(*size_px, *numbers, more, model)
+        more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64)).tolist()
+        return cls(*size_px, *numbers, tuple(more), model)
 
     @classmethod
     def from_file(cls, path: Path | str) -> "Camera":

@@ -26,7 +26,7 @@ except ImportError as error:
 EPOCHS = (1980.0, 2100.0)
 _ITRF = "EPSG:7912"
 _FRAMES = (
-    (r"NAD83", "EPSG:6318"),
+    (r"NAD83(?!\((?:PA|MA)11)", "EPSG:6318"),
     (r"ETRS89|ETRF|RGF93|SWEREF99|EUREF|IGNF", "EPSG:4258"),
     (r"GDA94", "EPSG:4283"),
     (r"GDA2020", "EPSG:7844"),

@@ -158,7 +158,7 @@ class Publisher:
         for out in outs:
             try:
                 call(out)
-            except (OSError, ValueError) as error:
+            except Exception as error:  # one output must not end the others
                 if self.failed == 0:
                     log.warning("output failed: %s", error)
                 self.failed += 1

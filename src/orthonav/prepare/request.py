@@ -92,6 +92,8 @@ class BuildRequest:
     cells: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.orthos, str | Path):
+            object.__setattr__(self, "orthos", (self.orthos,))
         with_paths(self, "orthos", "out", "other_dates", "work", "dem")
 
 

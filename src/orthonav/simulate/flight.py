@@ -187,6 +187,8 @@ class SimulateRequest:
     gnss: Good | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.orthos, str | Path):
+            object.__setattr__(self, "orthos", (self.orthos,))
         with_paths(self, "orthos", "out")
 
     @property

@@ -52,6 +52,8 @@ _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
 _DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
+_COMPACT = re.compile(r"(19|20)\d{12}")
+"""A date and time in 14 digits."""
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _LARGEST_S = 9e9
 
@@ -93,9 +95,12 @@ class ImageTable:
     warnings: tuple[str, ...]
 
     def row(self, name: str) -> ImageRow | None:
-        """The row of an image, by its path below the folder, its name, or that without a suffix."""
-        pure = PurePosixPath(name.lower())
-        keys = (str(pure), pure.name, pure.stem)
+        """The row of an image: by the end of its path below the folder, or by its name without a
+        suffix. An image without a folder is that of a row with one too."""
+        parts = PurePosixPath(name.lower()).parts
+        ends = ["/".join(parts[first:]) for first in range(len(parts))]
+        stem = PurePosixPath(parts[-1]).stem
+        keys = [*ends, stem] + [f"/{parts[-1]}", f"/{stem}"] * (len(parts) == 1)
         return next((self.rows[key] for key in keys if key in self.rows), None)
 
 
@@ -248,6 +253,8 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
     time; UTC where no zone."""
     if text.lower() in _EMPTY:
         return None
+    if _COMPACT.fullmatch(text):
+        text = f"{text[:8]}T{text[8:]}"
     number = number_of(text)
     if math.isfinite(number):
         seconds = Decimal(text)
@@ -285,7 +292,8 @@ def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
 
 
 def _by_name(rows: Sequence[tuple[str, ImageRow]], path: Path) -> dict[str, ImageRow]:
-    """Rows by path, by name and by name without suffix, as far as these are of one row only."""
+    """Rows by path, by name and by name without suffix, as far as these are of one row only; names
+    of rows with a folder begin with a slash."""
     found: dict[str, ImageRow] = {}
     short: dict[str, ImageRow | None] = {}
     for text, row in rows:
@@ -293,6 +301,7 @@ def _by_name(rows: Sequence[tuple[str, ImageRow]], path: Path) -> dict[str, Imag
         if str(pure) in found:
             raise FlightError(f"table names {text!r:.80} twice: {path}")
         found[str(pure)] = row
-        for name in {pure.name, pure.stem}:
+        slash = "/" if len(pure.parts) > 1 else ""
+        for name in {slash + pure.name, slash + pure.stem}:
             short[name] = None if name in short else row
     return {name: row for name, row in short.items() if row is not None} | found

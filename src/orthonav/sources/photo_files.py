@@ -1,5 +1,6 @@
 """Which photographs a source names: those of a folder, of a table of images, or single files."""
 
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from orthonav.errors import FlightError
 from orthonav.files import require_file
 from orthonav.sources.image_table import ImageTable, is_image_table, read_image_table
 from orthonav.sources.options import SourceOptions
+
+log = logging.getLogger(__name__)
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
@@ -52,9 +55,10 @@ class ChosenPhotos:
         if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
             table = read_image_table(telemetry)
         if len(sources) == 1 and first.is_dir():
-            if table is None and telemetry is None and (found := image_table_in(first)):
-                table = read_image_table(found)
-            return cls(first, photo_paths(first), table, table is not None)
+            paths = photo_paths(first)
+            if table is None and telemetry is None:
+                table = image_table_in(first, paths)
+            return cls(first, paths, table, table is not None)
         if len(sources) == 1 and is_image_table(first):
             return cls(first.parent, photo_paths(first.parent), read_image_table(first), True)
         for path in sources:
@@ -64,10 +68,22 @@ class ChosenPhotos:
         return cls(folder, [path.resolve() for path in sources], table, True)
 
 
-def image_table_in(folder: Path) -> Path | None:
-    """The table of images that lies in a folder. Raises `FlightError` where there are several."""
-    found = sorted(path for path in folder.iterdir() if is_image_table(path))
+def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
+    """The table that lies in a folder and names some of these photographs below it.
+
+    Raises `FlightError` where there are several.
+    """
+    names = [path.relative_to(folder).as_posix() for path in photos]
+    found = []
+    for path in sorted(path for path in folder.iterdir() if is_image_table(path)):
+        table = read_image_table(path)
+        if any(table.row(name) for name in names):
+            found.append(table)
+        else:
+            log.warning("table that names none of the photographs is not used: %s", path)
     if len(found) > 1:
-        names = ", ".join(path.name for path in found[:5])
-        raise FlightError(f"folder has several tables of images ({names}); give one: {folder}")
+        several = ", ".join(table.path.name for table in found[:5])
+        raise FlightError(
+            f"folder has several tables of images ({several}); give one by --telemetry: {folder}"
+        )
     return found[0] if found else None

@@ -147,6 +147,12 @@ def _with_rows(
             f"table names none of the {len(found)} photographs, such as {without[0]}; it names "
             f"{next(iter(chosen.table.rows))}: {chosen.table.path}"
         )
+    orders = [row.order for row in rows if row is not None]
+    if len(set(orders)) < len(orders):
+        raise FlightError(
+            "a row of the table names several photographs of one name; give their paths below "
+            f"{chosen.folder}: {chosen.table.path}"
+        )
     warnings = list(chosen.table.warnings)
     if without:
         warnings.append(

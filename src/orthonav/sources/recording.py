@@ -23,9 +23,6 @@ DECIMALS = 8
 LONG_GAP_NS = 1_000_000_000
 """After so long without a view a velocity at one time no longer says how far the aircraft flew: it
 may have turned."""
-FOV_STD = 0.05
-"""Standard deviation of a focal length by a field of view, as a share: such are rounded, and often
-those of another mode."""
 JUMP_M, JUMP_MPS = 500.0, 150.0
 """Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
 that this program is for flies slower, and logs round positions to some metres."""
@@ -226,9 +223,7 @@ def given_camera(
         return fitted(read_camera_file(options.camera), width_px, height_px, where)
     if options.fov_deg is None:
         return None
-    focal_px = width_px / 2 / math.tan(math.radians(options.fov_deg) / 2)
-    middle = width_px / 2, height_px / 2
-    return Camera(width_px, height_px, focal_px, focal_px, *middle, focal_std=FOV_STD)
+    return Camera.from_fov(options.fov_deg, width_px, height_px)
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

@@ -79,7 +79,8 @@ def check_map(
 def check(map_path: Path | str, *, progress: Progress = no_progress, **asked: Any) -> CheckResult:
     """Predict where on a map views can be localized.
 
-    `asked`: fields of `CheckRequest`, such as `route`, `agl_m`, `camera`, `prior_std_m`. Raises as
+    `asked`: fields of `CheckRequest`, such as `route`, `agl_m`, `camera`, `prior_std_m`. It starts
+    processes: call it below `if __name__ == "__main__":`, or with `workers=1`. Raises as
     `check_map`, and `CheckError` for values out of range.
     """
     return check_map(CheckRequest(Path(map_path), **asked), progress)[0]

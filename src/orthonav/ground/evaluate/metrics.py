@@ -36,6 +36,7 @@ from orthonav.ground.evaluate.figures import (
 )
 from orthonav.ground.evaluate.gaps import Longest, longest, path_so_far_m, seconds_since_first
 from orthonav.ground.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
+from orthonav.ground.evaluate.truth import check_truth
 from orthonav.records import Fix, NoFix, ViewResult
 
 Positions = Mapping[str, tuple[float, float]]
@@ -243,9 +244,12 @@ def compare(
 def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
     """Metrics of a file of fixes (`fixes.jsonl`) against the true positions of a `truth.csv`.
 
-    Raises `MissingFileError` or `FlightError`.
+    Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the truth seem
+    to be swapped, or `ValueError` for a radius that is not positive.
     """
-    return measure(compare(read_truth(Path(truth)), read_results(Path(fixes))), radius_m)
+    known, results = read_truth(Path(truth)), read_results(Path(fixes))
+    check_truth(known, results, None, Path(truth))
+    return measure(compare(known, results), radius_m)
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
@@ -412,14 +416,17 @@ def _criterion_row(
 
 
 def _longest_gap(comparison: Comparison) -> Longest:
-    """The longest stretch without a confident fix of any flight; time and path each by itself."""
+    """The longest stretch without a confident fix of any flight, time and path each by itself; NaN
+    where views have no result or a flight does not tell."""
+    if comparison.n_without_result:
+        return Longest(math.nan, math.nan)
     gaps: list[tuple[float, float]] = []
     for first, last in pairwise((*comparison.starts, len(comparison.frames))):
         seconds_s = seconds_since_first(comparison.time_ns[first:last])
         path_m = path_so_far_m(comparison.truth_en_m[first:last])
         gap = longest(~comparison.confident[first:last], seconds_s, path_m)
         gaps.append((gap.seconds_s, gap.path_m))
-    return Longest(*(float(value) for value in np.fmax.reduce(gaps)))  # of those that are known
+    return Longest(*(float(value) for value in np.max(gaps, axis=0)))
 
 
 def _covariance(outcome: Fix | NoFix) -> FloatArray:

@@ -124,7 +124,10 @@ class RclNode(Graph):
         self._executor.spin_once(timeout_s)
         for made, _ in self._subscriptions:  # spin_once handles one message
             with made.handle:
-                while (taken := made.handle.take_message(made.msg_type, True)) is not None:
+                for _ in range(made.qos_profile.depth):
+                    taken = made.handle.take_message(made.msg_type, True)
+                    if taken is None:
+                        break
                     made.callback(taken[0])
         return self._handled
 

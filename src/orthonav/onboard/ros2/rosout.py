@@ -1,5 +1,6 @@
 """The log of the program on `/rosout`, where tools of ROS look for it."""
 
+import contextlib
 import logging
 
 from orthonav.onboard.ros2.graph import Graph
@@ -20,17 +21,15 @@ class Rosout(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Publish a record; one that cannot be published is dropped."""
         definitions = self._node.definitions
-        message = definitions.new(
-            KIND,
-            stamp=definitions.time(round(record.created * 1e9)),
-            level=min(record.levelno, logging.CRITICAL),
-            name=self._node.arguments.full_name.strip("/").replace("/", "."),
-            msg=record.getMessage(),
-            file=record.pathname,
-            function=record.funcName or "",
-            line=record.lineno,
-        )
-        try:
+        with contextlib.suppress(Exception):  # the code that logs must not fail
+            message = definitions.new(
+                KIND,
+                stamp=definitions.time(round(record.created * 1e9)),
+                level=min(record.levelno, logging.CRITICAL),
+                name=self._node.arguments.full_name.strip("/").replace("/", "."),
+                msg=record.getMessage(),
+                file=record.pathname,
+                function=record.funcName or "",
+                line=record.lineno,
+            )
             self._writer.write(message)
-        except OSError:
-            self.handleError(record)
