@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.geo.camera import Camera
+from orthonav.geo.ellipse import error_ellipse
 from orthonav.geo.ground import Ground
 from orthonav.grey import grey_levels
 
@@ -168,10 +169,10 @@ class View:
         )
 
     def __repr__(self) -> str:
-        told = self.telemetry
+        reported = self.telemetry
         return (
             f"View({self.camera.width_px} x {self.camera.height_px} px, heading "
-            f"{told.yaw_deg:.1f} deg, {told.agl_m:.1f} m above ground)"
+            f"{reported.yaw_deg:.1f} deg, {reported.agl_m:.1f} m above ground)"
         )
 
 
@@ -211,8 +212,8 @@ class Fix:
 
     @property
     def std_m(self) -> float:
-        """Standard deviation of the position along the worst direction, m."""
-        return math.sqrt(float(np.linalg.eigvalsh(self.cov_en_m2)[-1]))
+        """Standard deviation of the position along the worst direction, m; NaN where unknown."""
+        return error_ellipse(self.cov_en_m2)[0]
 
     def __repr__(self) -> str:
         return (

@@ -81,7 +81,7 @@ class BoundedLog:
 
 
 class Said:
-    """A console that keeps what it is told."""
+    """A console that stores its lines."""
 
     is_terminal = True
 
@@ -1220,8 +1220,8 @@ def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_st
     assert any(text.startswith("searching -> tracking: 46.") for text in texts)
     withheld = Counter(each["withheld"] for each in views)
     found = withheld.pop(None)
-    told = f"end: {len(views)} views, {found} with a position (none is sent)"
-    assert texts[-1].startswith(f"{told}, {withheld.total()} withheld: ")
+    begin = f"end: {len(views)} views, {found} with a position (none is sent)"
+    assert texts[-1].startswith(f"{begin}, {withheld.total()} withheld: ")
     done = run(*command, "--quiet")
     lines = done.err.splitlines()
     assert done.code == 0 and all("WARNING: " in line for line in lines)

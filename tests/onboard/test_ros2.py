@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.errors import CameraError
 from orthonav.geo.camera import attitude_of
+from orthonav.geo.ellipse import error_ellipse
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
@@ -43,7 +44,6 @@ from orthonav.publish.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
-    error_ellipse,
     floored,
 )
 from orthonav.publish.gate import Gate, GateRules

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthonav.geo.ellipse import error_ellipse
 from orthonav.publish.correlation import (
     AT_STD_M,
     AVERAGING_S,
@@ -15,7 +16,7 @@ from orthonav.publish.correlation import (
     for_filter,
     messages_averaged,
 )
-from orthonav.publish.estimate import NavigationEstimate, error_ellipse
+from orthonav.publish.estimate import NavigationEstimate
 from orthonav.records import MAP_STD_M
 
 S = 10**9

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthonav.geo.ellipse import error_ellipse
 from orthonav.publish.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
     ellipse_95,
-    error_ellipse,
     estimate_from_result,
 )
 from orthonav.publish.gpstime import gps_time

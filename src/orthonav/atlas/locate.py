@@ -118,7 +118,7 @@ class LocalTrack:
         speed = min(float(np.hypot(*velocity)) / 2 + AGILE_MPS, MAX_SPEED_MPS)
         if fix.evidence["vel_std_mps"] > AGILE_MPS:
             velocity, speed = np.zeros(2), MAX_SPEED_MPS
-        spread_m = SIGMAS * math.sqrt(float(np.linalg.eigvalsh(fix.cov_en_m2)[-1]))
+        spread_m = SIGMAS * fix.std_m
         reach_m = spread_m + speed * seconds
         if reach_m > MAX_REACH_M:
             return False

@@ -289,11 +289,4 @@ def map_background(opened: "MapFile") -> "Background":
     from orthonav.mapfile.layer import preview
     from orthonav.report import Background
 
-    grid = opened.manifest.sheets[0].grid
-    return Background(
-        preview(opened),
-        west_m=grid.west_m,
-        south_m=grid.north_m - grid.height_px * grid.gsd_m,
-        east_m=grid.west_m + grid.width_px * grid.gsd_m,
-        north_m=grid.north_m,
-    )
+    return Background(preview(opened), *opened.manifest.sheets[0].grid.extent_en_m)

@@ -65,12 +65,11 @@ def _view_deg(extent: float, model: str) -> float:
 
 def _map_text(path: Path, opened: MapFile) -> str:
     sheet = opened.manifest.sheets[0]
-    area_km2 = sum(each.area_km2 for each in opened.manifest.sheets)
     terrain = sheet.terrain
     ground = "level ground"
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
-    return f"{path}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}"
+    return f"{path}, {opened.manifest.area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}"
 
 
 def _telemetry_text(options: argparse.Namespace) -> str:

@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
     """Summary of a map as JSON values."""
-    area_km2 = sum(sheet.area_km2 for sheet in manifest.sheets)
+    area_km2 = manifest.area_km2
     size_mb = size_bytes / 1e6
     return {
         "map": str(path),

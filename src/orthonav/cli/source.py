@@ -121,8 +121,7 @@ def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -
     from orthonav.geo.swapped import swapped_hint
 
     grid, frame = localizer.grid, localizer.sheet.frame
-    low = np.array([grid.west_m, grid.north_m - grid.height_px * grid.gsd_m])
-    high = np.array([grid.west_m + grid.width_px * grid.gsd_m, grid.north_m])
+    low, high = np.reshape(grid.extent_en_m, (2, 2))
 
     def beyond_m(lat_deg: float, lon_deg: float) -> float:
         position = frame.en_from_latlon(lat_deg, lon_deg)

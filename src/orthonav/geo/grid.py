@@ -89,6 +89,16 @@ class TileGrid:
         """Rows of the raster that all tiles together cover."""
         return (self.rows - 1) * self.stride_px + self.tile_px
 
+    @property
+    def extent_en_m(self) -> tuple[float, float, float, float]:
+        """West, south, east and north of that raster, metres in the sheet."""
+        return (
+            self.west_m,
+            self.north_m - self.height_px * self.gsd_m,
+            self.west_m + self.width_px * self.gsd_m,
+            self.north_m,
+        )
+
     def tiles_rc(self, centres_en_m: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
         """Grid rows and columns (N, 2) of tile centres (N, 2): inverse of `centres_en_m`."""
         centres = np.asarray(centres_en_m, dtype=np.float64)

@@ -150,9 +150,8 @@ class Tracker:
         if registration is None or registration.confidence is None:
             raise MapFileError("a track needs a map with a registration layer and its confidence")
         self._registration, self._confidence = registration, registration.confidence
-        self._localizer, grid = localizer, localizer.grid
-        east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
-        return grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
+        self._localizer = localizer
+        return localizer.grid.extent_en_m
 
     def continue_on(self, localizer: Localizer) -> None:
         """Continue the track between two views on another map, which shows the aircraft too.

@@ -236,6 +236,11 @@ class Manifest:
     parts: dict[str, dict[str, Any]] = field(default_factory=dict)
     sha256: str = field(default="", init=False, compare=False)
 
+    @property
+    def area_km2(self) -> float:
+        """Area of all sheets."""
+        return sum(sheet.area_km2 for sheet in self.sheets)
+
     def to_json(self) -> str:
         """Canonical JSON, with the SHA-256 of everything else in `manifest_sha256`."""
         plain = {

@@ -142,32 +142,24 @@ class MapFile:
     arrays: Mapping[str, NDArray[Any]]
 
     def __repr__(self) -> str:
-        area_km2 = sum(sheet.area_km2 for sheet in self.manifest.sheets)
-        gsd_m = self.manifest.sheets[0].grid.gsd_m
+        area_km2, gsd_m = self.manifest.area_km2, self.manifest.sheets[0].grid.gsd_m
         return f"MapFile({self.path}, {area_km2:.2f} km2, {gsd_m:g} m per pixel)"
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
         """South, west, north and east of the first sheet, degrees."""
-        corners = self._corners_deg()
-        (south, west), (north, east) = corners.min(axis=0), corners.max(axis=0)
-        return float(south), float(west), float(north), float(east)
+        sheet = self.manifest.sheets[0]
+        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        corners_en_m = [(x, y) for x in (west_m, east_m) for y in (south_m, north_m)]
+        lat, lon = sheet.frame.latlon_from_en(corners_en_m)
+        return float(lat.min()), float(lon.min()), float(lat.max()), float(lon.max())
 
     def contains(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether a position is on the first sheet."""
         sheet = self.manifest.sheets[0]
-        east, north = sheet.frame.en_from_latlon(lat_deg, lon_deg).tolist()
-        x_px = (east - sheet.grid.west_m) / sheet.grid.gsd_m
-        y_px = (sheet.grid.north_m - north) / sheet.grid.gsd_m
-        return bool(0 <= x_px <= sheet.grid.width_px and 0 <= y_px <= sheet.grid.height_px)
-
-    def _corners_deg(self) -> NDArray[np.float64]:
-        """Latitudes and longitudes (4, 2) of the corners of the first sheet."""
-        sheet = self.manifest.sheets[0]
-        grid = sheet.grid
-        east_m = grid.west_m + grid.gsd_m * grid.width_px * np.array([0.0, 1.0, 1.0, 0.0])
-        north_m = grid.north_m - grid.gsd_m * grid.height_px * np.array([0.0, 0.0, 1.0, 1.0])
-        return np.stack(sheet.frame.latlon_from_en(np.stack([east_m, north_m], axis=1)), axis=1)
+        x_m, y_m = sheet.frame.en_from_latlon(lat_deg, lon_deg).tolist()
+        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        return bool(west_m <= x_m <= east_m and south_m <= y_m <= north_m)
 
     def array(self, name: str, dtype: type[np.generic], ndim: int) -> NDArray[Any]:
         """The part `name`; raises `MapFileError` if it is missing or has another type or shape."""

@@ -41,7 +41,6 @@ from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.start_check import StartCheck
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
-from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect, status_texts
 from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources.attitude import LOOKS_DOWN, Angles
@@ -206,7 +205,7 @@ class Runner:
         image = self._newest.take(timeout_s)
         result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
-        if now_ns >= self._tick_ns or self._newest.is_over:
+        if now_ns >= self._tick_ns or (image is None and self._newest.is_over):
             self._tick_ns = now_ns + TICK_NS
             self._tick(now_ns)
         return result
@@ -419,7 +418,7 @@ class Runner:
         fix, arrival = self._confident_fix(result), image.arrival
         if self._latency is None or arrival is None or fix is None:
             return None
-        std_m = error_ellipse(fix.cov_en_m2)[0]
+        std_m = fix.std_m
         place = fix.lat_deg, fix.lon_deg
         return self._latency.located(arrival, image.exposed_ns, place, std_m).reason
 
@@ -443,7 +442,7 @@ class Runner:
         if not self.options.heading_known:
             self._mismatch = 0.0, self._mismatch[1]
         utc_ns = exposed_ns + self._clocks.utc_ns() - self._clocks.mono_ns()
-        std_m = error_ellipse(fix.cov_en_m2)[0]
+        std_m = fix.std_m
         self._last = states.SavedState(
             fix.lat_deg, fix.lon_deg, std_m, utc_ns, exposed_ns, self._boot_id
         )

@@ -17,7 +17,6 @@ from orthonav.onboard.console import Console
 from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, HealthLimits, Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.telemetry import Clocks
-from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.local import Autopilot
 from orthonav.records import Fix, NoFix, ViewResult
 
@@ -281,8 +280,7 @@ def _meaning(reason: str, plain: Mapping[str, Any]) -> str:
 def _place_text(outcome: Fix | NoFix) -> str:
     if isinstance(outcome, NoFix):
         return f"{outcome.reason}: {outcome.detail}"
-    std_m = error_ellipse(outcome.cov_en_m2)[0]
-    return f"{outcome.lat_deg:.6f}, {outcome.lon_deg:.6f} +- {std_m:.1f} m"
+    return f"{outcome.lat_deg:.6f}, {outcome.lon_deg:.6f} +- {outcome.std_m:.1f} m"
 
 
 def _counted(counts: Counter[str], sends: bool) -> str:

@@ -10,7 +10,8 @@ the variance of the fix (docs/decisions/correlated-errors.md).
 import math
 from dataclasses import dataclass, field, replace
 
-from orthonav.publish.estimate import NavigationEstimate, error_ellipse, floored
+from orthonav.geo.ellipse import error_ellipse
+from orthonav.publish.estimate import NavigationEstimate, floored
 from orthonav.records import MAP_STD_M
 
 AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4

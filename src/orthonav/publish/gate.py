@@ -13,12 +13,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.geo.ellipse import error_ellipse
 from orthonav.geo.frames import LocalFrame
 from orthonav.publish.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
-    error_ellipse,
 )
 from orthonav.records import CONFIDENT
 

@@ -14,11 +14,11 @@ from typing import Any
 
 from orthonav.errors import MissingExtraError
 from orthonav.extras import needed
+from orthonav.geo.ellipse import error_ellipse
 from orthonav.publish.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
-    error_ellipse,
 )
 from orthonav.publish.gpstime import gps_time
 from orthonav.records import CONFIDENT

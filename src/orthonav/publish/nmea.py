@@ -12,7 +12,8 @@ import math
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 
-from orthonav.publish.estimate import EstimateError, NavigationEstimate, error_ellipse
+from orthonav.geo.ellipse import error_ellipse
+from orthonav.publish.estimate import EstimateError, NavigationEstimate
 from orthonav.records import CONFIDENT
 
 MPS_PER_KNOT = 1852 / 3600

@@ -23,7 +23,7 @@ from orthonav.sources.track import (
 
 Reader = Any
 LEAST_TILT_STD_DEG, MOST_TILT_STD_DEG = 1.5, 10.0
-"""Between them an IMU is believed about its orientation; MAVROS states 57 deg by default."""
+"""An orientation of an IMU counts as stated between them; MAVROS states 57 deg by default."""
 
 
 def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> RecordedTrack:

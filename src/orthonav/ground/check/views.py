@@ -179,11 +179,9 @@ def require_overlap(path: Path, sheet: SheetInfo) -> None:
     """Raise `AreaError` where an orthophoto does not overlap a sheet."""
     lat_lon = Mosaic.open([path]).outline_latlon_deg
     points = sheet.frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
-    grid = sheet.grid
-    east_m = grid.west_m + grid.width_px * grid.gsd_m
-    south_m = grid.north_m - grid.height_px * grid.gsd_m
+    west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
     (west, south), (east, north) = points.min(axis=0), points.max(axis=0)
-    if east < grid.west_m or west > east_m or north < south_m or south > grid.north_m:
+    if east < west_m or west > east_m or north < south_m or south > north_m:
         raise AreaError(f"the orthophoto of the other date does not overlap the map: {path}")
 
 

@@ -27,7 +27,6 @@ from orthonav.onboard.gnss.records import (
     GnssStatus,
     MapPosition,
 )
-from orthonav.publish.estimate import error_ellipse
 from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
 
 log = logging.getLogger(__name__)
@@ -263,14 +262,14 @@ class GnssWatch:
             self.log(time_ns, gnss_message(sample, time_ns))
 
     def _is_confident(self, fix: Fix, state: str | None) -> bool:
-        known = math.isfinite(error_ellipse(fix.cov_en_m2)[0] + fix.heading_deg)
+        known = math.isfinite(fix.std_m + fix.heading_deg)
         return known and fix.confidence >= self._least and state in (None, "tracking")
 
     def _position(self, fix: Fix, now_ns: int, *, as_stated: bool) -> MapPosition:
         return MapPosition(
             now_ns,
             np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)),
-            error_ellipse(fix.cov_en_m2)[0],
+            fix.std_m,
             _velocity(fix),
             fix.heading_deg,
             fix.agl_m if math.isfinite(fix.agl_m) else 0.0,

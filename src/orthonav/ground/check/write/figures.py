@@ -266,9 +266,7 @@ def map_image(opened: MapFile, box: Box) -> Background:
     while layer and level + 1 < layer.levels and longest_px >= 2 ** (level + 1) * MAX_SIDE_PX:
         level += 1
     if layer is None or longest_px > 2 ** (level + 2) * MAX_SIDE_PX:  # too few levels
-        south_m = grid.north_m - grid.height_px * grid.gsd_m
-        east_m = grid.west_m + grid.width_px * grid.gsd_m
-        return Background(preview(opened), grid.west_m, south_m, east_m, grid.north_m)
+        return Background(preview(opened), *grid.extent_en_m)
     gsd_m = grid.gsd_m * 2**level
     rows, cols = layer.shape(level)
     left = int(np.clip(math.floor((west - grid.west_m) / gsd_m), 0, cols - 1))
