@@ -26,8 +26,8 @@ from benchmarks.inputs import DATA, FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Wor
 from benchmarks.placing import BOTH, Task
 from benchmarks.record import Section, Table, git, number, provenance, save
 from benchmarks.verdicts import Verdict, from_placed, percent
-from orthonav.records import CONFIDENT
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
+from orthonav.core.records import CONFIDENT
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 ROOT = Path(__file__).resolve().parents[1]
 HERE, THERE = "here", "other"

@@ -25,24 +25,24 @@ import cv2
 import numpy as np
 from rasterio.warp import transform as transform_coordinates
 
-import orthonav.simulate.landscape as landscape
+import orthonav.ground.simulate.landscape as landscape
 from benchmarks.child import peak_memory_mb
 from benchmarks.corridor import BAND_M, GSD_M, LAMBERT, route_of
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav import __version__
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.coverage import box_deg
-from orthonav.atlas.cut import cut_map
-from orthonav.atlas.item import Sheet
-from orthonav.atlas.recipe import AtlasRecipe
-from orthonav.geo.area import Area, Extent
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.mapfile import MapFile, open_map, write_map
-from orthonav.mapfile.layer import GreyLayer
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.layer import CHUNK_PX, compressed_block
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile import MapFile, open_map, write_map
+from orthonav.core.mapfile.layer import GreyLayer
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.coverage import box_deg
+from orthonav.ground.atlas.cut import cut_map
+from orthonav.ground.atlas.item import Sheet
+from orthonav.ground.atlas.recipe import AtlasRecipe
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.layer import CHUNK_PX, compressed_block
+from orthonav.ground.planning.area import Area, Extent
 
 SHEET_KM = 5.0
 WIDER = 1.03

@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.atlas.build import build_atlas
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import SerialRunner
-from orthonav.atlas.locate import AtlasLocator
-from orthonav.atlas.sheet_registration import SheetRegistrar
-from orthonav.atlas.sheet_tasks import AtlasRequest
-from orthonav.atlas.tile_search import TileSearch
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import distances_m
-from orthonav.records import CONFIDENT, Fix, Telemetry, View
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import distances_m
+from orthonav.core.records import CONFIDENT, Fix, Telemetry, View
+from orthonav.ground.atlas.build import build_atlas
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.cluster import SerialRunner
+from orthonav.ground.atlas.locate import AtlasLocator
+from orthonav.ground.atlas.sheet_registration import SheetRegistrar
+from orthonav.ground.atlas.sheet_tasks import AtlasRequest
+from orthonav.ground.atlas.tile_search import TileSearch
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
 PAST, PRESENT = DEFAULT_DATES[2], DEFAULT_DATES[0]

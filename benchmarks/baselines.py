@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.localizer.rectify import RectifiedView, downsampled
-from orthonav.records import Fix, View
-from orthonav.represent.canny import Canny
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.rectify import RectifiedView, downsampled
+from orthonav.core.records import Fix, View
+from orthonav.core.tiles.canny import Canny
+from orthonav.ground.imagery.mosaic import Mosaic
 
 JPEG_QUALITY = 90
 LOWE = 0.75

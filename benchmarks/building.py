@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.inputs import LANDSCAPE_SEED, NAIP_ABSENT, NAIP_PAST, PAST, Workplace, naip
 from benchmarks.machine import multiplying_gflops
 from benchmarks.record import Section, Table, number
-from orthonav.embed.whitened import MAX_LEARNT_TILES
+from orthonav.core.tiles.whitened import MAX_LEARNT_TILES
 
 STAGES = ("start", "read", "represent", "cells", "learn", "embed", "calibrate", "register", "write")
 STAGE_NOTES = (

@@ -2,9 +2,9 @@
 
 `python -m benchmarks.changes --work DIR [--views 60] [--width 256] [--only SCENE ..] [--out FILE]`
 builds a map of an early date, simulates views of a later one at random places, localizes them
-without a prior, and compares the cells that `orthonav.changes` scores with a reference made of the
-orthophotos of all dates. Real imagery is looked for in `../shared/data` beside the checkout or in
-the folder that ORTHONAV_DATA names. DIR keeps maps and flights.
+without a prior, and compares the cells that `orthonav.ground.changes` scores with a reference made
+of the orthophotos of all dates. Real imagery is looked for in `../shared/data` beside the checkout
+or in the folder that ORTHONAV_DATA names. DIR keeps maps and flights.
 
 The reference takes colour only (a* and b* of CIELAB, means of cells), which views do not have: they
 are grey. A cell changed where no date up to the map's looks like any date from the views' on
@@ -30,18 +30,18 @@ from scipy.stats import rankdata
 from benchmarks.inputs import DATA, map_of
 from benchmarks.record import Table, provenance
 from benchmarks.verdicts import percent
-from orthonav.changes.ground import changed_ground
-from orthonav.changes.record import ChangedGround, ChangeGrid
-from orthonav.changes.views import cell_side_m, views_beside_map
-from orthonav.confidence.accept import Acceptance
-from orthonav.files import write_text
-from orthonav.flight import open_flight
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.mapfile.manifest import SheetInfo
+from orthonav.core.files import write_text
+from orthonav.core.flight import open_flight
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.accept import Acceptance
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.manifest import SheetInfo
+from orthonav.ground.changes.ground import changed_ground
+from orthonav.ground.changes.record import ChangedGround, ChangeGrid
+from orthonav.ground.changes.views import cell_side_m, views_beside_map
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 CHANGED = 3.0

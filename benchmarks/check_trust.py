@@ -28,18 +28,18 @@ from scipy.optimize import minimize
 from benchmarks.inputs import file_of, map_of
 from benchmarks.record import Table, provenance
 from benchmarks.trust_views import Pair, pairs
-from orthonav.files import write_text
-from orthonav.flight import open_flight, read_truth
+from orthonav.core.files import write_text
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, Fix
 from orthonav.ground.check.places import CellGrid
 from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
 from orthonav.ground.check.verdict import GO_LOW, NARROW_PX
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.records import CONFIDENT, Fix
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 WIDTHS_PX = (256, 160, 112)

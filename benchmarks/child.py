@@ -48,10 +48,10 @@ def build(ortho: Path, out: Path) -> None:
     start = time.perf_counter()
     from unittest.mock import patch
 
-    from orthonav.imagery.mosaic import Mosaic, SheetRaster
-    from orthonav.mapfile import open_map
-    from orthonav.prepare import BuildRequest, build_map
-    from orthonav.represent.gradients import OrientedGradients
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.tiles.gradients import OrientedGradients
+    from orthonav.ground.build import BuildRequest, build_map
+    from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 
     read, represent, opened = _Clock(), _Clock(), _Clock()
     marks: dict[str, float] = {}

@@ -23,9 +23,9 @@ from benchmarks.inputs import (
 )
 from benchmarks.machine import timed
 from benchmarks.record import Section, Table, number
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.simulate.flight import Errors
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.ground.simulate.flight import Errors
 
 TURNS_DEG = (-6.0, 0.0, 6.0)
 CONTROL_VIEWS = 10

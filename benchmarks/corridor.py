@@ -26,12 +26,12 @@ import rasterio.shutil
 from rasterio.transform import Affine
 from rasterio.warp import transform as transform_coordinates
 
-import orthonav.simulate.landscape as landscape
+import orthonav.ground.simulate.landscape as landscape
 from benchmarks.child import peak_memory_mb
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.files import replacing
-from orthonav.geo.route import Route
+from orthonav.core.files import replacing
+from orthonav.ground.planning.route import Route
 
 BAND_M, TILE_M, COURSE_DEG = 5000.0, 1000, 60.0
 """The course is neither a row nor a column of blocks: the corridor fills a third of its box."""
@@ -216,8 +216,8 @@ def _killed_and_resumed(folder: Path, out: Path, km: float) -> tuple[float, dict
 
 def _child(folder: Path, out: Path, workers: int) -> int:
     """Build, and print how many blocks there are, then how it went."""
-    from orthonav.prepare import BuildRequest, build_map
-    from orthonav.prepare.sheet import SheetReader
+    from orthonav.ground.build import BuildRequest, build_map
+    from orthonav.ground.build.sheet import SheetReader
 
     begun = time.perf_counter()
     marks: dict[str, float] = {}

@@ -24,20 +24,20 @@ from benchmarks.fakes import (
     Time,
     wandering,
 )
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.records import Fix
+from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import LiveCamera, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.estimate import Clock
+from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
-from orthonav.publish.estimate import Clock
-from orthonav.publish.gate import Gate, GateRules
-from orthonav.records import Fix
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 STATED_S = 0.12

@@ -46,12 +46,12 @@ from benchmarks.fault_scenarios import (
 )
 from benchmarks.inputs import PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.simulate.render import ViewEffects, render_view
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.simulate.render import ViewEffects, render_view
 
 SIDE_M, MAP_M = 1600, 1200
 """Sides of the generated area, and of the map in its middle."""

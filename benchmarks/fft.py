@@ -1,6 +1,6 @@
 """`python -m benchmarks.fft`: the transforms of the search by our kernel, scipy, numpy and OpenCV.
 
-One pose of `orthonav.register.search`: three channels of a view transformed along both axes,
+One pose of `orthonav.core.register.search`: three channels of a view transformed along both axes,
 multiplied with the spectra of a window, summed, and transformed back. The kernel also cuts the view
 under its pose and compares the scores with the best so far, so it does more. Processor time, so
 that other work on the machine counts little. Decides what the search uses.
@@ -19,8 +19,8 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.register.kernel import KERNEL
-from orthonav.register.search import SearchWindow
+from orthonav.core.register.kernel import KERNEL
+from orthonav.core.register.search import SearchWindow
 
 SIZES = ((240, 100), (432, 160), (1000, 220), (2000, 220))
 """Sides of windows and of the views laid on them, px: near a prior, up to whole maps."""

@@ -5,11 +5,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthonav.files import replacing
-from orthonav.flight import open_flight, read_truth
-from orthonav.flight.folder import read_image
-from orthonav.geo.camera import Camera
-from orthonav.records import View
+from orthonav.core.files import replacing
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight.folder import read_image
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import View
 
 
 @dataclass(frozen=True, eq=False)

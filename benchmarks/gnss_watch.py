@@ -18,8 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.flight.gnss import GnssSample
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.simulate.motion import gauss_markov
+from orthonav.ground.simulate.receiver import (
+    LATENCY_S,
+    RATE_HZ,
+    GnssTrack,
+    receiver_of,
+    samples_of,
+    solutions,
+)
 from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
@@ -27,15 +36,6 @@ from orthonav.onboard.gnss.records import (
     GnssState,
     GnssStatus,
     MapPosition,
-)
-from orthonav.simulate.motion import gauss_markov
-from orthonav.simulate.receiver import (
-    LATENCY_S,
-    RATE_HZ,
-    GnssTrack,
-    receiver_of,
-    samples_of,
-    solutions,
 )
 
 FRAME = LocalFrame(48.0, 2.0)

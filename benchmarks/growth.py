@@ -15,9 +15,9 @@ from benchmarks.looped_flight import SMALL_CAMERA, LoopedFlight, rendered
 from benchmarks.placing import BOTH, Task, placed
 from benchmarks.record import Section, Table, number
 from benchmarks.verdicts import from_placed, percent
-from orthonav.geo.camera import Camera
-from orthonav.mapfile import open_map
-from orthonav.simulate.flight import Errors
+from orthonav.core.geo.camera import Camera
+from orthonav.core.mapfile import open_map
+from orthonav.ground.simulate.flight import Errors
 
 CAMERA_SIDE_M, CAMERA_HZ, CAMERA_VIEWS = 2000, 2.0, 40
 CAMERAS = SMALL_CAMERA, Camera(320, 240, 250.0, 250.0, 161.5, 118.5)

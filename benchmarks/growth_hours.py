@@ -19,8 +19,8 @@ from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
 from benchmarks.looped_flight import LoopedFlight, played, rendered, views_of
 from benchmarks.record import Section, Table, number
 from benchmarks.soak import WARM_UP, slope
-from orthonav.geo.camera import Camera
-from orthonav.mapfile import open_map
+from orthonav.core.geo.camera import Camera
+from orthonav.core.mapfile import open_map
 
 SIDE_M, GSD_M, RATE_HZ = 2000, 2.0, 0.25
 CAMERA = Camera(160, 120, 125.0, 125.0, 80.5, 59.5)
@@ -98,9 +98,9 @@ def fly(map_path: Path, flight: Path, smooth: bool) -> dict[str, Any]:
     import cv2
 
     from benchmarks.child import memory_mb
-    from orthonav.flight import open_flight
-    from orthonav.localizer import Localizer
-    from orthonav.localizer.tracker import Tracker
+    from orthonav.core.flight import open_flight
+    from orthonav.core.localize import Localizer
+    from orthonav.core.track.tracker import Tracker
     from orthonav.onboard.run import localize_flight
 
     cv2.setNumThreads(1)

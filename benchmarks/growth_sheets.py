@@ -18,16 +18,16 @@ from benchmarks.growth import Curve, plot
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number
 from benchmarks.tracking import TURNS_EN_M
-from orthonav.atlas.build import build_atlas
-from orthonav.atlas.cluster import SerialRunner
-from orthonav.atlas.sheet_tasks import AtlasRequest
-from orthonav.geo.area import Extent
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame, distances_m
-from orthonav.geo.route import Route
-from orthonav.geo.world import WorldSheets
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.ground.atlas.build import build_atlas
+from orthonav.ground.atlas.cluster import SerialRunner
+from orthonav.ground.atlas.sheet_tasks import AtlasRequest
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Extent
+from orthonav.ground.planning.route import Route
+from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 SHEET_KM, GSD_M = 1.5, 8.0
 SIDES = 1, 2, 4, 8
@@ -144,11 +144,11 @@ def search(folder: Path, flight: Path) -> dict[str, Any]:
 
     from benchmarks.child import memory_mb
     from benchmarks.flights import read_views
-    from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.find import PlaceFinder
-    from orthonav.atlas.index_manifest import read_manifest
-    from orthonav.atlas.sheet_registration import SheetRegistrar
-    from orthonav.atlas.tile_search import TileSearch
+    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.find import PlaceFinder
+    from orthonav.ground.atlas.index_manifest import read_manifest
+    from orthonav.ground.atlas.sheet_registration import SheetRegistrar
+    from orthonav.ground.atlas.tile_search import TileSearch
 
     cv2.setNumThreads(1)
     start = time.process_time()

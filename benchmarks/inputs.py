@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import orthonav.simulate.landscape as landscape
+import orthonav.ground.simulate.landscape as landscape
 from benchmarks.flights import Flight, read_views
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 LANDSCAPE_SEED = 1
 FLIGHT_SEED = 7

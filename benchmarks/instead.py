@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from benchmarks.flights import FlownView
     from benchmarks.inputs import Workplace
     from benchmarks.record import Section, Table
-    from orthonav.geo.frames import LocalFrame
+    from orthonav.core.geo.frames import LocalFrame
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 TRACK, SIFT, ORB, ENCODER = "track", "sift", "orb", "encoder"
@@ -138,9 +138,9 @@ def run(task: Task) -> dict[str, Any]:
 
     from benchmarks.child import peak_memory_mb
     from benchmarks.flights import FlownView
-    from orthonav.flight import open_flight, read_truth
-    from orthonav.mapfile import open_map
-    from orthonav.records import View
+    from orthonav.core.flight import open_flight, read_truth
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.records import View
 
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
@@ -188,10 +188,10 @@ def _method(task: Task, frame: "LocalFrame") -> tuple[Placer, int]:
 
 
 def _track(task: Task, frame: "LocalFrame") -> Placer:
-    from orthonav.localizer import Localizer
-    from orthonav.localizer.tracker import Tracker
-    from orthonav.mapfile import open_map
-    from orthonav.records import Fix
+    from orthonav.core.localize import Localizer
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.records import Fix
+    from orthonav.core.track.tracker import Tracker
 
     tracker = Tracker(Localizer(open_map(Path(task.map_path))))
 
@@ -210,10 +210,10 @@ def _encoder(task: Task) -> tuple[Placer, int]:
     import numpy as np
     import torch
 
-    from orthonav.localizer.rectify import downsampled, rectify
-    from orthonav.mapfile import open_map
-    from orthonav.neural.autoencoder import AutoEncoder
-    from orthonav.represent.canny import Canny
+    from orthonav.core.localize.rectify import downsampled, rectify
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.tiles.canny import Canny
+    from orthonav.research.autoencoder import AutoEncoder
 
     torch.set_num_threads(1)
     torch.manual_seed(0)

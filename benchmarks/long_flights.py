@@ -31,19 +31,19 @@ from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number, provenance, save, sources_digest
 from benchmarks.verdicts import percent
-from orthonav.files import replacing
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.camera import Camera
-from orthonav.geo.route import Route
+from orthonav.core.files import replacing
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, Fix, ViewResult
+from orthonav.core.track.tracker import Tracker
 from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate.clouds import Clouds
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.motion import Wind
 from orthonav.onboard.run import localize_flight
-from orthonav.records import CONFIDENT, Fix, ViewResult
-from orthonav.simulate.clouds import Clouds
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.motion import Wind
 
 CAMERA = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)
 AGL_M, GSD_M, SPACING_M, SPEED_MPS, TURN_RADIUS_M = 2000.0, 2.5, 100.0, 25.0, 400.0

@@ -11,16 +11,16 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-import orthonav.simulate as simulate
+import orthonav.ground.simulate as simulate
 from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import FLIGHT_SEED, Workplace
-from orthonav.flight import read_truth
-from orthonav.geo import camera, lens
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
-from orthonav.simulate import render
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.core.flight import read_truth
+from orthonav.core.geo import camera, lens
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate import render
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 CAMERA = Camera(
     1280, 960, 1000.0, 1000.0, 646.0, 474.0, distortion=(-0.12, 0.05, 0.0005, -0.0003, 0.0)

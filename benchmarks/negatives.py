@@ -9,8 +9,8 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
-from orthonav.flight import open_flight
-from orthonav.flight.folder import read_image
+from orthonav.core.flight import open_flight
+from orthonav.core.flight.folder import read_image
 
 Grey = NDArray[np.uint8]
 SHARES = {

@@ -13,7 +13,7 @@ from benchmarks.instead import beside
 from benchmarks.looped_flight import CAMERA, LoopedFlight, played, rendered, rest_of, views_of
 from benchmarks.pair import Arrivals, Cores, FakeAutopilot, Fly, Lines, free_port, on_core
 from benchmarks.record import Section, Table, number
-from orthonav.mapfile import open_map
+from orthonav.core.mapfile import open_map
 
 SIDE_M, CAMERA_HZ = 2000, 10
 RATES_HZ = (5, 10)

@@ -2,9 +2,10 @@
 
 `python -m benchmarks.over_terrain [--views 30] [--only GROUP ..] [--areas SEED ..] [--work DIR]`
 drapes imagery of another date over generated hills, renders true perspective views of it
-(`orthonav.simulate.perspective`), and prints what of them is placed without and with the terrain,
-by wrong terrains, and far off nadir. Imagery is generated; with optional real imagery beside the
-checkout its rows use that. `--on`, `--off-nadir` and `--slopes` choose parts of the rows.
+(`orthonav.ground.simulate.perspective`), and prints what of them is placed without and with the
+terrain, by wrong terrains, and far off nadir. Imagery is generated; with optional real imagery
+beside the checkout its rows use that. `--on`, `--off-nadir` and `--slopes` choose parts of the
+rows.
 `--mirrored` shows what views of no place of the map are taken for.
 """
 
@@ -28,16 +29,16 @@ from rasterio.windows import Window
 
 from benchmarks.inputs import DATA
 from orthonav.cli.heights import map_heights
-from orthonav.geo.camera import Camera, enu_from_camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.localizer.relief import Relief
-from orthonav.mapfile import MapFile, open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
-from orthonav.simulate.perspective import Raster, random_relief, seen_view
+from orthonav.core.geo.camera import Camera, enu_from_camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.relief import Relief
+from orthonav.core.mapfile import MapFile, open_map
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
 
 GROUPS = ("slopes", "wrong", "oblique")
 HEADER = (

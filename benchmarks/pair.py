@@ -19,8 +19,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.frames import LocalFrame
 
 POSITION = "GLOBAL_POSITION_SENSOR"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")

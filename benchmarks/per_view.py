@@ -11,11 +11,11 @@ from benchmarks.flights import FlownView
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, USUAL_ERRORS, Workplace
 from benchmarks.machine import timed
 from benchmarks.record import Section, Table, timing_cells
-from orthonav.flight.folder import read_image
-from orthonav.localizer import Localizer
-from orthonav.localizer.rectify import downsampled
-from orthonav.localizer.tiles import UNKNOWN_HEADING_STEP_DEG
-from orthonav.mapfile import open_map
+from orthonav.core.flight.folder import read_image
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.rectify import downsampled
+from orthonav.core.localize.tiles import UNKNOWN_HEADING_STEP_DEG
+from orthonav.core.mapfile import open_map
 
 REPEATS = 3
 Made = TypeVar("Made")

@@ -16,14 +16,14 @@ import numpy as np
 
 from benchmarks.over_terrain import Array, Bench, Row, Seen, home_m, layer_of
 from orthonav.cli.heights import map_heights
-from orthonav.errors import FlightError
-from orthonav.flight.pixel import locate_pixel
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.localizer.relief import Relief
-from orthonav.publish.estimate import ELLIPSE_95
-from orthonav.records import CONFIDENT, Fix
-from orthonav.simulate.perspective import Raster, met, rays_enu
+from orthonav.core.errors import FlightError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.relief import Relief
+from orthonav.core.records import CONFIDENT, Fix
+from orthonav.ground.recordings.pixel import locate_pixel
+from orthonav.ground.simulate.perspective import Raster, met, rays_enu
+from orthonav.onboard.messages.estimate import ELLIPSE_95
 
 TILT_STD_DEG = 1.0
 AT = ((0.5, 0.5), (0.15, 0.8), (0.85, 0.8), (0.3, 0.4), (0.7, 0.4))

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from orthonav.geo.frames import LocalFrame
-    from orthonav.records import View
+    from orthonav.core.geo.frames import LocalFrame
+    from orthonav.core.records import View
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 BOTH, TILES, REGISTRATION = OWN = "both", "tiles", "registration"
@@ -73,10 +73,12 @@ def run(task: Task) -> dict[str, Any]:
 
     from benchmarks.child import memory_mb
     from benchmarks.flights import read_views
-    from orthonav.mapfile import open_map
+    from orthonav.core.mapfile import open_map
 
     if task.method in OWN:
-        importlib.import_module("orthonav.localizer")  # opening a map is timed, importing is not
+        importlib.import_module(
+            "orthonav.core.localize"
+        )  # opening a map is timed, importing is not
 
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
@@ -116,7 +118,7 @@ def _timed(place: Placer, view: "View") -> tuple[Any, float]:
 
 def row_of(found: Any, frame: "LocalFrame", truth_latlon_deg: tuple[float, float]) -> list[float]:
     """East and north error, confidence, radius, three numbers of the covariance."""
-    from orthonav.records import Fix, NoFix
+    from orthonav.core.records import Fix, NoFix
 
     nothing = [math.nan] * 7
     truth = frame.en_from_latlon(*truth_latlon_deg)
@@ -135,10 +137,10 @@ def _method(task: Task) -> Placer:
 
 
 def _orthonav(task: Task) -> Placer:
-    from orthonav.localizer import Localizer
-    from orthonav.localizer.plan import DEFAULT_PLAN
-    from orthonav.localizer.tracker import Tracker
-    from orthonav.mapfile import open_map
+    from orthonav.core.localize import Localizer
+    from orthonav.core.localize.plan import DEFAULT_PLAN
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.track.tracker import Tracker
 
     localizer = Localizer(
         open_map(Path(task.map_path)),

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines import canny_edges
-from orthonav.geo.grid import TileGrid
-from orthonav.localizer.rectify import RectifiedView, downsampled, rectify
-from orthonav.mapfile import open_map
-from orthonav.records import View
-from orthonav.register.search import bank
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import View
+from orthonav.core.register.search import bank
 
 Array = NDArray[np.float32]
 Place = NDArray[np.float64] | None

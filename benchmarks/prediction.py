@@ -30,17 +30,17 @@ from numpy.typing import NDArray
 
 from benchmarks.inputs import DATA, file_of
 from benchmarks.record import Table, provenance
-from orthonav.flight import open_flight, read_truth
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, Fix, Prior
+from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.check.outcome import Cells
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.landscape import DEFAULT_DATES
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import CONFIDENT, Fix, Prior
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
 WIDTHS_PX = (112, 160, 256)
@@ -364,7 +364,7 @@ def _bins_table(found: Sequence[Outcome]) -> Table:
 
 def _picture(found: Sequence[Outcome], path: Path) -> None:
     """Predicted against measured, a point per cell."""
-    from orthonav.report import draw_axes
+    from orthonav.ground.report import draw_axes
 
     def draw(axes: Any) -> None:
         for group in GROUPS:

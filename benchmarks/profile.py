@@ -16,10 +16,10 @@ from benchmarks.flights import Flight
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace
 from benchmarks.machine import reading_gb_per_s, seconds
 from benchmarks.record import Section, Table, number
-from orthonav.localizer import Localizer, candidates, plan, registration
-from orthonav.mapfile import open_map
-from orthonav.register import refine, registrar
-from orthonav.register.search import search
+from orthonav.core.localize import Localizer, candidates, plan, registration
+from orthonav.core.mapfile import open_map
+from orthonav.core.register import refine, registrar
+from orthonav.core.register.search import search
 
 FORWARD, BACKWARD = 3, 1
 """FFTs of a pose: one per channel of evidence, and one of the sum of products."""

@@ -24,13 +24,13 @@ from benchmarks.negatives import SHARES, Sources, negatives
 from benchmarks.placing import row_of
 from benchmarks.record import Table, number, provenance
 from benchmarks.verdicts import FAR_M, Verdict, percent
-from orthonav.flight import open_flight, read_truth
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, Fix, Telemetry, View
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import SingleViews, localize_flight, locate_view
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import CONFIDENT, Fix, Telemetry, View
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 NAIP_MAP = "naip_nd/20090818.tif"
 NAIP_VIEWS = ("naip_nd/20120731.tif", "naip_nd/20150926.tif", "naip_nd/20180716.tif")

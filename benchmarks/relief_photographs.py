@@ -25,12 +25,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.inputs import DATA
 from orthonav.cli.heights import map_heights
-from orthonav.geo.camera import Camera, attitude_of
-from orthonav.localizer import Localizer
-from orthonav.mapfile import MapFile, open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
-from orthonav.simulate.perspective import Raster, met
+from orthonav.core.geo.camera import Camera, attitude_of
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import MapFile, open_map
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.simulate.perspective import Raster, met
 
 FOLDER = DATA / "relief_ngi"
 STRIPS = (("05_0182", "05_0184"), ("06_0251", "06_0253"))

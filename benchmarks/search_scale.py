@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, Workplace
 from benchmarks.machine import reading_gb_per_s, seconds
 from benchmarks.record import Section, Table, number
-from orthonav.embed.cells import CellLayout
-from orthonav.embed.whitened import CellSheet, WhitenedEmbedder
-from orthonav.geo.grid import TileGrid
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.search.exact import CACHE_BYTES, ExactIndex
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.exact import CACHE_BYTES, ExactIndex
+from orthonav.core.tiles.whitened import CellSheet, WhitenedEmbedder
+from orthonav.ground.imagery.mosaic import Mosaic
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 DENSE_STRIDE_PX = 4

@@ -24,10 +24,10 @@ from benchmarks.placing import (
 from benchmarks.posed import LEVELS_MI, poses
 from benchmarks.record import Section, Table, number
 from benchmarks.verdicts import Verdict, from_placed, percent
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import CONFIDENT
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT
+from orthonav.ground.imagery.mosaic import Mosaic
 
 SIDE_M = 2000
 RADII_M = (15.0, 35.0)

@@ -26,7 +26,7 @@ from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
 from benchmarks.looped_flight import SMALL_CAMERA, LoopedFlight, played, rendered
 from benchmarks.pair import Arrivals, Cores, FakeAutopilot, Fly, Lines, Sample, free_port, on_core
 from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.mapfile import open_map
+from orthonav.core.mapfile import open_map
 
 SIDE_M, RATE_HZ, LEAD_S = 2000, 5, 6.0
 LOG_MB = 40

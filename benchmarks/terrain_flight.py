@@ -19,20 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthonav.cli.heights import map_heights
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.camera import Camera
-from orthonav.geo.route import Route
-from orthonav.imagery.terrain import Dem, open_dem
-from orthonav.localizer import Localizer
-from orthonav.localizer.relief import Relief
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import MapFile, open_map
-from orthonav.mapfile.terrain import TerrainLayer
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.relief import Relief
+from orthonav.core.mapfile import MapFile, open_map
+from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.records import CONFIDENT, Fix
+from orthonav.core.track.tracker import Tracker
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.terrain import Dem, open_dem
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area, generate_heights
 from orthonav.onboard.run import Locator, SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import CONFIDENT, Fix
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area, generate_heights
 
 SLOPE, AGL_M, SPACING_M = 0.15, 200.0, 40.0
 CAMERA = Camera(640, 480, 560.0, 560.0, 320.0, 240.0)

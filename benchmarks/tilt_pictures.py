@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import (
+from orthonav.core.geo.camera import (
     axis_on_ground_en_m,
     camera_from_en,
     counted_from_centres,
     footprint_en_m,
 )
-from orthonav.localizer import Localizer
-from orthonav.records import Fix, Telemetry, View
+from orthonav.core.localize import Localizer
+from orthonav.core.records import Fix, Telemetry, View
 
 BLOCK_PX, STEP_PX, REACH_PX = 48, 32, 12
 """Blocks of the view, their distance, and how far aside they are looked for, map pixels."""

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number
 from benchmarks.verdicts import percent
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.route import Route
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, Fix, ViewResult
+from orthonav.core.track.tracker import Tracker
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import Locator, SingleViews, localize_flight
-from orthonav.records import CONFIDENT, Fix, ViewResult
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 SIDES_M = (1000, 4000, 10000)
 TURNS_EN_M = ((-330, -330), (-330, 300), (-60, 330), (60, -330), (330, -300), (330, 330))

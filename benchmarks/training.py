@@ -163,10 +163,10 @@ def _learn(
     """Learn on `count` generated tiles; seconds and loss of each epoch, threads, peak memory."""
     import torch
 
-    from orthonav.embed.network import AutoEncoderRecipe
-    from orthonav.neural.autoencoder import Reconstruction
-    from orthonav.neural.means import Means, World, kept_memory
-    from orthonav.neural.training import train
+    from orthonav.core.tiles.network import AutoEncoderRecipe
+    from orthonav.research.autoencoder import Reconstruction
+    from orthonav.research.means import Means, World, kept_memory
+    from orthonav.research.training import train
 
     recipe = AutoEncoderRecipe(dims=dims, width=width, epochs=epochs, batch=BATCH)
     tiles = _edge_tiles(count, tile_px)
@@ -198,8 +198,8 @@ def _learn(
 
 def _exported(encoder: Any, recipe: Any, tiles: Any) -> dict[str, dict[str, Any]]:
     """Megabytes, milliseconds of single tiles and likeness of the encoder in each precision."""
-    from orthonav.embed.network import PRECISIONS as NAMES
-    from orthonav.neural.export import cosines, export_encoder
+    from orthonav.core.tiles.network import PRECISIONS as NAMES
+    from orthonav.research.export import cosines, export_encoder
 
     held_out = _edge_tiles(32, TILE_PX, seed=1).batch(np.arange(32))
     calibration = tiles.batch(np.arange(64))
@@ -227,7 +227,7 @@ def _edge_tiles(count: int, tile_px: int, seed: int = 0) -> Any:
     """Tiles (binary edges) of a generated sheet with detail of several sizes."""
     import cv2
 
-    from orthonav.neural.tiles import SheetTiles
+    from orthonav.research.tiles import SheetTiles
 
     rng = np.random.default_rng(seed)
     side = 4 * tile_px

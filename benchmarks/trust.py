@@ -29,7 +29,8 @@ from benchmarks.record import Table, provenance
 from benchmarks.trust_pictures import write_worst
 from benchmarks.trust_views import pairs, views_of
 from benchmarks.verdicts import percent
-from orthonav.confidence.registered import (
+from orthonav.core.files import write_text
+from orthonav.core.localize.registered import (
     ALONE,
     FEATURES,
     LEAST,
@@ -38,9 +39,8 @@ from orthonav.confidence.registered import (
     RegisteredConfidence,
     features_of,
 )
-from orthonav.files import write_text
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.evaluate.calibration import calibrate
-from orthonav.records import CONFIDENT
 
 RIDGE = 1e-5
 """Weight of the ridge of the fit: only against weights without bound."""

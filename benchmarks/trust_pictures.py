@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.inputs import file_of, map_of
-from orthonav.flight import open_flight
-from orthonav.flight.folder import read_image
-from orthonav.mapfile import open_map
-from orthonav.mapfile.layer import GreyLayer
-from orthonav.register.pose import Pose
+from orthonav.core.flight import open_flight
+from orthonav.core.flight.folder import read_image
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.layer import GreyLayer
+from orthonav.core.register.pose import Pose
 
 WORST = 3
 """Views of each kind and scene: right ones with the least confidence, wrong ones with the most."""

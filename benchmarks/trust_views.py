@@ -17,16 +17,16 @@ import rasterio
 from rasterio.warp import transform_bounds
 
 from benchmarks.inputs import DATA, file_of, map_of
-from orthonav.errors import OutputError
-from orthonav.files import write_text
-from orthonav.flight import open_flight, read_truth
-from orthonav.flight.folder import read_image
-from orthonav.localizer import Localizer
-from orthonav.localizer.registration import RegistrationLocalizer
-from orthonav.mapfile import open_map
-from orthonav.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES
+from orthonav.core.errors import OutputError
+from orthonav.core.files import write_text
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight.folder import read_image
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 TILT_STD_DEG = 1.0

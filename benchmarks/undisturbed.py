@@ -37,10 +37,10 @@ from benchmarks.faults import Ground
 from benchmarks.inputs import file_of, map_of
 from benchmarks.record import Section, Table, number, provenance, save
 from benchmarks.trust_views import Pair, pairs
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import NoFix, Telemetry, View
-from orthonav.register.sharpness import sharpness
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import NoFix, Telemetry, View
+from orthonav.core.register.sharpness import sharpness
 
 GSD_M = 0.9, 2.1
 AGL_PX, SPEED_PX_S = 150.0, 12.0

@@ -30,13 +30,13 @@ from benchmarks.record import Table, number, provenance
 from benchmarks.tilt_pictures import Exterior, attitude_of, write_picture
 from benchmarks.trust_views import Pair, is_covered, pairs, views_in
 from benchmarks.verdicts import FAR_M
-from orthonav.geo.camera import axis_on_ground_en_m
-from orthonav.geo.frames import LocalFrame
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.geo.camera import axis_on_ground_en_m
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, RADIUS_SHARE, Fix, NoFix, Telemetry, View
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import SingleViews, locate_view
-from orthonav.records import CONFIDENT, RADIUS_SHARE, Fix, NoFix, Telemetry, View
-from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 """Errors of heading and height, which are reported."""

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.evaluate.calibration import calibrate, check_covariance
-from orthonav.records import CONFIDENT
 
 FAR_M = 35.0
 Array = NDArray[np.float64]

@@ -17,10 +17,10 @@ from playwright.sync_api import Browser, Page
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
 from benchmarks.inputs import PAST, Workplace
 from benchmarks.record import Section, Table, number
-from orthonav.flight.fixes import write_results
-from orthonav.geo.frames import LocalFrame
-from orthonav.mapfile import open_map
-from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.core.flight.fixes import write_results
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, NoFix, ViewResult
 
 SIDE_M = 1000
 VIEWS = (1000, 10_000, 20_000)

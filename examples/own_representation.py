@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from orthonav import represent
 from orthonav.cli import main
-from orthonav.variants import Variant
+from orthonav.core.tiles import represent
+from orthonav.core.variants import Variant
 
 
 @dataclass(frozen=True)

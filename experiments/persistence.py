@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.register.evidence import FINE, evidence
 from orthonav.ground.check.persistence import (
     MODEL,
     PATCH_PX,
@@ -23,8 +24,7 @@ from orthonav.ground.check.persistence import (
     features,
     terms,
 )
-from orthonav.register.evidence import FINE, evidence
-from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
 Array = NDArray[Any]
 SEEDS = (901, 902, 903, 904)

@@ -24,10 +24,10 @@ import pytest
 
 from helpers import Done, textured
 from orthonav.cli import main
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
 
 pytest_plugins = ["absent"]
 SEED = 2
@@ -109,7 +109,7 @@ def made_once(tmp_path_factory):
 def area(made_once):
     """Orthophotos of 1.2 x 1.0 km at 1 m, of two dates; not to be changed."""
 
-    from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+    from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
     def make(folder):
         generate_area(folder, size_m=(1200.0, 1000.0), dates=DEFAULT_DATES[:2], seed=SEED)
@@ -122,7 +122,7 @@ def area(made_once):
 def map_path(area, made_once):
     """A map of the first date: tiles of 128 px of 2.5 m; not to be changed."""
 
-    from orthonav.prepare import BuildRequest, build_map
+    from orthonav.ground.build import BuildRequest, build_map
 
     def make(folder):
         out = folder / "area.onav"
@@ -141,7 +141,7 @@ def localizer(map_path):
 def flight_path(area, made_once):
     """A flight of 30 views of the second date, with errors and no prior; not to be changed."""
 
-    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+    from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
     def make(folder):
         errors = Errors(yaw_std_deg=4.0, agl_std=0.03, attitude_std_deg=3.0)

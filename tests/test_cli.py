@@ -19,10 +19,10 @@ import pytest
 from helpers import Done, textured
 from orthonav import __version__
 from orthonav.cli import COMMANDS, common, main
-from orthonav.flight.fixes import read_results
-from orthonav.mapfile import open_map
-from orthonav.records import Fix
-from orthonav.report import Drawing
+from orthonav.core.flight.fixes import read_results
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix
+from orthonav.ground.report import Drawing
 
 WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "2"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
@@ -62,8 +62,8 @@ def ortho(make_ortho, tmp_path_factory):
 @pytest.fixture(autouse=True)
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
+    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture
@@ -840,7 +840,7 @@ def test_a_signal_is_an_interrupt(writing, out, name, stage, number):
 KILLED = """
 import os, sys, time
 from orthonav.cli import main
-from orthonav.prepare import calibrate
+from orthonav.ground.build import calibrate
 
 calibrate.CROPS = 16
 

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import CameraError, FlightError, MapFileError
-from orthonav.flight import decode_image
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map, write_map
-from orthonav.sources.cameras import read_camera_file
+from orthonav.core.errors import CameraError, FlightError, MapFileError
+from orthonav.core.flight import decode_image
+from orthonav.core.geo.camera_files import read_camera_file
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map, write_map
 
 pytestmark = pytest.mark.long
 
@@ -127,7 +127,7 @@ def test_headings_that_are_many_but_not_too_many(tmp_path):
 
 def test_a_map_of_what_does_not_fly(tmp_path, flight_path, monkeypatch):
     """Refused before anything of it is loaded, weights least of all."""
-    monkeypatch.setitem(sys.modules, "orthonav.neural.sam", None)
+    monkeypatch.setitem(sys.modules, "orthonav.research.sam", None)
     recipe = dict(open_map(GOLDEN).manifest.recipe)
     recipe["represent"] = {"name": "sam", "weights": str(tmp_path / "weights.pth")}
     path = changed(tmp_path / "a.onav", recipe=recipe)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from orthonav.cli import demo, main
-from orthonav.prepare import BuildRequest
-from orthonav.simulate import landscape
+from orthonav.ground.build import BuildRequest
+from orthonav.ground.simulate import landscape
 
 
 @pytest.fixture
@@ -31,11 +31,11 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.ground.check.places.FEWEST_TRIALS", 24)
     monkeypatch.setattr("orthonav.ground.check.run.usable_cores", lambda: 1)
-    monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 30)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
+    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
     quicker = functools.partial(BuildRequest, calibration_views=2)
-    monkeypatch.setattr("orthonav.prepare.BuildRequest", quicker)
+    monkeypatch.setattr("orthonav.ground.build.BuildRequest", quicker)
 
 
 @pytest.mark.long
@@ -99,7 +99,7 @@ def test_a_demo_that_fails_leaves_nothing(small_demo, tmp_path, capsys, names_in
     def broken(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("orthonav.prepare.build_map", broken)
+    monkeypatch.setattr("orthonav.ground.build.build_map", broken)
     assert main(["demo", "--quiet", "--out", str(tmp_path / "demo")]) == 1
     assert capsys.readouterr().err == "orthonav: error: interrupted; nothing was written\n"
     assert names_in(tmp_path) == []

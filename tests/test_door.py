@@ -12,7 +12,7 @@ import pytest
 
 import orthonav
 from orthonav.cli import main
-from orthonav.errors import CameraError, CheckError
+from orthonav.core.errors import CameraError, CheckError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from orthonav import extras
 from orthonav.cli import COMMANDS, version
 from orthonav.cli.needs import NEEDS
-from orthonav.errors import MissingExtraError
+from orthonav.core import extras
+from orthonav.core.errors import MissingExtraError
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]

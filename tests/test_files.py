@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from orthonav.errors import MissingFileError, OutputError, RouteError
-from orthonav.files import not_written, replacing, replacing_folder, require_file, write_text
+from orthonav.core.errors import MissingFileError, OutputError, RouteError
+from orthonav.core.files import not_written, replacing, replacing_folder, require_file, write_text
 
 INTERRUPTIONS = pytest.mark.parametrize(
     "interruption", [ValueError("bug"), KeyboardInterrupt(), SystemExit(3), RouteError("known")]
@@ -152,7 +152,7 @@ def test_a_real_limit_on_file_size(out):
     out.parent.mkdir()
     out.write_text("old")
     script = (
-        "import sys, pathlib, orthonav.files as files;"
+        "import sys, pathlib, orthonav.core.files as files;"
         "files.write_text(pathlib.Path(sys.argv[1]), 'x' * 10**6)"
     )
     limit = 64 * 1024

@@ -10,12 +10,12 @@ import make_golden
 import numpy as np
 import pytest
 
-from orthonav.flight import read_image
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.localizer import Localizer
-from orthonav.mapfile import GreyInfo, GreyLayer, SheetInfo, open_map
-from orthonav.records import Fix, View
+from orthonav.core.flight import read_image
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import GreyInfo, GreyLayer, SheetInfo, open_map
+from orthonav.core.records import Fix, View
 
 DATA = Path(__file__).parent / "data"
 SHEET = SheetInfo(

@@ -23,11 +23,11 @@ sys.meta_path.insert(0, Blocked())
 
 FIX = """
 import json, pathlib
-from orthonav.flight import open_flight
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.flight import open_flight
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.flight.fixes import result_to_json
+from orthonav.core.flight.fixes import result_to_json
 
 map_path, flight_path = map(pathlib.Path, sys.argv[1:])
 flight = open_flight(flight_path)
@@ -95,7 +95,7 @@ def test_a_fix_without_heavy_libraries(map_path, flight_path, tmp_path, names_in
 @pytest.mark.slow  # starts PyTorch again
 def test_importing_has_no_side_effect(tmp_path, names_in):
     names = json.loads(fresh(ALL_MODULES, *ABSENT, cwd=tmp_path))
-    assert "orthonav.localizer.localizer" in names and len(names) > 50
+    assert "orthonav.core.localize.localizer" in names and len(names) > 50
     assert names_in(tmp_path) == []
 
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from orthonav.cli import main
-from orthonav.confidence.accept import Acceptance
-from orthonav.errors import FlightError, VariantError
-from orthonav.flight import open_flight
-from orthonav.flight.fixes import read_results
-from orthonav.flight.identity import Identity, flight_digest, read_identity
-from orthonav.geo.camera import Camera
-from orthonav.grey import grey_levels
-from orthonav.mapfile import open_map
-from orthonav.records import Telemetry, View
+from orthonav.core.errors import FlightError, VariantError
+from orthonav.core.flight import open_flight
+from orthonav.core.flight.fixes import read_results
+from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+from orthonav.core.geo.camera import Camera
+from orthonav.core.grey import grey_levels
+from orthonav.core.localize.accept import Acceptance
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Telemetry, View
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 NADIR = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
@@ -203,10 +203,10 @@ def test_a_camera_is_scaled_to_the_image():
 
 
 def test_paths_may_be_text(map_path, few, area, tmp_path):
-    from orthonav.prepare import BuildRequest, build_map
-    from orthonav.simulate.flight import SimulateRequest, simulate_flight
-    from orthonav.sources import SourceOptions, open_source
-    from orthonav.web.opening import ViewRequest
+    from orthonav.ground.build import BuildRequest, build_map
+    from orthonav.ground.recordings import SourceOptions, open_source
+    from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
+    from orthonav.ground.view.opening import ViewRequest
 
     made = str(tmp_path / "small.onav")
     small = {"tile_px": 64, "gsd_m": 5.0, "registration": False}

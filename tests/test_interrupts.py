@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from orthonav.flight.fixes import read_results
+from orthonav.core.flight.fixes import read_results
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Height, read_route
-from orthonav.mapfile import open_map
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.mapfile import open_map
+from orthonav.ground.planning.route import Height, read_route
 
 FRAME = LocalFrame(46.5, 2.5)
 CORNERS_EN_M = [(-1500.0, -1500.0), (-1500.0, 1500.0), (1500.0, 1500.0)]

@@ -17,7 +17,7 @@ import fixes
 import pytest
 
 from helpers import Done
-from orthonav.flight import open_flight
+from orthonav.core.flight import open_flight
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "data" / "golden_flight"

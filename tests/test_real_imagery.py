@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.area import Area
-from orthonav.geo.grid import TileGrid
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.terrain import terrain_of_dem
 from orthonav.ground.evaluate.metrics import compare
-from orthonav.imagery.terrain import open_dem
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.planning.area import Area
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.terrain import terrain_of_dem
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 DATA = Path(os.environ.get("ORTHONAV_DATA", BESIDE))
@@ -44,7 +44,7 @@ def test_views_of_another_year_are_placed(tmp_path, monkeypatch, past, present, 
         if not (DATA / name).is_file():
             pytest.skip(f"optional real imagery is not there (see ORTHONAV_DATA): {DATA / name}")
     # Few crops and views for its confidence, which is not looked at here.
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
     build_map(BuildRequest([DATA / past], tmp_path / "map.onav", calibration_views=2))
     flight = tmp_path / "flight"
     simulate_flight(SimulateRequest([DATA / present], flight, random=VIEWS, errors=ERRORS, seed=1))

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import absent
-from orthonav.extras import module_of
+from orthonav.core.extras import module_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = sorted(Path(__file__).parent.rglob("*.py"))

@@ -5,13 +5,13 @@ import tracemalloc
 
 import pytest
 
-from orthonav.errors import FlightError, RouteError
-from orthonav.flight import folder as folders
-from orthonav.flight.fixes import MAX_LINE_BYTES, read_results
-from orthonav.flight.folder import read_truth
-from orthonav.geo.route import read_route
-from orthonav.sources.table import read_table
-from orthonav.tables import MAX_LINE_CHARS, TableError, TableRows, bounded_lines
+from orthonav.core.errors import FlightError, RouteError
+from orthonav.core.flight import folder as folders
+from orthonav.core.flight.fixes import MAX_LINE_BYTES, read_results
+from orthonav.core.flight.folder import read_truth
+from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows, bounded_lines
+from orthonav.ground.planning.route import read_route
+from orthonav.ground.recordings.table import read_table
 
 TRUTH = "frame,lat_deg,lon_deg\n"
 TABLE = "time_s,pitch_deg,roll_deg\n"
@@ -84,7 +84,7 @@ def test_tables_of_a_flight_have_at_most_so_many_rows(tmp_path, monkeypatch):
     ],
 )
 def test_routes_of_too_many_waypoints_take_little_memory(tmp_path, monkeypatch, name, text):
-    monkeypatch.setattr("orthonav.geo.routes.record.MAX_WAYPOINTS", 5_000)
+    monkeypatch.setattr("orthonav.ground.planning.routes.record.MAX_WAYPOINTS", 5_000)
     path = tmp_path / name
     path.write_text(text)
     tracemalloc.start()

@@ -90,8 +90,8 @@ def test_the_example_that_is_shown_is_the_example():
 def test_the_example_adds_a_representation(textured_grey):
     import numpy as np
 
-    from orthonav import represent
-    from orthonav.variants import make_variant
+    from orthonav.core.tiles import represent
+    from orthonav.core.variants import make_variant
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(represent, "TABLE", dict(represent.TABLE))

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import VariantError
-from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.errors import VariantError
+from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
 
 
 @dataclass(frozen=True)

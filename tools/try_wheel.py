@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
 LARGE = ("train", "cluster")
 """Extras that bring gigabytes (PyTorch) or hundreds of MB (Ray): only with --all."""
-KERNEL = "orthonav/register/_kernel.abi3.so"
+KERNEL = "orthonav/core/register/_kernel.abi3.so"
 """Compiled from `_kernel.c` and `_search.c`; needs a C compiler and Python's headers."""
 MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")
 
@@ -59,7 +59,7 @@ COMMANDS: dict[str, Sequence[str]] = {
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
 SCRIPTS = {
     "ros2": "import cyclonedds.domain, rosbags.typesys",
-    "web": "from orthonav.web.assets import load_assets; assert '/' in load_assets()",
+    "web": "from orthonav.ground.view.assets import load_assets; assert '/' in load_assets()",
     "neural": "import onnxruntime; assert onnxruntime.get_available_providers()",
 }
 """Where a command would serve until it is stopped, or would need a map of gigabytes."""

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.simulate.render import ViewEffects, render_view
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.simulate.render import ViewEffects, render_view
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 """The camera of the recorded flights; it looks straight down the body, image top to the nose."""

@@ -22,14 +22,14 @@ from benchmarks.closed_loop.physics import (
 )
 from benchmarks.closed_loop.replays import Rule, is_wrong
 from benchmarks.closed_loop.sensors import CALM, CONSUMER, Grade, Instruments
-from orthonav.geo.frames import LocalFrame
-from orthonav.localizer.tracker import Tracker
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
+from orthonav.onboard.messages.correlation import FilterCovariance
+from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, estimate_from_result
+from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import locate_view
-from orthonav.publish.correlation import FilterCovariance
-from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
-from orthonav.publish.gate import Gate
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
 
 AGL_M, WIND_MPS = 250.0, 5.0
 ROUTE_EN_M = np.array(

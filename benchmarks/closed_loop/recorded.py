@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.ground import CAMERA, EFFECTS, Angles, Demo, Grey
 from benchmarks.flights import read_rows
+from orthonav.core.records import Prior, Telemetry, View
 from orthonav.onboard.telemetry import TelemetryBuffer, wxyz_of_angles
-from orthonav.records import Prior, Telemetry, View
 
 GROUND_AMSL_M = 40.0
 LATE_S = 0.02

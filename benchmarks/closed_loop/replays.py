@@ -19,13 +19,13 @@ from benchmarks.closed_loop.recorded import MIRRORED, OFF, ON, SHIFTED, Exposure
 from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.inputs import DATA
 from benchmarks.record import Section, Table, number
-from orthonav.geo.ellipse import error_ellipse
-from orthonav.localizer.tracker import Tracker
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.aiding import ABSOLUTE, FIX_3D, Aiding
+from orthonav.onboard.messages.estimate import Clock, estimate_from_result
+from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
-from orthonav.publish.estimate import Clock, estimate_from_result
-from orthonav.publish.gate import Gate
-from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
 
 RECORDED = DATA / "closed_loop"
 METHODS = ("single", "single, no prior", "track")

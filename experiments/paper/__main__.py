@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.errors import MissingExtraError
+from orthonav.core.errors import MissingExtraError
 
 if TYPE_CHECKING:
     from experiments.paper.methods import Method
@@ -82,7 +82,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from experiments.paper.runs import Workplace
     from experiments.paper.scenes import render
     from experiments.paper.trajectories import SETTINGS, dry
-    from orthonav.represent.learned import VARIABLE
+    from orthonav.core.tiles.learned import VARIABLE
 
     _require(options)
     os.environ[VARIABLE] = str(BETWEEN_DATES)  # maps do not say where their network lies
@@ -189,7 +189,7 @@ def _whole(scene: "Scene", wanted: set[str]) -> bool:
 
 def _require(options: argparse.Namespace) -> None:
     """Raise `MissingExtraError` naming all that the chosen rows need and that is not installed."""
-    from orthonav.extras import require
+    from orthonav.core.extras import require
 
     learnt = not options.methods or set(options.methods) != {"gradient"}
     require("python -m experiments.paper", "geo", *(["train"] if learnt else []))
@@ -290,7 +290,7 @@ def _say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    from orthonav.errors import OrthonavError
+    from orthonav.core.errors import OrthonavError
 
     try:
         sys.exit(main(sys.argv[1:]))

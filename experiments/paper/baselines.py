@@ -22,10 +22,10 @@ from experiments.paper.results import ACCURACY_M
 from experiments.paper.runs import Workplace, head, placements, save
 from experiments.paper.scenes import Scene
 from experiments.paper.stored import code_of
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import View
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import View
+from orthonav.ground.imagery.mosaic import Mosaic
 
 MAP_OF = "gradient-gradient"
 """The baselines get the plane and pixels of this run's map."""

@@ -25,11 +25,11 @@ from torch import nn
 from torch.nn import functional
 
 from experiments.paper.methods import BETWEEN_DATES
-from orthonav.extras import needed
-from orthonav.files import replacing, write_text
-from orthonav.neural.means import Means, mixed_precision
-from orthonav.represent.canny import Canny
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.core.extras import needed
+from orthonav.core.files import replacing, write_text
+from orthonav.core.tiles.canny import Canny
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.research.means import Means, mixed_precision
 
 AREAS = ((101, 1.0), (102, 1.0), (103, 1.5), (104, 2.0), (105, 3.0), (106, 5.0))
 """Seed and ground resolution of the landscapes; those of the experiments have other seeds."""

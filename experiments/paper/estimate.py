@@ -8,10 +8,10 @@ from typing import Any
 
 from experiments.paper.methods import Method
 from experiments.paper.scenes import Scene
-from orthonav import embed
-from orthonav.embed.caevl import CaevlRecipe
-from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
-from orthonav.variants import make_variant
+from orthonav.core.tiles import embed
+from orthonav.core.tiles.network import AutoEncoderRecipe, TripletRecipe
+from orthonav.core.variants import make_variant
+from orthonav.research.caevl_recipe import CaevlRecipe
 
 STEP_MS = {"autoencoder": 15.0, "triplet": 250.0, "caevl": 60.0}
 """A step of the full networks on a modern data-centre GPU: assumed from their arithmetic and memory
@@ -36,8 +36,8 @@ def parameters(method: Method) -> tuple[int, int]:
     """Parameters of a network, and of its encoder alone; zeros for a method without one."""
     import torch
 
-    from orthonav.neural.autoencoder import AutoEncoder
-    from orthonav.neural.triplet import ResNet34
+    from orthonav.research.autoencoder import AutoEncoder
+    from orthonav.research.triplet import ResNet34
 
     recipe = make_variant(embed.TABLE, method.recipe)
     with torch.device("meta"):

@@ -19,11 +19,11 @@ from experiments.paper.methods import DEFAULT
 from experiments.paper.results import ACCURACY_M
 from experiments.paper.runs import SWEPT_ON, placements
 from experiments.paper.trajectories import REDUCED, TILE_PX
-from orthonav.files import replacing
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, View
+from orthonav.core.files import replacing
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, View
+from orthonav.ground.build import BuildRequest, build_map
 
 ROWS = ("view, October 2021", "map of July 2016, true place", "map, where it was put")
 Pictures = list[NDArray[np.uint8]]

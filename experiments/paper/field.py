@@ -29,10 +29,10 @@ from experiments.paper.methods import Method, flown, methods
 from experiments.paper.runs import MB, Workplace, head, save
 from experiments.paper.scenes import Scene
 from experiments.paper.stored import code_of_field
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import Fix, Prior, Telemetry, View
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, Prior, Telemetry, View
+from orthonav.ground.imagery.mosaic import Mosaic
 
 KEY = "field"
 VIEWS = 20

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.paper.methods import Method
 from experiments.paper.results import ACCURACY_M, Result, numbers, percent
-from orthonav.records import CONFIDENT
+from orthonav.core.records import CONFIDENT
 
 FAR_M, FAR_PX = 35.0, 10.0
 """A position beyond both is wrong; pixels, for imagery on which 35 m are less than a view shows."""

@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks.posed import BORDER_PX, MIN_INLIERS, RANSAC_PX, Picture, posed
 from numpy.typing import NDArray
 
-from orthonav.extras import needed
-from orthonav.records import PRIOR_SIGMAS, View
+from orthonav.core.extras import needed
+from orthonav.core.records import PRIOR_SIGMAS, View
 
 EXTRA = "matchers"
 KEYPOINTS_PER_PX = 512 / 256**2

@@ -93,7 +93,7 @@ def _prepare(jobs: int, work: dict[str, float]) -> None:
     import cv2
 
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
-    learning = logging.getLogger("orthonav.prepare.encoders")
+    learning = logging.getLogger("orthonav.ground.build.encoders")
     learning.setLevel(logging.INFO)
     learning.propagate = False
     learning.addHandler(LEARNING)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.localizer import Localizer
-from orthonav.localizer.match import TileMatcher
-from orthonav.localizer.rectify import downsampled
-from orthonav.mapfile import MapFile
-from orthonav.records import View
-from orthonav.search.position import RULES
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.match import TileMatcher
+from orthonav.core.localize.rectify import downsampled
+from orthonav.core.mapfile import MapFile
+from orthonav.core.records import View
+from orthonav.core.tiles.position import RULES
 
 SIMILARITIES = ("product", "cosine")
 

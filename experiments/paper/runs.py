@@ -25,11 +25,11 @@ from experiments.paper.rules import compared
 from experiments.paper.scenes import Scene
 from experiments.paper.stored import code_of, compact
 from experiments.paper.trajectories import TILE_PX, Setting
-from orthonav.files import write_text
-from orthonav.localizer import Localizer
-from orthonav.mapfile import MapFile, open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, View
+from orthonav.core.files import write_text
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import MapFile, open_map
+from orthonav.core.records import Fix, View
+from orthonav.ground.build import BuildRequest, build_map
 
 SWEPT_ON = "B"
 HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)

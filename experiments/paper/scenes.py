@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from experiments.paper.methods import REDUCED_NETWORKS
 from experiments.paper.trajectories import TABLE_1, TILE_PX, Setting, Trajectory, two_tiles
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 SEED = 1
 AGL_M = 2000.0

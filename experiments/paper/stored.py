@@ -30,7 +30,7 @@ from experiments.paper.methods import (
 from experiments.paper.results import Result, read
 from experiments.paper.scenes import REDUCED_REAL, SEED, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
-from orthonav.files import write_text
+from orthonav.core.files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = Path(__file__).resolve().parent / "rows"
@@ -52,33 +52,33 @@ Processors round single pixels differently. A change of the generator moves hous
 with them the figures of some quarter.
 """
 TILES = (
-    "src/orthonav/localizer/match.py",
-    "src/orthonav/localizer/rectify.py",
-    "src/orthonav/localizer/tiles.py",
+    "src/orthonav/core/localize/match.py",
+    "src/orthonav/core/localize/rectify.py",
+    "src/orthonav/core/localize/tiles.py",
     "src/orthonav/search/*.py",
 )
 NETWORK = (
-    "src/orthonav/embed/network.py",
-    "src/orthonav/neural/tiles.py",
-    "src/orthonav/neural/training.py",
+    "src/orthonav/core/tiles/network.py",
+    "src/orthonav/research/tiles.py",
+    "src/orthonav/research/training.py",
 )
 FAMILY = {
-    "gradient": ("src/orthonav/embed/cells.py", "src/orthonav/embed/whitened.py"),
-    "bovw": ("src/orthonav/embed/words.py", "src/orthonav/neural/words.py"),
-    "autoencoder": (*NETWORK, "src/orthonav/neural/autoencoder.py"),
+    "gradient": ("src/orthonav/core/tiles/cells.py", "src/orthonav/core/tiles/whitened.py"),
+    "bovw": ("src/orthonav/core/tiles/words.py", "src/orthonav/research/words.py"),
+    "autoencoder": (*NETWORK, "src/orthonav/research/autoencoder.py"),
     "triplet": (
         *NETWORK,
-        "src/orthonav/neural/triplet.py",
-        "src/orthonav/prepare/change.py",
-        "src/orthonav/prepare/encoders.py",
+        "src/orthonav/research/triplet.py",
+        "src/orthonav/ground/build/change.py",
+        "src/orthonav/ground/build/encoders.py",
     ),
     "caevl": (
         *NETWORK,
-        "src/orthonav/embed/caevl.py",
-        "src/orthonav/neural/augment.py",
-        "src/orthonav/neural/autoencoder.py",
-        "src/orthonav/neural/caevl.py",
-        "src/orthonav/neural/vicreg.py",
+        "src/orthonav/research/caevl_recipe.py",
+        "src/orthonav/research/augment.py",
+        "src/orthonav/research/autoencoder.py",
+        "src/orthonav/research/caevl.py",
+        "src/orthonav/research/vicreg.py",
     ),
     BASELINES: ("benchmarks/posed.py", "experiments/paper/baselines.py"),
     FIELD: (
@@ -88,21 +88,23 @@ FAMILY = {
     ),
 }
 EDGES = {
-    DEFAULT: ("src/orthonav/represent/gradients.py",),
-    GREY: ("src/orthonav/represent/gray.py",),
-    CANNY: ("src/orthonav/represent/canny.py",),
-    SEGMENTS: ("src/orthonav/represent/segments.py",),
-    SAM: ("src/orthonav/neural/sam.py",),
-    LEARNT: ("src/orthonav/represent/learned.py", "experiments/paper/between_dates.onnx"),
+    DEFAULT: ("src/orthonav/core/tiles/gradients.py",),
+    GREY: ("src/orthonav/core/tiles/gray.py",),
+    CANNY: ("src/orthonav/core/tiles/canny.py",),
+    SEGMENTS: ("src/orthonav/research/segments.py",),
+    SAM: ("src/orthonav/research/sam.py",),
+    LEARNT: ("src/orthonav/core/tiles/learned.py", "experiments/paper/between_dates.onnx"),
 }
 PART_OF = {"encoder_": ("autoencoder", "caevl"), "triplet_": ("triplet",), "words": ("bovw",)}
 """Which families a part of a setting decides, by the beginning of its name; others decide all."""
 REGISTRATION = (
-    "src/orthonav/confidence/*.py",
-    "src/orthonav/localizer/*.py",
-    "src/orthonav/register/*.py",
+    "src/orthonav/core/localize/*.py",
+    "src/orthonav/core/localize/*.py",
+    "src/orthonav/core/register/*.py",
 )
-TRACKED = tuple(f"src/orthonav/localizer/{name}.py" for name in ("odometry", "places", "tracker"))
+TRACKED = tuple(
+    f"src/orthonav/core/localize/{name}.py" for name in ("odometry", "places", "tracker")
+)
 """Files among those that place no single view, and so decide no row."""
 
 
@@ -120,7 +122,7 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
 def _drawn() -> str:
     """Means and standard deviations of the grey levels of the quarters of some generated ground,
     at every date and resolution."""
-    from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
+    from orthonav.ground.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
     made, levels = Landscape(SEED), []
     west_m, north_m = (origin + off for origin, off in zip(ORIGIN_M, DRAWN_FROM_M, strict=True))

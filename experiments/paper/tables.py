@@ -14,7 +14,7 @@ from experiments.paper.methods import column
 from experiments.paper.results import Result, accepted_at, ceiling, confident, percent, read, share
 from experiments.paper.stored import name_of
 from experiments.paper.views import PLACEMENTS
-from orthonav.records import CONFIDENT
+from orthonav.core.records import CONFIDENT
 
 
 def report(out: Path, setting: str) -> Path | None:

@@ -6,9 +6,9 @@ from benchmarks.record import Table, number
 
 from experiments.paper.labels import EDGES
 from experiments.paper.results import Result, percent, share
-from orthonav import embed
-from orthonav.embed.network import AutoEncoderRecipe
-from orthonav.variants import make_variant
+from orthonav.core.tiles import embed
+from orthonav.core.tiles.network import AutoEncoderRecipe
+from orthonav.core.variants import make_variant
 
 _FIGURES = ("route", "on grid, product", "on grid, cosine", "anywhere", "learn s", "commit")
 

@@ -1,13 +1,13 @@
 """The paper's Table 1: trajectories A to D, their search bands and overlaps; and how it is cut.
 
 The table itself, and the ground resolution taken where the paper states none, are those of the
-presets (`orthonav.geo.routes.presets`).
+presets (`orthonav.ground.planning.routes.presets`).
 """
 
 import math
 from dataclasses import astuple, dataclass, replace
 
-from orthonav.geo.routes import presets
+from orthonav.ground.planning.routes import presets
 
 TILE_PX = 256
 VIEW_ROOM = 1.5

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from experiments.paper.scenes import Scene
 from experiments.paper.trajectories import TILE_PX, VIEW_ROOM
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.records import Telemetry
-from orthonav.simulate.render import ViewEffects, render_view
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.records import Telemetry
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.simulate.render import ViewEffects, render_view
 
 SEED = 7
 PLACEMENTS = ("route", "grid", "anywhere")

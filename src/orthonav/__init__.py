@@ -43,18 +43,19 @@ __all__ = [
     "simulate_flight",
 ]
 _HOMES = {
-    **dict.fromkeys(("BuildRequest", "build_map"), "prepare"),
-    **dict.fromkeys(("CONFIDENT", "Fix", "NoFix", "Prior"), "records"),
-    **dict.fromkeys(("Telemetry", "View", "ViewResult"), "records"),
-    **dict.fromkeys(("FlightFolder", "open_flight", "read_truth"), "flight"),
-    **dict.fromkeys(("Localizer", "Tracker"), "localizer"),
-    **dict.fromkeys(("MapFile", "open_map"), "mapfile"),
-    **dict.fromkeys(("SimulateRequest", "simulate_flight"), "simulate.flight"),
-    "Camera": "geo.camera",
+    **dict.fromkeys(("BuildRequest", "build_map"), "ground.build"),
+    **dict.fromkeys(("CONFIDENT", "Fix", "NoFix", "Prior"), "core.records"),
+    **dict.fromkeys(("Telemetry", "View", "ViewResult"), "core.records"),
+    **dict.fromkeys(("FlightFolder", "open_flight", "read_truth"), "core.flight"),
+    "Localizer": "core.localize",
+    "Tracker": "core.track.tracker",
+    **dict.fromkeys(("MapFile", "open_map"), "core.mapfile"),
+    **dict.fromkeys(("SimulateRequest", "simulate_flight"), "ground.simulate.flight"),
+    "Camera": "core.geo.camera",
     "check": "ground.check.run",
     "evaluate": "ground.evaluate.metrics",
-    "OrthonavError": "errors",
-    "read_results": "flight.fixes",
+    "OrthonavError": "core.errors",
+    "read_results": "core.flight.fixes",
 }
 
 

@@ -23,16 +23,18 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def atlas(area, made_once):
     """An atlas of the first date with its index; read-only."""
-    from orthonav.atlas.build import build_atlas
-    from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.cluster import SerialRunner
-    from orthonav.atlas.recipe import CoarseRecipe
-    from orthonav.atlas.sheet_tasks import AtlasRequest
+    from orthonav.ground.atlas.build import build_atlas
+    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.cluster import SerialRunner
+    from orthonav.ground.atlas.recipe import CoarseRecipe
+    from orthonav.ground.atlas.sheet_tasks import AtlasRequest
 
     def make(folder):
         recipe = {**RECIPE, "coarse": dataclasses.asdict(CoarseRecipe(*COARSE))}
         with pytest.MonkeyPatch.context() as patch, SerialRunner() as runner:
-            patch.setattr("orthonav.prepare.calibrate.CROPS", 24)  # most of the time of a sheet
+            patch.setattr(
+                "orthonav.ground.build.calibrate.CROPS", 24
+            )  # most of the time of a sheet
             request = AtlasRequest(str(folder / "atlas"), [area.past], recipe)
             assert not build_atlas(request, runner).names("failed")
 
@@ -42,9 +44,9 @@ def atlas(area, made_once):
 @pytest.fixture(scope="module")
 def flown(area, made_once):
     """A flight of five views across the second date, heading not reported; read-only."""
-    from orthonav.geo.route import Route
-    from orthonav.imagery.mosaic import Mosaic
-    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+    from orthonav.ground.imagery.mosaic import Mosaic
+    from orthonav.ground.planning.route import Route
+    from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
     def make(folder):
         outline = Mosaic.open([area.present]).outline_latlon_deg
@@ -61,7 +63,7 @@ def flown(area, made_once):
             seed=3,
         )
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
+            patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
             simulate_flight(request)
 
     return made_once("searched-flight", make) / "flight"

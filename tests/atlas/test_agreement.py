@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.atlas.agreement import (
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.atlas.agreement import (
     CHANCE,
     MAX_CHAIN_LOG_ODDS,
     MIN_VIEWS,
     Agreement,
     PlaceEvidence,
 )
-from orthonav.geo.frames import LocalFrame
 
 FRAME = LocalFrame(46.5, 2.0)
 SIDE_M = 1000.0

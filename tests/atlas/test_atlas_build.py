@@ -10,18 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.atlas import build as building
-from orthonav.atlas import sheet_tasks as tasks
-from orthonav.atlas.build import build_atlas, build_sheet
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import SerialRunner
-from orthonav.atlas.coarse import read_coarse
-from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.atlas.sheet_tasks import AtlasRequest, Imagery, plan_sheets, request_digest, versions
-from orthonav.errors import AreaError, AtlasError, StorageError, WorkerError
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.mapfile import open_map
+from orthonav.core.errors import AreaError, AtlasError, StorageError, WorkerError
+from orthonav.core.mapfile import open_map
+from orthonav.ground.atlas import build as building
+from orthonav.ground.atlas import sheet_tasks as tasks
+from orthonav.ground.atlas.build import build_atlas, build_sheet
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.cluster import SerialRunner
+from orthonav.ground.atlas.coarse import read_coarse
+from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.sheet_tasks import (
+    AtlasRequest,
+    Imagery,
+    plan_sheets,
+    request_digest,
+    versions,
+)
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.route import Route
 
 COARSE = CoarseRecipe(gsd_m=4.0, tile_px=32, overlap=0.5)
 SMALL = {
@@ -39,8 +45,8 @@ RECIPE = AtlasRecipe(**{"gsd_m": 1.0, **SMALL, "coarse": COARSE})
 @pytest.fixture(autouse=True)
 def fewer_crops(monkeypatch):
     """Calibration from few crops: it takes longest."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
+    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +60,8 @@ def built(ortho, tmp_path_factory):
     """An atlas of it, which nobody changes, and what building it came to."""
     place = tmp_path_factory.mktemp("built") / "atlas"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 4)
-        patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
+        patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
         return place, made(place, ortho)
 
 
@@ -254,7 +260,7 @@ def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     there = [name for name in content(place) if full in name or broken in name]
     assert all(name.startswith("coarse/") for name in there), "whole, and named by no item"
     monkeypatch.undo()
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
     assert run(*arguments).code == 0
     assert content(place) == content(built[0])
 

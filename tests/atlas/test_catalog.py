@@ -15,12 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.atlas.catalog import Atlas, copy_sheets
-from orthonav.atlas.integrity import check_atlas
-from orthonav.atlas.item import Sheet, StoredFile, canonical, read_item
-from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.atlas.store import Store
-from orthonav.errors import AreaError, AtlasError, MissingFileError, StorageError
+from orthonav.core.errors import AreaError, AtlasError, MissingFileError, StorageError
+from orthonav.ground.atlas.catalog import Atlas, copy_sheets
+from orthonav.ground.atlas.integrity import check_atlas
+from orthonav.ground.atlas.item import Sheet, StoredFile, canonical, read_item
+from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.store import Store
 
 RECIPE = AtlasRecipe(gsd_m=1.0)
 HERE = RECIPE.sheets.name_at(46.6, 1.9)
@@ -352,11 +352,12 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeyp
 MANY = """
 import sys
 from pathlib import Path
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.item import Sheet
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.item import Sheet
+from orthonav.ground.atlas.recipe import AtlasRecipe
 
 url, files, number = sys.argv[1:]
-atlas = Atlas.open_or_create(url, __import__("orthonav.atlas.recipe").atlas.recipe.AtlasRecipe(1.0))
+atlas = Atlas.open_or_create(url, AtlasRecipe(1.0))
 for step in range(6):
     sheet = atlas.recipe.sheets.name_at(46.0 + 0.2 * step, 2.0 + 0.3 * int(number))
     path = Path(files, sheet)

@@ -14,13 +14,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from orthonav.atlas.build import build_atlas
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
-from orthonav.atlas.sheet_tasks import AtlasRequest
-from orthonav.errors import MissingExtraError, WorkerError
-from orthonav.geo.world import WorldSheets
-from orthonav.imagery.mosaic import Mosaic
+from orthonav.core.errors import MissingExtraError, WorkerError
+from orthonav.ground.atlas.build import build_atlas
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
+from orthonav.ground.atlas.sheet_tasks import AtlasRequest
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.world import WorldSheets
 
 SMALL = {
     "sheet_km": 0.3,
@@ -133,7 +133,7 @@ class Ref:
 def fake_ray(monkeypatch):
     """Ray without its processes, which take half a minute to start and end."""
     made = FakeRay()
-    monkeypatch.setattr("orthonav.atlas.cluster._imported", lambda: made)
+    monkeypatch.setattr("orthonav.ground.atlas.cluster._imported", lambda: made)
     strategies = SimpleNamespace(NodeAffinitySchedulingStrategy=lambda *_, **__: None)
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace())
     monkeypatch.setitem(sys.modules, "ray.util", SimpleNamespace())
@@ -175,7 +175,7 @@ def test_tasks_of_ray_fail_by_themselves_and_are_stopped_at_the_end(fake_ray):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_cluster_of_this_machine_builds_the_same_atlas(ray, ortho, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.atlas.cluster.STOP_S", 0.5)
+    monkeypatch.setattr("orthonav.ground.atlas.cluster.STOP_S", 0.5)
     bounds_deg = two_sheets(ortho)
     alone = plain(tmp_path / "alone", ortho, SMALL, bounds_deg)
     assert len(alone.names("built")) == 2

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from orthonav import represent
-from orthonav.atlas.coarse import POOLING, make_coarse, read_coarse, write_coarse
-from orthonav.atlas.item import canonical
-from orthonav.atlas.recipe import CoarseRecipe
-from orthonav.embed.cells import MICRO, CellLayout
-from orthonav.embed.whitened import CellSheet, pooled_features
-from orthonav.errors import AtlasError, MissingFileError
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.world import WorldSheets
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.variants import make_variant
+from orthonav.core.errors import AtlasError, MissingFileError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.cells import MICRO, CellLayout
+from orthonav.core.tiles.whitened import CellSheet, pooled_features
+from orthonav.core.variants import make_variant
+from orthonav.ground.atlas.coarse import POOLING, make_coarse, read_coarse, write_coarse
+from orthonav.ground.atlas.item import canonical
+from orthonav.ground.atlas.recipe import CoarseRecipe
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.world import WorldSheets
 
 RECIPE = CoarseRecipe(gsd_m=1.0, tile_px=64, overlap=0.5)
 WORLD = WorldSheets(250.0)

@@ -9,27 +9,27 @@ import pytest
 from safetensors import SafetensorError
 
 from helpers import textured, write_dem
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.coverage import box_deg, check_shown
-from orthonav.atlas.cut import cut_in_memory, cut_map
-from orthonav.atlas.item import Sheet
-from orthonav.atlas.recipe import AtlasRecipe
-from orthonav.embed.cells import CellLayout
-from orthonav.embed.stored import embedder_of
-from orthonav.embed.whitened import CellSheet
-from orthonav.errors import AreaError, AtlasError, OutputError, StorageError, VariantError
-from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import GreyLayer, open_map, write_map
-from orthonav.mapfile.terrain import TerrainLayer
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.layout import grid_of
-from orthonav.records import Fix, Telemetry, View
-from orthonav.represent.gradients import OrientedGradients
+from orthonav.core.errors import AreaError, AtlasError, OutputError, StorageError, VariantError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import GreyLayer, open_map, write_map
+from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.records import Fix, Telemetry, View
+from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.stored import embedder_of
+from orthonav.core.tiles.whitened import CellSheet
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.coverage import box_deg, check_shown
+from orthonav.ground.atlas.cut import cut_in_memory, cut_map
+from orthonav.ground.atlas.item import Sheet
+from orthonav.ground.atlas.recipe import AtlasRecipe
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.layout import grid_of
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 RECIPE = AtlasRecipe(
     gsd_m=1.0, tile_px=64, overlap=0.75, calibration_views=2, sheet_km=0.3, coarse=None
@@ -66,8 +66,8 @@ def folder(ortho, names, middle, tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
     atlas = Atlas.open_or_create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
-        patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
+        patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
         dem = write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0)
         for name in names:
             terrain = {"dem": dem, "dem_datum": "msl"}
@@ -362,7 +362,7 @@ def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names
     def full(*arguments, **named):
         raise SafetensorError("I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr("orthonav.mapfile.writer.save_file", full)
+    monkeypatch.setattr("orthonav.core.mapfile.writer.save_file", full)
     with pytest.raises(OutputError, match="disk full"):
         cut_map(
             Atlas.open(str(folder)),

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.atlas.cut_sheets import pooled_registered, pooled_tiles
-from orthonav.atlas.warp import Warp, _turn
-from orthonav.confidence.logistic import LogisticConfidence
-from orthonav.confidence.registered import Chances, RegisteredConfidence
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.prepare.blocks import Block
-from orthonav.represent.gradients import OrientedGradients
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.logistic import LogisticConfidence
+from orthonav.core.localize.registered import Chances, RegisteredConfidence
+from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.ground.atlas.cut_sheets import pooled_registered, pooled_tiles
+from orthonav.ground.atlas.warp import Warp, _turn
+from orthonav.ground.build.blocks import Block
 
 TILES = [LogisticConfidence(-6.2, (11.0, 12.0)), LogisticConfidence(-4.2, (5.6, 21.7))]
 REGISTERED = [

@@ -11,17 +11,17 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.index_manifest import IndexManifest, Part, ShardInfo
-from orthonav.atlas.integrity import check_atlas
-from orthonav.atlas.item import Sheet, StoredFile, canonical
-from orthonav.atlas.quantizers import VectorRecipe
-from orthonav.atlas.recipe import AtlasRecipe
-from orthonav.atlas.store import Store
 from orthonav.cli import main
-from orthonav.errors import AtlasError
-from orthonav.geo.area import Area
-from orthonav.mapfile import open_map
+from orthonav.core.errors import AtlasError
+from orthonav.core.mapfile import open_map
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.index_manifest import IndexManifest, Part, ShardInfo
+from orthonav.ground.atlas.integrity import check_atlas
+from orthonav.ground.atlas.item import Sheet, StoredFile, canonical
+from orthonav.ground.atlas.quantizers import VectorRecipe
+from orthonav.ground.atlas.recipe import AtlasRecipe
+from orthonav.ground.atlas.store import Store
+from orthonav.ground.planning.area import Area
 
 RECIPE = AtlasRecipe(gsd_m=2.5, tile_px=128, calibration_views=24, coarse=None)
 PLACES = [(46.6, 1.9), (46.6, 2.1)]
@@ -213,7 +213,7 @@ def test_a_full_disk_is_reported(near, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orthonav.atlas.filesystems.shutil.copyfile", full)
+    monkeypatch.setattr("orthonav.ground.atlas.filesystems.shutil.copyfile", full)
     assert main(["atlas", "add", near.url + "2", near.url, "-q"]) == 1
 
 
@@ -331,7 +331,7 @@ def test_options_reach_index_and_cut(near, capfd, monkeypatch):
         asked.update(how, url=atlas.url, out=out, area=area)
         raise AtlasError("sheets are missing")
 
-    monkeypatch.setattr("orthonav.atlas.cut.cut_map", cut)
+    monkeypatch.setattr("orthonav.ground.atlas.cut.cut_map", cut)
     options = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
     code, done = run(capfd, "cut", near.url, *options, "--band-m", "50")
     assert code == 1 and "needs a route" in done.err

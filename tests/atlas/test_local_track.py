@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.atlas import locate
-from orthonav.atlas.agreement import Placement
-from orthonav.atlas.find import FoundPlace
-from orthonav.atlas.locate import LocalTrack
-from orthonav.flight.folder import open_flight
-from orthonav.geo.frames import LocalFrame, distances_m
-from orthonav.records import NoFix, View
-from orthonav.track import State
+from orthonav.core.flight.folder import open_flight
+from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.core.records import NoFix, View
+from orthonav.core.track import State
+from orthonav.ground.atlas import locate
+from orthonav.ground.atlas.agreement import Placement
+from orthonav.ground.atlas.find import FoundPlace
+from orthonav.ground.atlas.locate import LocalTrack
 
 STD_M = 12.5
 BEGUN = 3

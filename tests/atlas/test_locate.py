@@ -12,21 +12,26 @@ import pytest
 
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
-from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.find import rectified
-from orthonav.atlas.index import make_index
-from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets
-from orthonav.atlas.item import canonical
-from orthonav.atlas.locate import AtlasLocator
-from orthonav.atlas.matches import against
-from orthonav.atlas.sheet_registration import SheetRegistrar
-from orthonav.atlas.store import Store
-from orthonav.atlas.tile_search import TileSearch
-from orthonav.errors import AtlasError
-from orthonav.flight.folder import open_flight
-from orthonav.geo.frames import distances_m
+from orthonav.core.errors import AtlasError
+from orthonav.core.flight.folder import open_flight
+from orthonav.core.geo.frames import distances_m
+from orthonav.core.records import Fix, NoFix, View
+from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.find import rectified
+from orthonav.ground.atlas.index import make_index
+from orthonav.ground.atlas.index_manifest import (
+    MANIFEST,
+    IndexManifest,
+    read_manifest,
+    stale_sheets,
+)
+from orthonav.ground.atlas.item import canonical
+from orthonav.ground.atlas.locate import AtlasLocator
+from orthonav.ground.atlas.matches import against
+from orthonav.ground.atlas.sheet_registration import SheetRegistrar
+from orthonav.ground.atlas.store import Store
+from orthonav.ground.atlas.tile_search import TileSearch
 from orthonav.onboard.run import locate_view
-from orthonav.records import Fix, NoFix, View
 
 CANDIDATES = 6
 """Registering candidates takes most of the time."""
@@ -34,7 +39,7 @@ CANDIDATES = 6
 
 @pytest.fixture(autouse=True)
 def fewer_candidates(monkeypatch):
-    monkeypatch.setattr("orthonav.atlas.find.CANDIDATES", CANDIDATES)
+    monkeypatch.setattr("orthonav.ground.atlas.find.CANDIDATES", CANDIDATES)
 
 
 @pytest.fixture(scope="module")
@@ -133,8 +138,8 @@ def test_the_same_sheets_make_the_same_index(atlas, copied):
 
 
 def test_a_removed_sheet_is_retired_and_a_new_one_is_added(copied, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.atlas.index.FEW_ROWS", 0)
-    monkeypatch.setattr("orthonav.atlas.index.REBUILD_SHARE", 2.0)
+    monkeypatch.setattr("orthonav.ground.atlas.index.FEW_ROWS", 0)
+    monkeypatch.setattr("orthonav.ground.atlas.index.REBUILD_SHARE", 2.0)
     changed = copied
     smallest = min(changed.sheets().values(), key=lambda each: each.tiles)
     kept = {key: changed.path(smallest, key) for key in smallest.files}

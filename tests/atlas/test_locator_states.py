@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthonav.atlas import locate
-from orthonav.atlas.find import FoundPlace
-from orthonav.atlas.locate import AtlasLocator
-from orthonav.atlas.recipe import AtlasRecipe
-from orthonav.errors import AtlasError
-from orthonav.records import NoFix
-from orthonav.track import State
+from orthonav.core.errors import AtlasError
+from orthonav.core.records import NoFix
+from orthonav.core.track import State
+from orthonav.ground.atlas import locate
+from orthonav.ground.atlas.find import FoundPlace
+from orthonav.ground.atlas.locate import AtlasLocator
+from orthonav.ground.atlas.recipe import AtlasRecipe
 
 SEARCHING = NoFix("searching", "nothing agrees")
 FOUND = FoundPlace((), 1.0, 0.95)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.errors import AtlasError
+from orthonav.core.errors import AtlasError
+from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
 
 RECIPE = AtlasRecipe(gsd_m=1.0)
 

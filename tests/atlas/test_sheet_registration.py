@@ -11,19 +11,19 @@ import pytest
 
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
-from orthonav.atlas import matches
-from orthonav.atlas.find import PlaceFinder, rectified
-from orthonav.atlas.matches import SEARCHED, ViewMatches
-from orthonav.atlas.sheet_registration import (
+from orthonav.core.flight.folder import open_flight, read_truth
+from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.core.records import PRIOR_SIGMAS, Prior, View
+from orthonav.ground.atlas import matches
+from orthonav.ground.atlas.find import PlaceFinder, rectified
+from orthonav.ground.atlas.matches import SEARCHED, ViewMatches
+from orthonav.ground.atlas.sheet_registration import (
     PyramidPart,
     SearchRegion,
     SheetMatch,
     SheetRegistrar,
 )
-from orthonav.atlas.tile_search import TileSearch
-from orthonav.flight.folder import open_flight, read_truth
-from orthonav.geo.frames import LocalFrame, distances_m
-from orthonav.records import PRIOR_SIGMAS, Prior, View
+from orthonav.ground.atlas.tile_search import TileSearch
 
 SIDE_M = 300.0
 

@@ -12,8 +12,8 @@ import fsspec
 import pytest
 from fsspec.implementations.local import LocalFileSystem
 
-from orthonav.atlas.store import Store, cache_folder
-from orthonav.errors import MissingExtraError, StorageError
+from orthonav.core.errors import MissingExtraError, StorageError
+from orthonav.ground.atlas.store import Store, cache_folder
 
 
 class Trouble(LocalFileSystem):
@@ -183,7 +183,7 @@ def test_local_files_are_whole_or_absent(tmp_path, monkeypatch, error):
         to.write_bytes(b"ne")
         raise error
 
-    monkeypatch.setattr("orthonav.atlas.filesystems.shutil.copyfile", half)
+    monkeypatch.setattr("orthonav.ground.atlas.filesystems.shutil.copyfile", half)
     with pytest.raises((KeyboardInterrupt, StorageError)) as caught:
         store.write("items/a", tmp_path)
     assert "full" in str(caught.value) or isinstance(error, KeyboardInterrupt)
@@ -307,7 +307,7 @@ def test_local_files_are_not_copied(tmp_path):
 
 def test_the_least_recently_used_files_leave_the_cache(far, monkeypatch):
     monkeypatch.setenv("ORTHONAV_CACHE_GB", "25e-9")  # three files of 8 bytes
-    monkeypatch.setattr("orthonav.atlas.store.GRACE_S", 50)
+    monkeypatch.setattr("orthonav.ground.atlas.store.GRACE_S", 50)
     paths = {}
     for number, name in enumerate("bcd"):
         data = f"map of {name}".encode()

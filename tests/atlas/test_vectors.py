@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.atlas.index_manifest import Part, ShardInfo
-from orthonav.atlas.index_shards import ShardedIndex, write_shard
-from orthonav.atlas.quantizers import QUANTIZERS_NAME, Quantizers, VectorRecipe, train
-from orthonav.errors import AtlasError
+from orthonav.core.errors import AtlasError
+from orthonav.ground.atlas.index_manifest import Part, ShardInfo
+from orthonav.ground.atlas.index_shards import ShardedIndex, write_shard
+from orthonav.ground.atlas.quantizers import QUANTIZERS_NAME, Quantizers, VectorRecipe, train
 
 DIMS, COUNT = 16, 6000
 RECIPE = VectorRecipe(DIMS, list_bits=6, quantizers=8)

@@ -14,8 +14,8 @@ from benchmarks.pair import Arrivals, FakeAutopilot, Fly, Lines, free_port, on_c
 from pymavlink.dialects.v20 import common as mavlink
 
 from benchmarks import growth, install, soak
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.frames import LocalFrame
 
 FRAME, SPEED_MPS, STEP_S, VIEWS = LocalFrame(48.0, 2.0), 25.0, 0.1, 8
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from benchmarks.fusion import RECEIVERS, Fixes, fixes_of, fuse
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.publish.correlation import for_filter
-from orthonav.publish.estimate import NavigationEstimate
-from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.onboard.messages.correlation import for_filter
+from orthonav.onboard.messages.estimate import NavigationEstimate
 
 FRAME = LocalFrame(48.0, 2.0)
 INERTIAL = [each for each in RECEIVERS if each.inertial]

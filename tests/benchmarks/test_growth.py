@@ -6,7 +6,7 @@ from arm64 import instructions
 from benchmarks.child import memory_mb
 
 from benchmarks import growth, growth_sheets
-from orthonav.geo.world import WorldSheets
+from orthonav.ground.planning.world import WorldSheets
 
 
 @pytest.mark.parametrize("side", [1, 2, 4])

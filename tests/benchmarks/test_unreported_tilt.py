@@ -7,10 +7,15 @@ from benchmarks.tilt_pictures import Exterior, displacements, orthorectified
 from benchmarks.unreported_tilt import Flown, compared, height_m, level_telemetry
 
 from helpers import textured
-from orthonav.geo.camera import Camera, axis_on_ground_en_m, camera_from_en, counted_from_centres
-from orthonav.geo.frames import LocalFrame
-from orthonav.records import Fix, Telemetry, View
-from orthonav.simulate.flight import DEFAULT_CAMERA
+from orthonav.core.geo.camera import (
+    Camera,
+    axis_on_ground_en_m,
+    camera_from_en,
+    counted_from_centres,
+)
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, Telemetry, View
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
 TRUE = Telemetry(0, 30.0, 4.0, -3.0, 250.0)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import rasterio
 
-from orthonav.changes.ground import changed_ground
-from orthonav.changes.record import ChangedGround, ChangeGrid, read_changes, write_changes
-from orthonav.changes.views import SeenCells
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.geo.frames import LocalFrame
-from orthonav.simulate.flight import SimulateRequest, simulate_flight
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.changes.ground import changed_ground
+from orthonav.ground.changes.record import ChangedGround, ChangeGrid, read_changes, write_changes
+from orthonav.ground.changes.views import SeenCells
+from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
 
 FRAME = LocalFrame(48.0, 2.0)
 GRID = ChangeGrid(FRAME, -200.0, 150.0, 10.0, 30, 40)

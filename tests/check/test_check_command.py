@@ -10,20 +10,20 @@ import rasterio
 from made_trials import lost, right
 
 from helpers import write_dem
-from orthonav.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.cli import main
-from orthonav.errors import AreaError, CameraError, CheckError, MapFileError, MissingFileError
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
+from orthonav.core.errors import AreaError, CameraError, CheckError, MapFileError, MissingFileError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.signature import map_digest
+from orthonav.ground.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.ground.check import run as check_run
 from orthonav.ground.check.outcome import Word
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
 from orthonav.ground.check.verdict import Verdict
 from orthonav.ground.check.write import to_json
-from orthonav.mapfile import open_map
-from orthonav.mapfile.signature import map_digest
+from orthonav.ground.planning.route import Route
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 

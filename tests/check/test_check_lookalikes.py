@@ -5,7 +5,7 @@ import math
 import pytest
 from made_trials import lost, misplaced, right
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.lookalikes import MAX_PAIRS, SIMILAR, found_lookalikes
 
 FRAME = LocalFrame(46.0, 3.0)

@@ -16,6 +16,7 @@ from made_check import EVIL, FILES, small_route
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
+from orthonav.core.mapfile import open_map
 from orthonav.ground.check.outcome import CELL_VALUES, BlindStretch
 from orthonav.ground.check.write import figures, write_check
 from orthonav.ground.check.write.figures import MAX_SIDE_PX, jpeg, map_image, visible_box
@@ -23,10 +24,9 @@ from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN, _known_cells
 from orthonav.ground.check.write.plain import to_plain
 from orthonav.ground.check.write.risk import RISKS, segments, shade
 from orthonav.ground.check.write.wording import better_sentence, remedies, share_text
-from orthonav.mapfile import open_map
-from orthonav.report import Drawing, metres_text
-from orthonav.report.leaflet import load_leaflet
-from orthonav.report.page import static_text
+from orthonav.ground.report import Drawing, metres_text
+from orthonav.ground.report.leaflet import load_leaflet
+from orthonav.ground.report.page import static_text
 
 VOID = {"meta", "img", "input", "br"}
 UNDRAWN = Drawing(
@@ -79,7 +79,7 @@ def folder(opened, frame, tmp_path_factory):
     """Checks of all kinds, and one whose names are markup, by name."""
     root = tmp_path_factory.mktemp("checks")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.report.canvas.DPI", 20)
+        patch.setattr("orthonav.ground.report.canvas.DPI", 20)
         path = write_check(small_route(frame), opened, root / "small_route")
         assert path == root / "small_route" / "index.html"
         for name in ("draw_axes", "draw_figure"):  # drawing takes longest

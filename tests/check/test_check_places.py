@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import AreaError
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.places import (
     FEWEST_TRIALS,
     MAX_CELLS,
@@ -22,6 +20,8 @@ from orthonav.ground.check.places import (
     checked_m2,
     trial_places,
 )
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
 

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_trials import CONDITIONS
 
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Route
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.outcome import Along
 from orthonav.ground.check.route import BLIND, blind_stretches, expected_drift, predicted_along
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
 SIDE_M = 100.0

@@ -10,17 +10,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.changes.record import ChangedGround, ChangeGrid
-from orthonav.errors import AreaError, MapFileError, MissingFileError, WorkerError
-from orthonav.geo.camera import Camera
+from orthonav.core.errors import AreaError, MapFileError, MissingFileError, WorkerError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.changes.record import ChangedGround, ChangeGrid
 from orthonav.ground.check import trials, views
 from orthonav.ground.check.persistence import MARGIN_PX
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.trials import run_many
 from orthonav.ground.check.views import OrthoPyramid, TrialPlan, require_overlap
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 WEST = np.array([[-250.0, 60.0], [-180.0, -90.0], [-300.0, 120.0], [-220.0, 0.0], [-330.0, -60.0]])
@@ -163,7 +163,7 @@ def test_workers_always_end(plan, how):
 
 def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
     path = tmp_path / "tiles.onav"
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
     build_map(BuildRequest([half_blank.past], path, tile_px=128, overlap=0.5, registration=False))
     with pytest.raises(MapFileError, match="registration layer"):
         run_trials(TrialPlan(CheckRequest(path, camera=CAMERA), 120.0), WEST[:1])

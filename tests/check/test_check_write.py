@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from made_check import EVIL, FILES, lost_in, made_cells, small_route
 
-from orthonav.errors import MissingExtraError, OutputError
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.mapfile import open_map
 from orthonav.ground.check.outcome import Conditions
 from orthonav.ground.check.write import require_free, write_check
 from orthonav.ground.check.write.folder import tif_bytes
 from orthonav.ground.check.write.plain import to_json, to_plain
 from orthonav.ground.check.write.shapes import features, to_geojson
 from orthonav.ground.check.write.wording import text
-from orthonav.mapfile import open_map
-from orthonav.report import Drawing
+from orthonav.ground.report import Drawing
 
 KINDS = ("tiny", "small_route", "long_route", "nearly_empty")
 FRAME = LocalFrame(48.2, -3.1)
@@ -44,7 +44,7 @@ def written(opened, frame, tmp_path_factory):
     result = small_route(frame)
     folder = tmp_path_factory.mktemp("written") / "check"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.report.canvas.DPI", 20)
+        patch.setattr("orthonav.ground.report.canvas.DPI", 20)
         write_check(result, opened, folder)
     return result, folder
 
@@ -77,7 +77,7 @@ def tree(folder):
 
 @pytest.mark.long
 def test_the_same_check_gives_the_same_bytes(written, opened, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.report.canvas.DPI", 20)
+    monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 20)
     result, folder = written
     write_check(result, opened, tmp_path / "again")
     assert tree(folder) == tree(tmp_path / "again")

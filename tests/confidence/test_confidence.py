@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.confidence.logistic import (
+from orthonav.core.errors import VariantError
+from orthonav.core.localize.logistic import (
     FEATURES,
     USUAL,
     LogisticConfidence,
     fit_few,
     fit_logistic,
 )
-from orthonav.confidence.ratios import MAX_RATIO, lowe_ratio, peak_ratio, rival_score
-from orthonav.errors import VariantError
+from orthonav.core.localize.ratios import MAX_RATIO, lowe_ratio, peak_ratio, rival_score
 
 
 def scores(*values):

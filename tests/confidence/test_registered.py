@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.confidence.registered import (
+from orthonav.core.errors import VariantError
+from orthonav.core.localize.registered import (
     BEFORE_PHASE,
     BIAS_BEFORE_PHASE,
     CHANCES,
@@ -22,8 +23,7 @@ from orthonav.confidence.registered import (
     features_of,
     fit_registered,
 )
-from orthonav.errors import VariantError
-from orthonav.records import CONFIDENT
+from orthonav.core.records import CONFIDENT
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
 MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)

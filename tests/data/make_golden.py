@@ -13,11 +13,11 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.mapfile import GreyLayer, open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, Telemetry, View
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import GreyLayer, open_map
+from orthonav.core.records import Fix, Telemetry, View
+from orthonav.ground.build import BuildRequest, build_map
 
 HERE = Path(__file__).parent
 MAP, VIEW = HERE / "golden_v1.onav", HERE / "golden_view.png"

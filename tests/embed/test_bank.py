@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav import represent
-from orthonav.embed.bank import CHUNK_POSES, embed_poses
-from orthonav.embed.cells import CellLayout
-from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
-from orthonav.variants import make_variant
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.bank import CHUNK_POSES, embed_poses
+from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.variants import make_variant
 
 TILE_PX = 128
 GROUND_PX = 640

@@ -8,11 +8,11 @@ import numpy as np
 import onnx
 import pytest
 
-from orthonav.embed import TABLE
-from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
-from orthonav.embed.stored import embedder_of
-from orthonav.errors import MapFileError, MissingExtraError, VariantError
-from orthonav.variants import variant_recipe
+from orthonav.core.errors import MapFileError, MissingExtraError, VariantError
+from orthonav.core.tiles.embed import TABLE
+from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.core.tiles.stored import embedder_of
+from orthonav.core.variants import variant_recipe
 
 helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
 
@@ -196,7 +196,9 @@ def strange_graphs():
 
 @pytest.mark.parametrize("model", list(strange_graphs()))
 def test_anything_but_plain_layers_is_refused_before_it_is_loaded(model, monkeypatch):
-    monkeypatch.setattr("orthonav.embed.network._onnxruntime", lambda: pytest.fail("was loaded"))
+    monkeypatch.setattr(
+        "orthonav.core.tiles.network._onnxruntime", lambda: pytest.fail("was loaded")
+    )
     with pytest.raises(MapFileError, match=r"encoder (holds|needs)"):
         embedder(model)
 

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav import embed, represent
-from orthonav.embed.cells import MICRO, CellLayout
-from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn, pooled_features
-from orthonav.errors import AreaError, VariantError
-from orthonav.variants import make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.errors import AreaError, VariantError
+from orthonav.core.tiles import embed, represent
+from orthonav.core.tiles.cells import MICRO, CellLayout
+from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn, pooled_features
+from orthonav.core.variants import make_variant, variant_from_recipe, variant_recipe
 
 TILE_PX = 128
 SHEET_PX = 384
@@ -237,12 +237,12 @@ def test_the_same_bytes_every_time(place):
 
 def test_chunks_do_not_matter(place, monkeypatch):
     stored = place.embedder.tiles(place.sheet, place.tiles_px)
-    monkeypatch.setattr("orthonav.embed.whitened.CHUNK_TILES", 7)
+    monkeypatch.setattr("orthonav.core.tiles.whitened.CHUNK_TILES", 7)
     np.testing.assert_allclose(place.embedder.tiles(place.sheet, place.tiles_px), stored, atol=2e-3)
 
 
 def test_a_share_of_many_tiles_is_learnt_from(place, monkeypatch):
-    monkeypatch.setattr("orthonav.embed.whitened.MAX_LEARNT_TILES", 100)
+    monkeypatch.setattr("orthonav.core.tiles.whitened.MAX_LEARNT_TILES", 100)
     thinned = learn(place.embedder.recipe, place.sheet, place.tiles_px)
     taken = learn(place.embedder.recipe, place.sheet, place.tiles_px[::3])
     assert thinned.basis.tobytes() == taken.basis.tobytes()

@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.embed.words import (
+from orthonav.core.errors import MissingExtraError, VariantError
+from orthonav.core.tiles.gray import Gray
+from orthonav.core.tiles.words import (
     WordsEmbedder,
     WordsRecipe,
     describe,
 )
-from orthonav.errors import MissingExtraError, VariantError
-from orthonav.neural.words import learn_words
-from orthonav.represent.gray import Gray
-from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.research.words import learn_words
 
-TABLE = {"bovw": Variant("orthonav.embed.words:WordsRecipe")}
+TABLE = {"bovw": Variant("orthonav.core.tiles.words:WordsRecipe")}
 NOTHING = np.zeros(0, np.float32)
 
 
@@ -246,7 +246,7 @@ def test_learning_is_deterministic_and_seeded():
 
 def test_large_samples_are_drawn_evenly(monkeypatch):
     """More descriptors than are wanted: every picture still has its share."""
-    import orthonav.neural.words as words
+    import orthonav.research.words as words
 
     sample = words._Sample(1000, seed=3)
     for number in range(50):
@@ -336,7 +336,7 @@ def test_sift_words_need_no_torch_and_no_faiss():
     script = """
 import sys
 import numpy as np
-from orthonav.embed.words import WordsEmbedder, WordsRecipe
+from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe
 
 rng = np.random.default_rng(0)
 words = rng.integers(0, 99, (256, 128), dtype=np.uint8)

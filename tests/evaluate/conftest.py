@@ -2,7 +2,7 @@
 
 import pytest
 
-from orthonav.report import Drawing
+from orthonav.ground.report import Drawing
 
 CALIBRATION = ("calibration_plots.draw_axes", "calibration_plots.draw_figure")
 NOTHING = Drawing(b"", "", (1.0, 1.0))
@@ -11,7 +11,7 @@ NOTHING = Drawing(b"", "", (1.0, 1.0))
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of few pixels, which is fast."""
-    monkeypatch.setattr("orthonav.report.canvas.DPI", 20)
+    monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 20)
 
 
 @pytest.fixture

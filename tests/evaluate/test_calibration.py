@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from orthonav.errors import FlightError
-from orthonav.flight.fixes import result_from_json, result_to_json
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.fixes import result_from_json, result_to_json
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     N_BINS,
     NEES_LEVELS,
@@ -40,7 +41,6 @@ from orthonav.ground.evaluate.metrics import (
     wrong_key,
 )
 from orthonav.ground.evaluate.report import write_report
-from orthonav.records import Fix, ViewResult
 
 RADIUS_M = 20.0
 RIGHT_M, WRONG_M = 3.0, 300.0

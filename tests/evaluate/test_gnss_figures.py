@@ -6,12 +6,12 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from orthonav.flight.fixes import write_results
-from orthonav.flight.gnss import BIASES, FAULTS, fault_of
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight.fixes import write_results
+from orthonav.core.flight.gnss import BIASES, FAULTS, fault_of
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.gnss import gnss_rows, gnss_to_json, measure_gnss
 from orthonav.ground.evaluate.metrics import compare
-from orthonav.records import Fix, NoFix, ViewResult
 
 FRAME = LocalFrame(48.0, 2.0)
 STEP = float(FAULTS.index("gnss_step") + 1)

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from orthonav.errors import FlightError
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import FlightError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.calibration_report import nees_text
 from orthonav.ground.evaluate.figures import upper_bound
 from orthonav.ground.evaluate.flights import verdict
@@ -24,7 +25,6 @@ from orthonav.ground.evaluate.metrics import (
     radius_key,
     worst_views,
 )
-from orthonav.records import Fix, NoFix, ViewResult
 
 CENTRE = LocalFrame(48.0, -4.5)
 TRUTH_EN_M = {"a": (0.0, 0.0), "b": (100.0, 0.0), "c": (200.0, 50.0), "d": (300.0, 50.0)}

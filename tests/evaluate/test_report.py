@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import MissingExtraError
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import MissingExtraError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate import plots
 from orthonav.ground.evaluate.calibration_report import covariance_card
 from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, table, total
 from orthonav.ground.evaluate.metrics import compare, measure
 from orthonav.ground.evaluate.report import MadeFrom, write_report
-from orthonav.records import Fix, NoFix, ViewResult
-from orthonav.report import Background, Drawing, measure_text
+from orthonav.ground.report import Background, Drawing, measure_text
 
 CENTRE = LocalFrame(48.0, -4.5)
 PICTURES_PER_FLIGHT = 6
@@ -205,7 +205,7 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
 
 
 def test_the_map_shows_right_and_wrong_and_the_background(monkeypatch) -> None:
-    monkeypatch.setattr("orthonav.report.canvas.DPI", 80)
+    monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 80)
     flight = made_flight(80)
     plain = decoded(plots.map_picture(flight.comparison, 15.0))
     over = decoded(plots.map_picture(flight.comparison, 15.0, noisy_background()))
@@ -265,7 +265,7 @@ def test_matplotlib_is_imported_for_drawing_and_pyplot_never() -> None:
         "unwanted = {'matplotlib', 'jinja2', 'PIL', 'torch', 'rasterio', 'pyproj'}\n"
         "assert not unwanted & set(sys.modules)\n"
         "from orthonav.ground.evaluate import metrics, plots\n"
-        "from orthonav.records import NoFix, ViewResult\n"
+        "from orthonav.core.records import NoFix, ViewResult\n"
         "result = ViewResult('a', 0, NoFix('blank', ''), 1.0)\n"
         "plots.map_picture(metrics.compare({'a': (48.0, -4.5)}, [result]), 15.0)\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"

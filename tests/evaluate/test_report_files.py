@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.errors import MissingExtraError, OutputError
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.flights import FlightReport
 from orthonav.ground.evaluate.metrics import compare, measure
 from orthonav.ground.evaluate.plots import fix_classes, map_picture, over_time_picture
 from orthonav.ground.evaluate.report import write_report
-from orthonav.records import Fix, NoFix, ViewResult
-from orthonav.report.figures import LIST
+from orthonav.ground.report.figures import LIST
 
 CENTRE = LocalFrame(48.0, -4.5)
 GENERAL = {"map", "error-over-time", "error-curve", "accepted-against-accuracy"}
@@ -48,7 +48,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a report, drawn once."""
     folder = tmp_path_factory.mktemp("drawn")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.report.canvas.DPI", 20)
+        patch.setattr("orthonav.ground.report.canvas.DPI", 20)
         write_report(folder, [flown("one")])
     return folder
 

@@ -13,12 +13,15 @@ from scipy.stats import chi2
 
 from helpers import textured
 from orthonav.cli import main
-from orthonav.errors import FlightError
-from orthonav.flight.fixes import write_results
-from orthonav.flight.writer import FlightWriter
-from orthonav.geo.camera import Camera, camera_from_en
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.fixes import write_results
+from orthonav.core.flight.writer import FlightWriter
+from orthonav.core.geo.camera import Camera, camera_from_en
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.layer import GreyLayer
+from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.contact_sheet import (
     Row,
     row_text,
@@ -51,10 +54,7 @@ from orthonav.ground.evaluate.track_plots import (
     track_map_picture,
 )
 from orthonav.ground.evaluate.track_report import track_rows
-from orthonav.mapfile import open_map
-from orthonav.mapfile.layer import GreyLayer
-from orthonav.records import Fix, NoFix, Telemetry, ViewResult
-from orthonav.report import Drawing
+from orthonav.ground.report import Drawing
 
 CENTRE = LocalFrame(48.0, -4.5)
 COV = np.array([[25.0, 12.0], [12.0, 16.0]])
@@ -413,7 +413,7 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
 
 @pytest.mark.long
 def test_pictures_tell_states_apart_by_colour(monkeypatch) -> None:
-    monkeypatch.setattr("orthonav.report.canvas.DPI", 80)
+    monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 80)
     states = ["searching"] * 10 + ["tracking"] * 10 + ["coasting"] * 5 + ["lost"] * 5
     comparison, results = flown(drawn(30), states)
     track = measure_track(comparison, results, 15.0)

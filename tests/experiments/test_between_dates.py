@@ -8,7 +8,7 @@ import torch
 from experiments.paper import between_dates as between
 from experiments.paper.methods import BETWEEN_DATES
 
-from orthonav.represent.learned import LearnedEdges
+from orthonav.core.tiles.learned import LearnedEdges
 
 
 def dates(seed=0, size=150):

@@ -12,7 +12,7 @@ SMALL = replace(TABLE_1["B"], length_m=128.0, band_m=64.0)
 
 @pytest.mark.slow  # an experiment
 def test_only_views_beyond_the_radius_are_shown(tmp_path, area, monkeypatch):
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 8)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 8)
     scene = scenes.Scene("B", area.past, area.past, SMALL)
     localizer = exceptions.localizer_of(scene, tmp_path)
     assert list(exceptions.wrong(scene, localizer, 2)) == []

@@ -16,11 +16,11 @@ from experiments.paper.results import Result, read
 from experiments.paper.tables import tables
 from experiments.paper.trajectories import FULL, REDUCED, TABLE_1
 
-from orthonav.geo.camera import Camera
-from orthonav.geo.grid import TileGrid
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import Telemetry, View
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Telemetry, View
 
 CAMERA = Camera(256, 256, 500.0, 500.0, 128.0, 128.0)
 REPORTED = Telemetry(0, 0.0, 0.0, 0.0, 500.0, yaw_std_deg=5.0, agl_std_m=15.0)
@@ -148,7 +148,7 @@ def placed(tmp_path_factory, area):
     place = runs.Workplace(tmp_path_factory.mktemp("field"), setting, "test")
     scene = scenes.Scene("B", area.past, area.present, SMALL)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 8)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 8)
         runs.run(place, scene, Method("gradient", "gradient", "gradient"))
         names = {"SIFT, ratio test": Sift}
         patch.setattr(matchers, "LOCAL", names)
@@ -205,7 +205,7 @@ def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
     out.write_text(json.dumps(plain))
     assert field.run(place, scene) and asked == ["gradient-gradient"]
     plain = json.loads(whole)
-    plain["code"]["src/orthonav/embed/whitened.py"] = "0" * 12
+    plain["code"]["src/orthonav/core/tiles/whitened.py"] = "0" * 12
     out.write_text(json.dumps(plain))
     assert field.run(place, scene) and asked[1:] == ["gradient-gradient"]
     plain["code"]["experiments/paper/matchers.py"] = "0" * 12
@@ -220,8 +220,8 @@ def test_a_row_of_the_field_is_checked_and_shown(placed):
     (row,) = [each for each in read(place.results) if "field" in each.plain]
     assert stored.name_of(row) == "B-field" and stored.older(row) == ["setting"]
     row.plain["code"]["experiments/paper/matchers.py"] = "0" * 12
-    row.plain["code"]["src/orthonav/embed/whitened.py"] = "0" * 12  # of a map that is flown
-    changed = ["experiments/paper/matchers.py", "setting", "src/orthonav/embed/whitened.py"]
+    row.plain["code"]["src/orthonav/core/tiles/whitened.py"] = "0" * 12  # of a map that is flown
+    changed = ["experiments/paper/matchers.py", "setting", "src/orthonav/core/tiles/whitened.py"]
     assert sorted(stored.older(row)) == changed
     shown = "\n".join(table.markdown() for table in tables([row]))
     assert "| orthonav, embedding only" in shown and "| the prior itself" in shown
@@ -247,7 +247,7 @@ def test_learnt_edges_are_tuned_on_generated_landscapes():
     assert not tuned(learnt.family, learnt.recipe, "tours", "onnx")
     caevl = rows["caevl-canny"]
     assert not tuned(caevl.family, caevl.recipe, "B", caevl.edges)
-    assert stored.code_of(Method(**asdict(caevl)), "B")["src/orthonav/neural/vicreg.py"]
+    assert stored.code_of(Method(**asdict(caevl)), "B")["src/orthonav/research/vicreg.py"]
 
 
 def test_features_count_what_an_aircraft_carries():

@@ -15,13 +15,13 @@ from experiments.paper.results import accepted_at, ceiling, confident, read
 from experiments.paper.tables import report
 from experiments.paper.trajectories import FULL, GPU, REDUCED, TABLE_1, dry, epochs
 
-from orthonav.errors import AreaError, MissingFileError
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import View
+from orthonav.core.errors import AreaError, MissingFileError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import View
+from orthonav.ground.planning.area import Area
 
 SMALL = replace(TABLE_1["B"], name="B", length_m=320.0, band_m=288.0)
 
@@ -97,7 +97,7 @@ def scene(area):
 @pytest.fixture(scope="module")
 def made(place, scene):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 8)  # no confidence is looked at
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 8)  # no confidence is looked at
         return runs.run(place, scene, Method("gradient", "gradient", "gradient"))
 
 
@@ -349,7 +349,7 @@ def test_what_a_series_takes_is_said(scene, tmp_path):
 @pytest.mark.slow  # an experiment
 def test_a_dry_run_goes_through_every_step(scene, tmp_path, monkeypatch):
     """A small network, from imagery to the tables; no checkpoint is left."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 8)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 8)
     setting = dry(replace(REDUCED, encoder_width=8))
     there = runs.Workplace(tmp_path, setting, "test", device="cpu", workers=1)
     flown = scene.of(setting)

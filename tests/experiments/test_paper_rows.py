@@ -59,12 +59,12 @@ def test_a_row_of_todays_code_is_current():
 @pytest.mark.parametrize(
     "key, path",
     [
-        ("autoencoder-canny", "src/orthonav/neural/autoencoder.py"),
-        ("autoencoder-canny", "src/orthonav/represent/canny.py"),
-        ("triplet-gray", "src/orthonav/neural/triplet.py"),
-        ("gradient-gradient", "src/orthonav/embed/whitened.py"),
-        ("gradient-gradient-registration", "src/orthonav/register/registrar.py"),
-        ("bovw-gray-256", "src/orthonav/embed/words.py"),
+        ("autoencoder-canny", "src/orthonav/research/autoencoder.py"),
+        ("autoencoder-canny", "src/orthonav/core/tiles/canny.py"),
+        ("triplet-gray", "src/orthonav/research/triplet.py"),
+        ("gradient-gradient", "src/orthonav/core/tiles/whitened.py"),
+        ("gradient-gradient-registration", "src/orthonav/core/register/registrar.py"),
+        ("bovw-gray-256", "src/orthonav/core/tiles/words.py"),
     ],
 )
 def test_a_row_older_than_its_code_is_named(key, path):
@@ -90,8 +90,8 @@ def test_a_row_of_another_recipe_or_setting_is_named():
     made = row()
     made.plain["method"]["recipe"] = "autoencoder:width=8"
     made.plain["setting"]["views"] = 1
-    del made.plain["code"]["src/orthonav/embed/network.py"]
-    assert stored.older(made) == ["src/orthonav/embed/network.py", "setting", "recipe"]
+    del made.plain["code"]["src/orthonav/core/tiles/network.py"]
+    assert stored.older(made) == ["src/orthonav/core/tiles/network.py", "setting", "recipe"]
 
 
 def test_comments_and_docstrings_are_not_code(tmp_path):

@@ -11,11 +11,11 @@ import servers
 import terrain
 from servers import QUICK
 
-from orthonav.fetch.options import ImageryOptions
-from orthonav.fetch.run import FetchRequest, fetch
-from orthonav.fetch.sources import parse_source
-from orthonav.fetch.write import Packing
-from orthonav.geo.area import Area
+from orthonav.ground.fetch.options import ImageryOptions
+from orthonav.ground.fetch.run import FetchRequest, fetch
+from orthonav.ground.fetch.sources import parse_source
+from orthonav.ground.fetch.write import Packing
+from orthonav.ground.planning.area import Area
 
 MAPPROXY = """
 services:

@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 import terrain
 
-from orthonav.fetch.politeness import RequestLimits
+from orthonav.ground.fetch.politeness import RequestLimits
 
 QUICK = RequestLimits(parallel=4, per_second=2000, attempts=3, backoff_s=0.01, backoff_max_s=0.02)
 

@@ -11,14 +11,14 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from orthonav.errors import FetchError
-from orthonav.fetch import wms, wmts
-from orthonav.fetch.client import Client
-from orthonav.fetch.crs import MERCATOR_HALF_M
-from orthonav.fetch.documents import parse_xml
-from orthonav.fetch.options import ImageryOptions, Provenance, SourceSpec
-from orthonav.fetch.presets import presets
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import FetchError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.fetch import wms, wmts
+from orthonav.ground.fetch.client import Client
+from orthonav.ground.fetch.crs import MERCATOR_HALF_M
+from orthonav.ground.fetch.documents import parse_xml
+from orthonav.ground.fetch.options import ImageryOptions, Provenance, SourceSpec
+from orthonav.ground.fetch.presets import presets
 
 FOLDER = Path(__file__).parent / "capabilities"
 PROVENANCE = Provenance("", "")

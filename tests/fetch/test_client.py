@@ -12,10 +12,16 @@ import pytest
 import servers
 from servers import QUICK
 
-from orthonav.errors import FetchError
-from orthonav.fetch.client import BadReplyError, Client
-from orthonav.fetch.politeness import RequestLimits, Stopped, Turns, retry_after_s, retry_policy
-from orthonav.fetch.urls import Secret
+from orthonav.core.errors import FetchError
+from orthonav.ground.fetch.client import BadReplyError, Client
+from orthonav.ground.fetch.politeness import (
+    RequestLimits,
+    Stopped,
+    Turns,
+    retry_after_s,
+    retry_policy,
+)
+from orthonav.ground.fetch.urls import Secret
 
 SECRET = "s3cr3t-v4lue"
 

@@ -12,8 +12,8 @@ import rasterio
 import servers
 import terrain
 
-from orthonav.errors import FetchError, OutputError
-from orthonav.fetch.download import FileCache
+from orthonav.core.errors import FetchError, OutputError
+from orthonav.ground.fetch.download import FileCache
 
 NOISE = np.random.default_rng(1).integers(1, 255, (256, 256, 3), dtype=np.uint8)
 PLACEHOLDER = terrain.encoded(NOISE)

@@ -10,7 +10,7 @@ import servers
 import terrain
 
 from orthonav.cli import main
-from orthonav.imagery.source import open_source
+from orthonav.ground.imagery.source import open_source
 
 SECRET = "t0ken-of-mine"
 

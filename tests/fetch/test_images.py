@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from orthonav.fetch.client import BadReplyError, HttpReply, bad_status
-from orthonav.fetch.images import decode, image_or_absent
+from orthonav.ground.fetch.client import BadReplyError, HttpReply, bad_status
+from orthonav.ground.fetch.images import decode, image_or_absent
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.integers(1, 255, (256, 256, 3), dtype=np.uint8)

@@ -7,10 +7,10 @@ from xml.sax.saxutils import escape
 import pytest
 import servers
 
-from orthonav.errors import FetchError, OutputError
-from orthonav.fetch import package
-from orthonav.fetch.client import Client
-from orthonav.fetch.package import (
+from orthonav.core.errors import FetchError, OutputError
+from orthonav.ground.fetch import package
+from orthonav.ground.fetch.client import Client
+from orthonav.ground.fetch.package import (
     PackageFile,
     download_package,
     find_package,

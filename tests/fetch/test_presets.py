@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from orthonav.errors import FetchError
-from orthonav.fetch.options import ImageryOptions
-from orthonav.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
-from orthonav.fetch.sources import check_date, parse_source
-from orthonav.fetch.urls import checked_url
-from orthonav.imagery.datum import datum_of
+from orthonav.core.errors import FetchError
+from orthonav.ground.fetch.options import ImageryOptions
+from orthonav.ground.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
+from orthonav.ground.fetch.sources import check_date, parse_source
+from orthonav.ground.fetch.urls import checked_url
+from orthonav.ground.imagery.datum import datum_of
 
 DOCUMENTATION = Path(__file__).parents[2] / "docs" / "imagery.md"
 

@@ -11,17 +11,17 @@ import terrain
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from orthonav.errors import FetchError
-from orthonav.fetch.client import Client
-from orthonav.fetch.options import ImageryOptions
-from orthonav.fetch.presets import find_preset
-from orthonav.fetch.remote import CHUNK, RemoteFile
-from orthonav.fetch.run import FetchRequest, fetch
-from orthonav.fetch.sources import parse_source
-from orthonav.fetch.write import Packing
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.terrain import open_dem
+from orthonav.core.errors import FetchError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.fetch.client import Client
+from orthonav.ground.fetch.options import ImageryOptions
+from orthonav.ground.fetch.presets import find_preset
+from orthonav.ground.fetch.remote import CHUNK, RemoteFile
+from orthonav.ground.fetch.run import FetchRequest, fetch
+from orthonav.ground.fetch.sources import parse_source
+from orthonav.ground.fetch.write import Packing
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.planning.area import Area
 
 UTM = "EPSG:32631"
 
@@ -332,7 +332,7 @@ def test_a_terrain_preset_is_fetched_with_its_datum(catalogue, tmp_path, monkeyp
             find_preset("copernicus-dem"),
             url=f"{server.url}/api/", token_url=f"{server.url}/api/token",
         )  # fmt: skip
-        monkeypatch.setattr("orthonav.fetch.sources.find_preset", lambda name: known)
+        monkeypatch.setattr("orthonav.ground.fetch.sources.find_preset", lambda name: known)
         spec = parse_source("copernicus-dem", ImageryOptions())
         area = Area.from_bounds(terrain.bounds(300))
         fetch(FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK))

@@ -9,14 +9,14 @@ import servers
 import terrain
 from pyproj import Transformer
 
-from orthonav.errors import AreaError, FetchError
-from orthonav.fetch.options import ImageryOptions
-from orthonav.fetch.presets import find_preset
-from orthonav.fetch.run import FetchRequest, fetch
-from orthonav.fetch.sources import parse_source
-from orthonav.geo.area import Area
-from orthonav.imagery.source import open_source
-from orthonav.imagery.terrain import open_dem
+from orthonav.core.errors import AreaError, FetchError
+from orthonav.ground.fetch.options import ImageryOptions
+from orthonav.ground.fetch.presets import find_preset
+from orthonav.ground.fetch.run import FetchRequest, fetch
+from orthonav.ground.fetch.sources import parse_source
+from orthonav.ground.imagery.source import open_source
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.planning.area import Area
 
 MAX_OFF_PX = 0.05
 
@@ -89,7 +89,7 @@ def test_tiles_of_the_web_grid(take):
 
 
 def test_rows_from_the_south_quadkeys_and_large_tiles(take):
-    from orthonav.fetch.xyz import quadkey
+    from orthonav.ground.fetch.xyz import quadkey
 
     def answer(asked):
         kind, *rest = asked.path.strip("/").split("/")
@@ -122,7 +122,7 @@ def test_rows_from_the_south_quadkeys_and_large_tiles(take):
 
 
 def test_a_band_around_a_route_leaves_the_rest_out(take, tmp_path):
-    from orthonav.geo.route import Route
+    from orthonav.ground.planning.route import Route
 
     west, south, east, north = terrain.bounds(500)
     route = Route(((south, west), (north, east)))
@@ -224,7 +224,7 @@ def test_heights_of_a_wms(tmp_path, monkeypatch, broken):
     with servers.serving(answer) as server:
         url.append(server.url)
         known = replace(find_preset("ign-terrain"), url=server.url)
-        monkeypatch.setattr("orthonav.fetch.sources.find_preset", lambda name: known)
+        monkeypatch.setattr("orthonav.ground.fetch.sources.find_preset", lambda name: known)
         area = Area.from_bounds(terrain.bounds(60))
         spec = parse_source("ign-terrain", ImageryOptions(tile_px=128))
         request = FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK)

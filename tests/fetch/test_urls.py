@@ -2,8 +2,8 @@
 
 import pytest
 
-from orthonav.errors import FetchError
-from orthonav.fetch import urls
+from orthonav.core.errors import FetchError
+from orthonav.ground.fetch import urls
 
 
 @pytest.mark.parametrize(

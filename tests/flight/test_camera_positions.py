@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from orthonav.errors import VariantError
-from orthonav.flight.export import CSV_COLUMNS, camera_positions, export, export_of
-from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.core.errors import VariantError
+from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.ground.recordings.export import CSV_COLUMNS, camera_positions, export, export_of
 
 
 def result(frame, lat_deg, lon_deg, confidence=0.97, heading_deg=271.5):

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight.fixes import (
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.flight.fixes import (
     GROUND_KEYS,
     KEYS,
     POSE_KEYS,
@@ -20,7 +20,7 @@ from orthonav.flight.fixes import (
     result_to_json,
     write_results,
 )
-from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.core.records import Fix, NoFix, ViewResult
 
 FIX_LINE = {
     "frame": "a.jpg",

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import CameraError, FlightError, MissingFileError, OutputError
-from orthonav.flight import FlightWriter, open_flight, read_image, read_truth
-from orthonav.geo.camera import Camera
-from orthonav.records import Prior, Telemetry
+from orthonav.core.errors import CameraError, FlightError, MissingFileError, OutputError
+from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Prior, Telemetry
 
 CAMERA = Camera(64, 48, 60.0, 61.5, 32.25, 23.75, (0.01, -0.02, 1e-4, 2e-4))
 FULL = Telemetry(
@@ -199,7 +199,7 @@ def test_missing_folders(folder):
 
 
 def test_huge_telemetry_is_refused(folder, monkeypatch):
-    monkeypatch.setattr("orthonav.flight.folder.MAX_TEXT_BYTES", 10)
+    monkeypatch.setattr("orthonav.core.flight.folder.MAX_TEXT_BYTES", 10)
     refused(folder, "larger than")
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight.gnss import GnssSample, read_gnss, write_gnss
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.flight.gnss import GnssSample, read_gnss, write_gnss
 
 S = 10**9
 FULL = GnssSample(9 * S, 10 * S, 48.1, 2.2, 3, 1.5, (3.0, -4.0), 12, 9 * S, 1)

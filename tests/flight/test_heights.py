@@ -6,16 +6,16 @@ import re
 import numpy as np
 import pytest
 
-from orthonav.flight.heights import (
+from orthonav.core.flight.heights import (
     MISMATCH_M,
     FlownHeights,
     GroundHeights,
     assumed_heights,
     is_measured,
 )
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.ground import Ground, ground_around, ground_over
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.ground import Ground, ground_around, ground_over
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry
 
 FRAME = LocalFrame(46.5, 2.5)
 SLOPE = 0.1

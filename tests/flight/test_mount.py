@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight.mount import Bias, Mount, MountedFlight, read_mount, write_mount
-from orthonav.records import Telemetry
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.flight.mount import Bias, Mount, MountedFlight, read_mount, write_mount
+from orthonav.core.records import Telemetry
 
 Recorded = partial(SimpleNamespace, camera="camera", note="note", expected=1)
 MOUNT = Mount(

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.errors import FlightError
-from orthonav.flight.pixel import locate_pixel
-from orthonav.geo.camera import Camera, ground_en_m
-from orthonav.geo.frames import LocalFrame
-from orthonav.records import Fix, Telemetry
+from orthonav.core.errors import FlightError
+from orthonav.core.geo.camera import Camera, ground_en_m
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, Telemetry
+from orthonav.ground.recordings.pixel import locate_pixel
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 FRAME = LocalFrame(48.0, 2.0)

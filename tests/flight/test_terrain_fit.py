@@ -5,8 +5,8 @@ import logging
 import numpy as np
 import pytest
 
-from orthonav.flight.terrain_fit import TerrainFit
-from orthonav.records import Fix
+from orthonav.core.flight.terrain_fit import TerrainFit
+from orthonav.core.records import Fix
 
 
 def hills(shift_deg=0.0, more_m=0.0, hole=False):
@@ -48,7 +48,7 @@ def test_what_does_not_fit_is_named_once(terrain, named, caplog):
 
 def test_a_long_flight_is_judged_by_its_latest_views(caplog, monkeypatch):
     """A wrong datum is named once most of them lie on the part of the terrain that has it."""
-    monkeypatch.setattr("orthonav.flight.terrain_fit.MAX_VIEWS", 40)
+    monkeypatch.setattr("orthonav.core.flight.terrain_fit.MAX_VIEWS", 40)
 
     def joined(lat, lon):
         return np.where(np.asarray(lon) < 2.005, 200.0, 260.0)

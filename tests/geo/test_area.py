@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod
 
-from orthonav.errors import AreaError
-from orthonav.geo.area import Area
-from orthonav.geo.grid import TileGrid
-from orthonav.geo.route import Route
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.grid import TileGrid
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 GEOD = Geod(ellps="WGS84")
 offsets_deg = st.floats(-0.03, 0.03)

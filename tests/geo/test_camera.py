@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from orthonav.errors import CameraError
-from orthonav.geo.camera import (
+from orthonav.core.errors import CameraError
+from orthonav.core.geo.camera import (
     Camera,
     axis_on_ground_en_m,
     camera_from_en,

@@ -8,8 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
-from orthonav.errors import AreaError
-from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 
 HALF_DIAGONAL_M = MAX_SHEET_M / math.sqrt(2)
 ONE_MM = 1e-3

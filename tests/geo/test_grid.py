@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import AreaError
-from orthonav.geo.grid import TileGrid
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.grid import TileGrid
 
 coordinates = st.floats(-25_000, 25_000)
 shares = st.floats(0, 1)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import CameraError
-from orthonav.geo.camera import Camera, attitude_of, distort, enu_from_camera, undistort
+from orthonav.core.errors import CameraError
+from orthonav.core.geo.camera import Camera, attitude_of, distort, enu_from_camera, undistort
 
 PLANE = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 13), np.linspace(-0.5, 0.5, 11)), axis=-1)
 BROWN = [(-0.28, 0.09, 1e-3, -5e-4), (0.12, 0.02, -2e-3, 1e-3, 0.01), (-0.1, 0, 0, 0)]

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.errors import AreaError
-from orthonav.geo import estimate
-from orthonav.geo.area import Area
-from orthonav.geo.estimate import estimate_map
-from orthonav.geo.grid import TileGrid
-from orthonav.geo.route import Route, read_route
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.grid import TileGrid
+from orthonav.ground.planning import estimate
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.estimate import estimate_map
+from orthonav.ground.planning.route import Route, read_route
 
 L_ROUTE = Route(((46.5, 2.5), (46.53, 2.5), (46.53, 2.56)), leg_bands_m=(200, 900))
 

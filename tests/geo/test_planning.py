@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import CameraError, RouteError
-from orthonav.geo.camera import Camera, footprint_en_m
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.planning import (
+from orthonav.core.errors import CameraError, RouteError
+from orthonav.core.geo.camera import Camera, footprint_en_m
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.planning.route import Height, Route
+from orthonav.ground.planning.spacing import (
     FINEST_IMAGERY_M,
     LEAST_TILE_SHARE,
     ViewPlan,
@@ -19,8 +20,7 @@ from orthonav.geo.planning import (
     suited_tile_px,
     view_cautions,
 )
-from orthonav.geo.route import Height, Route
-from orthonav.geo.terrain import profile, terrain_cautions
+from orthonav.ground.planning.terrain import profile, terrain_cautions
 
 CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 

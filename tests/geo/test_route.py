@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pyproj import Geod
 
-from orthonav.errors import MissingFileError, RouteError
-from orthonav.geo import route as route_module
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import (
+from orthonav.core.errors import MissingFileError, RouteError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.planning import route as route_module
+from orthonav.ground.planning.route import (
     Height,
     Route,
     along_polyline_en_m,
@@ -25,7 +25,7 @@ from orthonav.geo.route import (
     read_route,
     within_bands,
 )
-from orthonav.geo.routes.geojson import read_geojson, to_geojson
+from orthonav.ground.planning.routes.geojson import read_geojson, to_geojson
 
 GEOD = Geod(ellps="WGS84")
 WAYPOINTS = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))

@@ -6,9 +6,9 @@ from io import BytesIO
 
 import pytest
 
-from orthonav.errors import RouteError
-from orthonav.geo.route import Height, read_route
-from orthonav.geo.routes import kml, markup
+from orthonav.core.errors import RouteError
+from orthonav.ground.planning.route import Height, read_route
+from orthonav.ground.planning.routes import kml, markup
 
 BAD_LATITUDE = "a latitude within 90"
 PLACES = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))

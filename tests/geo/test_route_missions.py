@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from orthonav.errors import RouteError
-from orthonav.geo.route import Height, Route, read_route
+from orthonav.core.errors import RouteError
+from orthonav.ground.planning.route import Height, Route, read_route
 
 HOME = [47.3977419, 8.545594, 487.989]
 A, B, C = (47.40, 8.55), (47.41, 8.56), (47.42, 8.57)

@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod
 
-from orthonav.errors import RouteError
-from orthonav.geo.area import Area
-from orthonav.geo.route import Height, leg_lengths_m, read_route
-from orthonav.geo.routes.presets import TABLE_1, preset
+from orthonav.core.errors import RouteError
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Height, leg_lengths_m, read_route
+from orthonav.ground.planning.routes.presets import TABLE_1, preset
 
 GEOD = Geod(ellps="WGS84")
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import AreaError
-from orthonav.geo import sheets as sheets_module
-from orthonav.geo.area import Area
-from orthonav.geo.frames import MAX_SHEET_M
-from orthonav.geo.route import Height, Route, leg_lengths_m, read_route
-from orthonav.geo.sheets import sheets_of_bounds, sheets_of_route
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import MAX_SHEET_M
+from orthonav.ground.planning import sheets as sheets_module
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Height, Route, leg_lengths_m, read_route
+from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
 
 
 def across_m(area):

@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import AreaError, RouteError
-from orthonav.geo.area import Area
-from orthonav.geo.route import Route
-from orthonav.geo.sheets import sheets_of_bounds
-from orthonav.geo.swapped import HINT, swapped_hint
-from orthonav.geo.world import WorldSheets
+from orthonav.core.errors import AreaError, RouteError
+from orthonav.core.geo.swapped import HINT, swapped_hint
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
+from orthonav.ground.planning.sheets import sheets_of_bounds
+from orthonav.ground.planning.world import WorldSheets
 
 
 def near(lat_deg, lon_deg):

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import AreaError
-from orthonav.geo.area import Area
-from orthonav.geo.frames import MAX_SHEET_M
-from orthonav.geo.world import LARGEST_SIDE_M, SMALLEST_SIDE_M, WorldSheets
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import MAX_SHEET_M
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.world import LARGEST_SIDE_M, SMALLEST_SIDE_M, WorldSheets
 
 SIDES_M = [SMALLEST_SIDE_M, 1234.5, 10_000.0, LARGEST_SIDE_M]
 LATITUDES = st.floats(-90, 90)

@@ -10,8 +10,8 @@ from pyproj import Transformer
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import Affine
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.mosaic import Mosaic
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.imagery.mosaic import Mosaic
 
 # On the central meridian of Lambert-93: grid north is true north, the scale off by 0.1 %, so a
 # sheet laid on a raster of this projection is that raster, pixel by pixel.

@@ -9,8 +9,8 @@ from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from scipy.ndimage import binary_dilation
 
-from orthonav.errors import ImageryError
-from orthonav.imagery.mosaic import Mosaic
+from orthonav.core.errors import ImageryError
+from orthonav.ground.imagery.mosaic import Mosaic
 
 INNER = np.s_[4:-4, 4:-4]
 RGB = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
@@ -358,7 +358,7 @@ def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
 
 
 def test_more_files_than_may_be_open(tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.imagery.raster.MAX_OPEN", 2)
+    monkeypatch.setattr("orthonav.ground.imagery.raster.MAX_OPEN", 2)
     paths = []
     for index in range(5):
         strip = np.full((3, 24, SIZE), 50 * index, np.uint8)

@@ -13,9 +13,9 @@ from rasterio.control import GroundControlPoint
 from rasterio.drivers import raster_driver_extensions
 from rasterio.transform import Affine
 
-from orthonav.errors import AreaError, ImageryError, MissingFileError
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.prepare import BuildRequest, build_map
+from orthonav.core.errors import AreaError, ImageryError, MissingFileError
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.mosaic import Mosaic
 
 SCENE = smooth_scene()
 
@@ -205,8 +205,8 @@ HUGE_PX = 12_000
 READ_HUGE = """
     import sys
     from pathlib import Path
-    from orthonav.geo.frames import LocalFrame
-    from orthonav.imagery.mosaic import Mosaic
+    from orthonav.core.geo.frames import LocalFrame
+    from orthonav.ground.imagery.mosaic import Mosaic
 
     mosaic = Mosaic.open([Path(sys.argv[1])])
     for pair in sys.argv[2:]:

@@ -10,11 +10,11 @@ from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
 from orthonav.cli import main
-from orthonav.errors import ImageryError
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.imagery.names import date_of, system_of, tab_transform
-from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
+from orthonav.core.errors import ImageryError
+from orthonav.core.mapfile import open_map
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.names import date_of, system_of, tab_transform
 
 SCENE = smooth_scene(200)
 PACKAGE = "BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D003_2013-01-01"
@@ -302,7 +302,7 @@ def test_naip_swissimage_and_drones(tmp_path):
 
 @pytest.mark.long
 def test_build_from_a_folder(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
     folder = tmp_path / "ortho_2019"
     tiles(folder, side=130, size=390, scene=smooth_scene(390))
     out = tmp_path / "map.onav"

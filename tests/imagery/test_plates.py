@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from geotiffs import FRAME, LAMBERT, smooth_scene, write
 
-from orthonav.errors import ImageryError
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.imagery.plates import plate_shift_deg, plate_shift_m
+from orthonav.core.errors import ImageryError
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.plates import plate_shift_deg, plate_shift_m
 
 
 @pytest.mark.parametrize(

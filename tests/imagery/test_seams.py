@@ -8,11 +8,11 @@ import rasterio
 from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from rasterio.transform import Affine
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.lattice import CellCache
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.imagery.quiet import quiet
-from orthonav.imagery.thin import cells_of
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.imagery.lattice import CellCache
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.quiet import quiet
+from orthonav.ground.imagery.thin import cells_of
 
 BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
 
@@ -201,7 +201,7 @@ def test_hidden_files_are_not_read_and_shared_ones_once(tmp_path, monkeypatch):
         counted.append(source.path)
         return cells_of(dataset, source, *arguments)
 
-    monkeypatch.setattr("orthonav.imagery.lattice.cells_of", counting)
+    monkeypatch.setattr("orthonav.ground.imagery.lattice.cells_of", counting)
     mosaic = Mosaic.open([tmp_path / "2021", tmp_path / "2015"])
     place = {"west_m": -45, "north_m": 45, "width_px": 90, "height_px": 90, "gsd_m": 1.0}
 

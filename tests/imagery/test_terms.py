@@ -6,7 +6,7 @@ import numpy as np
 import rasterio
 
 from orthonav.cli.info import imagery_text
-from orthonav.imagery.source import open_source
+from orthonav.ground.imagery.source import open_source
 
 TAGS = {
     "ORTHONAV_ATTRIBUTION": "IGN,  BD\nORTHO",

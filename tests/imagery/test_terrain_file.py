@@ -8,10 +8,10 @@ import pytest
 import rasterio
 from rasterio.transform import Affine
 
-from orthonav.errors import ImageryError, MissingFileError
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery import datum as datums
-from orthonav.imagery.terrain import open_dem
+from orthonav.core.errors import ImageryError, MissingFileError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.imagery import datum as datums
+from orthonav.ground.imagery.terrain import open_dem
 
 FRAME = LocalFrame(46.5, 2.5)
 SIDE, PX_M = 600, 10.0

@@ -13,13 +13,13 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from orthonav.confidence.registered import Chances, RegisteredConfidence
-from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.calibrate_registration import RegistrationCalibration
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize.registered import Chances, RegisteredConfidence
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.calibrate_registration import RegistrationCalibration
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
 
 SIDE_M = 620
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -118,6 +118,6 @@ def _map_of(ortho, path):
     confidence = RegisteredConfidence.usual(Chances(18.0, 16.0, 30.0))
     learnt = RegistrationCalibration(confidence, 0.6)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
-        patch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
+        patch.setattr("orthonav.ground.build.build.calibrate_registration", lambda *_: learnt)
         build_map(BuildRequest([ortho], path, tile_px=128, overlap=0.75, gsd_m=1.0))

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.geo.camera import Camera
-from orthonav.localizer import checks
-from orthonav.localizer.checks import check_picture, check_rectified, check_telemetry
-from orthonav.localizer.rectify import RectifiedView
-from orthonav.records import Telemetry
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import checks
+from orthonav.core.localize.checks import check_picture, check_rectified, check_telemetry
+from orthonav.core.localize.rectify import RectifiedView
+from orthonav.core.records import Telemetry
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 LEVEL = Telemetry(0, 90.0, 0.0, 0.0, 100.0)

@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthonav.confidence.registered import USUAL_CHANCES, USUAL_CONFIDENCE
-from orthonav.localizer.places import places_of
-from orthonav.localizer.plan import DEFAULT_PLAN, Search, SearchPlan
-from orthonav.localizer.view_search import ViewSearch
-from orthonav.register.pose import Pose
-from orthonav.register.refine import Placed
-from orthonav.register.registrar import Levels, OwnRatios, PosePrior, Registered
-from orthonav.register.sharpness import Sharpness
+from orthonav.core.localize.places import places_of
+from orthonav.core.localize.plan import DEFAULT_PLAN, Search, SearchPlan
+from orthonav.core.localize.registered import USUAL_CHANCES, USUAL_CONFIDENCE
+from orthonav.core.localize.view_search import ViewSearch
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.refine import Placed
+from orthonav.core.register.registrar import Levels, OwnRatios, PosePrior, Registered
+from orthonav.core.register.sharpness import Sharpness
 
 LOOK = 2
 """The judged level of all views here."""
@@ -168,7 +168,7 @@ def test_over_relief_it_must_stand_out_before_the_final_level_too(monkeypatch, r
 def test_a_trial_that_there_is_no_time_for_does_not_cut_a_search_short(monkeypatch):
     """The search of the final level costs less than the trial."""
     now = [100.0]
-    monkeypatch.setattr("orthonav.localizer.plan.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("orthonav.core.localize.plan.time.monotonic", lambda: now[0])
 
     def run(view_search, each):
         now[0] += each.cost_ms / 1e3

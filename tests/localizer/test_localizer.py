@@ -10,15 +10,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import CameraError
-from orthonav.flight import read_image
-from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.simulate.render import ViewEffects, render_view
+from orthonav.core.errors import CameraError
+from orthonav.core.flight import read_image
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.simulate.render import ViewEffects, render_view
 
 EVIDENCE = {"score", "margin", "lowe_ratio", "peak_ratio", "tiles_searched", "valid_share"}
 PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0)

@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from orthonav.localizer import tracker
-from orthonav.localizer.odometry import Terrain, ViewDisplacement, over_terrain
-from orthonav.track import CameraDisplacement
+from orthonav.core.track import CameraDisplacement, tracker
+from orthonav.core.track.odometry import Terrain, ViewDisplacement, over_terrain
 
 AGL_M, HALF_M = 200.0, 100.0
 BELOW = np.zeros(2)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from blots import CAMERA, GROUND, as_grey
 
-from orthonav.geo.ground import bilinear
-from orthonav.localizer.orthorectify import (
+from orthonav.core.geo.ground import bilinear
+from orthonav.core.localize.orthorectify import (
     Orientation,
     hidden,
     node_px,
     orthorectified,
 )
-from orthonav.records import Telemetry, View
-from orthonav.simulate.perspective import Raster, random_relief, seen_view
+from orthonav.core.records import Telemetry, View
+from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
 
 PIXEL_M, POSTING_M, SIDE_M = 1.0, 10.0, 800.0
 MIDDLE_M = SIDE_M / 2

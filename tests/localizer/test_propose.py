@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.localizer.propose import peak_poses
-from orthonav.register.search import bank
+from orthonav.core.localize.propose import peak_poses
+from orthonav.core.register.search import bank
 
 STEP_RAD, SCALE_STEP = math.radians(8.0), 0.13
 

@@ -18,16 +18,16 @@ from blots import (
     rendered,
 )
 
-from orthonav.confidence.registered import RegisteredConfidence
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.localizer.candidates import ViewCandidates
-from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
-from orthonav.mapfile import GreyLayer, open_map
-from orthonav.mapfile.layer import part_names
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.candidates import ViewCandidates
+from orthonav.core.localize.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
+from orthonav.core.localize.registered import RegisteredConfidence
+from orthonav.core.mapfile import GreyLayer, open_map
+from orthonav.core.mapfile.layer import part_names
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
+from orthonav.ground.build import BuildRequest, build_map
 from orthonav.onboard.run import SingleViews, locate_view
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 
 NEVER_CLEAR = ClearMargin(1e9, 1e9, 1e9)
 LENS = replace(CAMERA, distortion=(-0.25, 0.06, 0.001, -0.002))
@@ -556,7 +556,7 @@ def test_without_registration_it_is_placed_by_its_tiles(localizer, map_path, pla
 def test_a_map_without_the_layer_is_flown_by_its_tiles(known, tmp_path, plain):
     path = tmp_path / "tiles.onav"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
         request = BuildRequest([known.ortho], path, tile_px=128, overlap=0.75, gsd_m=1.0)
         build_map(replace(request, registration=False))
     opened = open_map(path)
@@ -569,7 +569,7 @@ def test_a_map_without_the_layer_is_flown_by_its_tiles(known, tmp_path, plain):
 
 def damaged(map_path, folder):
     """A copy of the map whose chunks hold no picture, but their sums are right."""
-    from orthonav.mapfile import write_map
+    from orthonav.core.mapfile import write_map
 
     opened = open_map(map_path)
     arrays = {name: np.array(part) for name, part in opened.arrays.items()}

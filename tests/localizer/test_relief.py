@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
 
-from orthonav.geo.ground import Ground
-from orthonav.localizer import Localizer
-from orthonav.localizer.plan import DEFAULT_PLAN
-from orthonav.localizer.relief import Relief
-from orthonav.mapfile import open_map
-from orthonav.records import Fix, Telemetry, View
-from orthonav.simulate.perspective import Raster, random_relief, seen_view
+from orthonav.core.geo.ground import Ground
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.plan import DEFAULT_PLAN
+from orthonav.core.localize.relief import Relief
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, Telemetry, View
+from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
 
 SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])
@@ -204,7 +204,7 @@ def test_level_ground_is_as_without_a_terrain(opened):
 
 def test_candidates_on_maps_without_a_terrain_are_placed_once(opened, monkeypatch):
     """Up to 45 deg off nadir."""
-    monkeypatch.delattr("orthonav.localizer.registration.ViewOverRelief")
+    monkeypatch.delattr("orthonav.core.localize.registration.ViewOverRelief")
     picture = rendered(GROUND, np.zeros(2), (30.0, 44.0, 0.0))
     fix = Localizer(opened).locate(View(picture, CAMERA, telemetry((30.0, 44.0, 0.0))))
     assert "terrain_gain" not in fix.evidence

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from blots import AGL_M, CAMERA, GROUND, Ground, as_grey, known_map, rendered
 
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.records import Fix, Prior, Telemetry, View
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, Prior, Telemetry, View
 
 VIEWS, TILT_DEG = 24, 4.0
 YAW_STD_DEG, AGL_STD = 5.0, 0.05

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from orthonav.localizer import plan
-from orthonav.localizer.plan import DEFAULT_PLAN, Budget
-from orthonav.register.registrar import Levels, PosePrior
+from orthonav.core.localize import plan
+from orthonav.core.localize.plan import DEFAULT_PLAN, Budget
+from orthonav.core.register.registrar import Levels, PosePrior
 
 LEVELS = Levels(2, 1, 0)
 TRACKED = PosePrior(0.5, math.radians(2.0), 0.03)

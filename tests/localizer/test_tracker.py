@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from blots import AGL_M, GROUND, Ground, known_map, rendered
 
-from orthonav.errors import CameraError, MapFileError
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.localizer.odometry import OdometryView, displacement
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
+from orthonav.core.errors import CameraError, MapFileError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.track import Estimate, ReportedAttitude, Sighting, State
+from orthonav.core.track.model import STATE
+from orthonav.core.track.odometry import OdometryView, displacement
+from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.run import localize_flight, smoothed_track
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.track import Estimate, ReportedAttitude, Sighting, State
-from orthonav.track.model import STATE
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0
@@ -351,7 +351,7 @@ class MemoryView:
 
     def grey(self):
         if self._broken:
-            from orthonav.errors import FlightError
+            from orthonav.core.errors import FlightError
 
             raise FlightError("broken")
         return self._grey

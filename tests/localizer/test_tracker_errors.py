@@ -7,10 +7,10 @@ import pytest
 from blots import AGL_M, GROUND, known_map, rendered
 from test_tracker import SPEED_MPS, WIDE, changed, followed, legs, place_of
 
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
-from orthonav.records import CONFIDENT, Fix, Telemetry, View
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, Fix, Telemetry, View
+from orthonav.core.track.tracker import Tracker
 
 EVERY_S = 1.0
 MOUNT_DEG = np.array([1.6, -1.2])

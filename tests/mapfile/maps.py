@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.mapfile import Manifest, SheetInfo
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile import Manifest, SheetInfo
 
 GRID = TileGrid(-100.0, 90.0, 1.0, 64, 32, 3, 4)
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from maps import arrays, manifest
 
-from orthonav.errors import MapChangedError, MapFileError
-from orthonav.mapfile import GreyLayer, open_map, write_map
-from orthonav.mapfile.layer import part_names
-from orthonav.mapfile.reader import BLOCK_BYTES
+from orthonav.core.errors import MapChangedError, MapFileError
+from orthonav.core.mapfile import GreyLayer, open_map, write_map
+from orthonav.core.mapfile.layer import part_names
+from orthonav.core.mapfile.reader import BLOCK_BYTES
 
 
 @pytest.fixture

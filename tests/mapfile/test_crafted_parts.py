@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import MapFileError
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.mapfile import GreyLayer, open_map, write_map
-from orthonav.mapfile.layer import preview
+from orthonav.core.errors import MapFileError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import GreyLayer, open_map, write_map
+from orthonav.core.mapfile.layer import preview
+from orthonav.core.records import NoFix, Telemetry, View
 from orthonav.onboard.run import SingleViews, locate_view
-from orthonav.records import NoFix, Telemetry, View
 
 GOLDEN = Path(__file__).parent.parent / "data" / "golden_v1.onav"
 MASKS, MASK_OFFSETS = "sheet0/grey/mask_bytes", "sheet0/grey/mask_offsets"

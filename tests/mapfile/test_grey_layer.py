@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from maps import arrays, manifest, put_together, taken_apart
 
 from helpers import textured
-from orthonav.errors import MapFileError
-from orthonav.geo.grid import TileGrid
-from orthonav.mapfile import GreyLayer, open_map, write_map
-from orthonav.mapfile import layer as layer_module
-from orthonav.mapfile.layer import ChunkTable, part_names
-from orthonav.prepare.layer import GreyLayerWriter
+from orthonav.core.errors import MapFileError
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile import GreyLayer, open_map, write_map
+from orthonav.core.mapfile import layer as layer_module
+from orthonav.core.mapfile.layer import ChunkTable, part_names
+from orthonav.ground.build.layer import GreyLayerWriter
 
 SHAPE, CHUNK_PX = (150, 210), 64
 NAMES = part_names(0)

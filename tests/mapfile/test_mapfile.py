@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from maps import arrays, described, manifest, put_together, taken_apart
 
-from orthonav.errors import MapFileError, MapVersionError, MissingFileError, OutputError
-from orthonav.mapfile import open_map, write_map
+from orthonav.core.errors import MapFileError, MapVersionError, MissingFileError, OutputError
+from orthonav.core.mapfile import open_map, write_map
 
 
 @pytest.fixture(scope="module")
@@ -392,7 +392,7 @@ def test_huge_shapes_take_no_memory(path):
     assert peak < 5e6
 
 
-@pytest.mark.parametrize("fails", ["orthonav.mapfile.writer.save_file", "os.fsync"])
+@pytest.mark.parametrize("fails", ["orthonav.core.mapfile.writer.save_file", "os.fsync"])
 @pytest.mark.parametrize("old", [True, False])
 def test_a_full_disk_keeps_the_old_map(path, content, monkeypatch, fails, old):
     if not old:
@@ -424,7 +424,7 @@ def test_what_interrupts_the_writing_leaves_nothing(tmp_path, monkeypatch, error
         path.write_bytes(b"half")
         raise error
 
-    monkeypatch.setattr("orthonav.mapfile.writer.save_file", half)
+    monkeypatch.setattr("orthonav.core.mapfile.writer.save_file", half)
     with pytest.raises(KeyboardInterrupt if error is KeyboardInterrupt else OutputError):
         write_map(tmp_path / "area.onav", manifest(), arrays())
     assert list(tmp_path.iterdir()) == []

@@ -14,15 +14,15 @@ from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
 from maps import arrays, manifest, put_together, taken_apart
 
 from orthonav.cli import localize
-from orthonav.errors import (
+from orthonav.core.errors import (
     MapFileError,
     MissingExtraError,
     MissingFileError,
     OutputError,
     VariantError,
 )
-from orthonav.mapfile import open_map, signature, write_map
-from orthonav.mapfile.signature import (
+from orthonav.core.mapfile import open_map, signature, write_map
+from orthonav.core.mapfile.signature import (
     MAX_SERIAL,
     key_id,
     map_digest,

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from maps import arrays, manifest
 
-from orthonav.errors import MapFileError
-from orthonav.mapfile import open_map, write_map
-from orthonav.mapfile.manifest import TerrainInfo
-from orthonav.mapfile.terrain import (
+from orthonav.core.errors import MapFileError
+from orthonav.core.mapfile import open_map, write_map
+from orthonav.core.mapfile.manifest import TerrainInfo
+from orthonav.core.mapfile.terrain import (
     TerrainLayer,
     decode_terrain,
     encode_terrain,

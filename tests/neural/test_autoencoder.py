@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from orthonav.embed.network import AutoEncoderRecipe
-from orthonav.neural.autoencoder import AutoEncoder, reconstruction_loss, reconstructions
-from orthonav.neural.tiles import SheetTiles
+from orthonav.core.tiles.network import AutoEncoderRecipe
+from orthonav.research.autoencoder import AutoEncoder, reconstruction_loss, reconstructions
+from orthonav.research.tiles import SheetTiles
 
 PAPER_PARAMETERS = 172_506_561
 

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from orthonav.embed import TABLE
-from orthonav.embed.caevl import CaevlRecipe
-from orthonav.embed.stored import embedder_of
-from orthonav.errors import VariantError
-from orthonav.neural import caevl
-from orthonav.neural.augment import augmented
-from orthonav.neural.autoencoder import AutoEncoder
-from orthonav.neural.means import Means
-from orthonav.neural.tiles import SheetTiles
-from orthonav.neural.vicreg import local_vicreg, vicreg
-from orthonav.represent.canny import Canny
-from orthonav.variants import variant_recipe
+from orthonav.core.errors import VariantError
+from orthonav.core.tiles.canny import Canny
+from orthonav.core.tiles.embed import TABLE
+from orthonav.core.tiles.stored import embedder_of
+from orthonav.core.variants import variant_recipe
+from orthonav.research import caevl
+from orthonav.research.augment import augmented
+from orthonav.research.autoencoder import AutoEncoder
+from orthonav.research.caevl_recipe import CaevlRecipe
+from orthonav.research.means import Means
+from orthonav.research.tiles import SheetTiles
+from orthonav.research.vicreg import local_vicreg, vicreg
 
 TILE_PX = 32
 QUICK = Means(save_every_s=1e6, workers=1, device="cpu", bf16=False)

@@ -7,10 +7,10 @@ import pytest
 import torch
 from test_training import AUTO, TRIPLET, Killed, kill_at, losses, noisy, sheet
 
-from orthonav.embed.network import TripletRecipe
-from orthonav.neural import means, training
-from orthonav.neural.means import Means
-from orthonav.neural.training import learn_network
+from orthonav.core.tiles.network import TripletRecipe
+from orthonav.research import means, training
+from orthonav.research.means import Means
+from orthonav.research.training import learn_network
 
 pytestmark = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="needs a GPU that PyTorch sees"

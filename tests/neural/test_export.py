@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch import nn
 
-from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
-from orthonav.neural import export
-from orthonav.neural.autoencoder import AutoEncoder
-from orthonav.neural.export import ExportError, export_encoder, least_cosine_between
-from orthonav.neural.triplet import ResNet34
+from orthonav.core.tiles.network import AutoEncoderRecipe, TripletRecipe
+from orthonav.research import export
+from orthonav.research.autoencoder import AutoEncoder
+from orthonav.research.export import ExportError, export_encoder, least_cosine_between
+from orthonav.research.triplet import ResNet34
 
 
 def maps(count, tile_px, seed=0, channels=1):

@@ -17,11 +17,11 @@ LEARN = """
 import itertools, json, sys
 import numpy as np
 import torch
-from orthonav.embed.network import TripletRecipe
-from orthonav.neural.means import Means, World
-from orthonav.neural.tiles import SheetTiles
-from orthonav.neural.training import train
-from orthonav.neural.triplet import Triplets
+from orthonav.core.tiles.network import TripletRecipe
+from orthonav.research.means import Means, World
+from orthonav.research.tiles import SheetTiles
+from orthonav.research.training import train
+from orthonav.research.triplet import Triplets
 
 grey = np.random.default_rng(0).integers(0, 255, (128, 128), np.uint8)
 places = np.stack(np.meshgrid([0, 24, 48, 64], [0, 24, 48, 64]), axis=-1).reshape(-1, 2)

@@ -12,19 +12,19 @@ import pytest
 import torch
 import transformers
 
-from orthonav.errors import MissingFileError, VariantError
-from orthonav.geo.camera import Camera
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.neural import sam, sam_weights
-from orthonav.neural.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Telemetry, View
-from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.errors import MissingFileError, VariantError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Telemetry, View
+from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.research import sam, sam_weights
+from orthonav.research.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
 
 SIDE = 64
-TABLE = {"sam": Variant("orthonav.neural.sam:SamBoundaries", flies=False, extra="train")}
+TABLE = {"sam": Variant("orthonav.research.sam:SamBoundaries", flies=False, extra="train")}
 # Names in the published checkpoints, for a model of two blocks and two decoder layers.
 ORIGINAL_NAMES = [
     (r"^vision_encoder\.", "image_encoder."),
@@ -597,7 +597,7 @@ def test_a_network_learns_from_the_boundaries_of_sheets_or_tiles(
     per, weights, area, tmp_path, monkeypatch
 ):
     """The whole path with a stand-in for the weights: imagery, network, map, views."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
     monkeypatch.setenv(sam.WEIGHTS_VARIABLE, str(weights))
     given = "grid=4,iou=0,stability=0,cache=none,device=cpu,window=64"
     request = BuildRequest(

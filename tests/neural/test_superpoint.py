@@ -10,8 +10,8 @@ import pytest
 import torch
 import transformers
 
-from orthonav.errors import MissingFileError, VariantError
-from orthonav.neural.superpoint import SuperPoint
+from orthonav.core.errors import MissingFileError, VariantError
+from orthonav.research.superpoint import SuperPoint
 
 BORDER_PX = 4
 

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from orthonav.neural.tiles import SheetTiles, epoch_batches, made_ahead
+from orthonav.research.tiles import SheetTiles, epoch_batches, made_ahead
 
 TILE_PX = 32
 

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 import torch
 
-from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
-from orthonav.errors import OutputError
-from orthonav.neural import checkpoints, means, training
-from orthonav.neural.checkpoints import TrainingError, loss_picture
-from orthonav.neural.means import Means
-from orthonav.neural.tiles import SheetTiles
-from orthonav.neural.training import learn_network
+from orthonav.core.errors import OutputError
+from orthonav.core.tiles.network import AutoEncoderRecipe, TripletRecipe
+from orthonav.research import checkpoints, means, training
+from orthonav.research.checkpoints import TrainingError, loss_picture
+from orthonav.research.means import Means
+from orthonav.research.tiles import SheetTiles
+from orthonav.research.training import learn_network
 
 TILE_PX = 32
 AUTO = AutoEncoderRecipe(dims=16, width=16, epochs=3, batch=8, learning_rate=3e-3)

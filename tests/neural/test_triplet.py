@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from orthonav.embed.network import TripletRecipe
-from orthonav.neural.tiles import SheetTiles
-from orthonav.neural.triplet import ResNet34, Triplets, hard_negatives, triplet_loss
+from orthonav.core.tiles.network import TripletRecipe
+from orthonav.research.tiles import SheetTiles
+from orthonav.research.triplet import ResNet34, Triplets, hard_negatives, triplet_loss
 
 
 def test_it_has_the_papers_number_of_parameters():

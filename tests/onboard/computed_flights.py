@@ -10,12 +10,12 @@ from benchmarks.fakes import S
 from flown import Flown
 from scipy.spatial.transform import Rotation
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.attitude import LOOKS_DOWN, enu_from_body_camera
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard import latency as latencies
 from orthonav.onboard.arrival import ArrivalWatch
 from orthonav.onboard.motion import ImageMotion, reported_motion
 from orthonav.onboard.telemetry import VehicleState
-from orthonav.sources.attitude import LOOKS_DOWN, enu_from_body_camera
 
 BEGIN_S = 13.0
 FRAME = LocalFrame(0.0, 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.fakes import MS, UTC_NS, S, Time
 
 from benchmarks import fakes
-from orthonav.records import Fix
+from orthonav.core.records import Fix
 from wire import TABLES, decode
 
 __all__ = ["MS", "UTC_NS", "Time"]  # tests import them from here

@@ -8,7 +8,7 @@ from benchmarks.fakes import SAMPLE_S, wandering
 from blots import GROUND, rendered
 from scipy.spatial.transform import Rotation
 
-from orthonav.geo.camera import Camera
+from orthonav.core.geo.camera import Camera
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 SMALL = Camera(160, 120, 125.0, 125.0, 80.0, 60.0)

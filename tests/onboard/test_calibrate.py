@@ -6,12 +6,12 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from orthonav.errors import FlightError
-from orthonav.flight.mount import Bias, Mount
-from orthonav.geo.camera import Camera
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.mount import Bias, Mount
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.track import Model
 from orthonav.onboard.calibrate import MountCorrected, calibrate_mount, model_of
-from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
-from orthonav.track import Model
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)
 TRUE = {"heading_bias": 4.0, "log_scale_bias": -0.1, "pitch_bias": 6.0, "roll_bias": -1.0}

@@ -7,14 +7,14 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from orthonav.errors import FlightError
-from orthonav.geo.camera import Camera
+from orthonav.core.errors import FlightError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.onboard.calibrate_views import (
     RecordedSingleViews,
     calibrate_mount_by_views,
     robust_mean,
 )
-from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)
 MOUNT = {"heading": 4.0, "log_scale": -0.05, "pitch": 5.0, "roll": -1.5}

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from fake_autopilot import UTC_NS, S, Time, write_flight
 
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.geo.camera import Camera
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Telemetry
 from orthonav.onboard.cameras import (
     CameraGoneError,
     CameraImage,
@@ -25,7 +26,6 @@ from orthonav.onboard.cameras import (
     read_into,
     recorded_images,
 )
-from orthonav.records import Telemetry
 
 
 def noisy(seed, shape=(240, 320)):

@@ -7,10 +7,10 @@ import pytest
 from fake_autopilot import S
 from flown import SMALL, Flown
 
+from orthonav.core.geo.attitude import enu_from_body_camera
 from orthonav.onboard.delay import DelayEstimator
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import PictureOdometry
-from orthonav.sources.attitude import enu_from_body_camera
 
 RATE_HZ = 5.0
 EVERY_S = 2

@@ -9,8 +9,8 @@ from benchmarks.fault_flights import CAMERA, Fault, FaultFlight, World
 from benchmarks.fault_scenarios import CAMERA_FAULTS, COMBINED_FAULTS, TELEMETRY_FAULTS
 from blots import AGL_M, GROUND, as_grey, known_map, rendered
 
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
 
 pytestmark = pytest.mark.long
 

@@ -36,24 +36,24 @@ from fake_autopilot import (
 from paced import pace_by
 
 from orthonav.cli import main
-from orthonav.errors import CameraError, MapChangedError, MapFileError
-from orthonav.flight.fixes import result_from_json
-from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
-from orthonav.flight.heights import FlownHeights
-from orthonav.geo.camera import Camera
+from orthonav.core.errors import CameraError, MapChangedError, MapFileError
+from orthonav.core.flight.fixes import result_from_json
+from orthonav.core.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
+from orthonav.core.flight.heights import FlownHeights
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.estimate import Clock
+from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
-from orthonav.publish.estimate import Clock
-from orthonav.publish.gate import Gate, GateRules
-from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from wire import decode
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
@@ -1277,7 +1277,7 @@ def test_a_stderr_that_takes_nothing_delays_no_flight(flown, tmp_path, how):
 
 def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():
     script = (
-        "import sys, orthonav.onboard.fly, orthonav.cli.fly, orthonav.localizer.tracker\n"
+        "import sys, orthonav.onboard.fly, orthonav.cli.fly, orthonav.core.track.tracker\n"
         "import orthonav.cli.flying\n"
         "unwanted = {'torch', 'rasterio', 'pyproj', 'mcap', 'cyclonedds', 'rosbags'}\n"
         "print(unwanted & {name.partition('.')[0] for name in sys.modules})"

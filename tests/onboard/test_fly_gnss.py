@@ -10,13 +10,13 @@ from fake_autopilot import MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_fly import AHEAD_NS, Flight
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import NoFix
 from orthonav.onboard.gnss.biases import Biases, design, unknown
 from orthonav.onboard.gnss.learner import Resumed
 from orthonav.onboard.gnss.records import Fault
 from orthonav.onboard.gnss.watch import GnssWatch, LiveSolutions
 from orthonav.onboard.state import SavedState, learnt_biases, save
-from orthonav.records import NoFix
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS = 10.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from benchmarks.gnss_watch import PITCH_DEG, recovered
 
-from orthonav.geo.camera import axis_on_ground_en_m
+from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.onboard.gnss.biases import (
     LIMITS,
     Biases,

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from benchmarks.gnss_watch import FRAME, MAPS, delay, false_alarms, fed, lawnmower, map_positions
 
-from orthonav.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import GnssSample
+from orthonav.ground.simulate.receiver import receiver_of, solutions
 from orthonav.onboard.gnss.biases import Biases, unknown
 from orthonav.onboard.gnss.difference import Difference, DifferenceModel, DifferenceWindow
 from orthonav.onboard.gnss.learner import _Filter
 from orthonav.onboard.gnss.monitor import RETURN_S, GnssMonitor
 from orthonav.onboard.gnss.receiver import SILENCE_S, Receiver
 from orthonav.onboard.gnss.records import Fault, GnssState, MapPosition
-from orthonav.simulate.receiver import receiver_of, solutions
 
 S = 10**9
 KNOWN = Biases(np.zeros(5), np.diag([1.5, 1.5, 0.01, 0.01, 0.1]) ** 2, 3600.0)

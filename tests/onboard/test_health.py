@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from fake_autopilot import S, fix
 
-from orthonav.geo.camera import Camera
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import NoFix, Telemetry, View
 from orthonav.onboard.health import (
     DIAGNOSIS_INTERVAL_S,
     DIAGNOSIS_VALID_S,
@@ -23,7 +24,6 @@ from orthonav.onboard.health import (
     judge,
     mismatch,
 )
-from orthonav.records import NoFix, Telemetry, View
 
 GOOD = Snapshot(60.0, {"taken": 50, "processed": 50, "confident": 50}, latency_s=0.1)
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)

@@ -13,11 +13,11 @@ from orthonav.onboard.cameras import LiveCamera, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.estimate import Clock
+from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
-from orthonav.publish.estimate import Clock
-from orthonav.publish.gate import Gate, GateRules
 
 METRES = 111_195.0  # a degree of latitude; the flights are at the equator
 BEGIN_S = 10.0

@@ -9,14 +9,14 @@ import time
 import pytest
 from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
 
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.core.errors import MissingExtraError, VariantError
 from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
+from orthonav.onboard.messages.estimate import Clock
+from orthonav.onboard.messages.local import Autopilot as Kind
+from orthonav.onboard.messages.local import Origin
+from orthonav.onboard.messages.mavlink import Signing, Target, dialect, signing_timestamp
 from orthonav.onboard.ports import Descriptor, Udp, open_serial, transport_opener
 from orthonav.onboard.telemetry import TelemetryBuffer
-from orthonav.publish.estimate import Clock
-from orthonav.publish.local import Autopilot as Kind
-from orthonav.publish.local import Origin
-from orthonav.publish.mavlink import Signing, Target, dialect, signing_timestamp
 from wire import decode
 
 KEY = bytes(range(32))

@@ -17,12 +17,12 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from orthonav.errors import OutputError
-from orthonav.geo.camera import Camera
+from orthonav.core.errors import OutputError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry, ViewResult
 from orthonav.onboard import log as log_module
 from orthonav.onboard import segment as segment_module
 from orthonav.onboard.log import FlightLog
-from orthonav.records import Fix, NoFix, Prior, Telemetry, ViewResult
 
 CAMERA = Camera(64, 48, 50.5, 50.25, 32.125, 24.0, (0.1, -0.02, 0.001, 0.002))
 MAP = {"name": "area.onav", "manifest_sha256": "0" * 64}
@@ -202,7 +202,7 @@ def test_chunks_are_on_disk_before_the_end(tmp_path):
     wait_for(lambda: log._segment and log._segment.chunks and not log._queue)
     shutil.copy(tmp_path / "flight_0001.mcap", tmp_path / "cut.mcap")
     log.close()
-    from orthonav.sources import open_source
+    from orthonav.ground.recordings import open_source
 
     assert len(list(open_source(tmp_path / "cut.mcap").views)) == 3
 

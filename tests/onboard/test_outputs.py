@@ -14,8 +14,15 @@ import pynmeagps
 import pytest
 from fake_autopilot import UTC_NS, S, Time, fix
 
-from orthonav.errors import VariantError
-from orthonav.flight.fixes import result_from_json
+from orthonav.core.errors import VariantError
+from orthonav.core.flight.fixes import result_from_json
+from orthonav.core.records import NoFix, ViewResult
+from orthonav.onboard.messages.correlation import messages_averaged
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.gate import Gate, GateRules
+from orthonav.onboard.messages.local import Autopilot, Origin, north_east_m
+from orthonav.onboard.messages.mavlink import Packer, Target
+from orthonav.onboard.messages.nmea import Quality
 from orthonav.onboard.outputs import (
     KINDS,
     JsonOut,
@@ -26,13 +33,6 @@ from orthonav.onboard.outputs import (
     open_sink,
 )
 from orthonav.onboard.telemetry import VehicleState
-from orthonav.publish.correlation import messages_averaged
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
-from orthonav.publish.gate import Gate, GateRules
-from orthonav.publish.local import Autopilot, Origin, north_east_m
-from orthonav.publish.mavlink import Packer, Target
-from orthonav.publish.nmea import Quality
-from orthonav.records import NoFix, ViewResult
 from wire import decode
 
 ORIGIN = Origin(48.0, 2.0, 100.0)

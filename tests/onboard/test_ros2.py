@@ -27,10 +27,20 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from orthonav.errors import CameraError
-from orthonav.geo.camera import attitude_of
-from orthonav.geo.ellipse import error_ellipse
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import CameraError
+from orthonav.core.geo.camera import attitude_of
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import ViewResult
+from orthonav.ground.recordings.opening import open_source
+from orthonav.onboard.messages.correlation import messages_averaged
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    EstimateError,
+    NavigationEstimate,
+    floored,
+)
+from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.lost import LostImages
@@ -39,16 +49,6 @@ from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
-from orthonav.publish.correlation import messages_averaged
-from orthonav.publish.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-    floored,
-)
-from orthonav.publish.gate import Gate, GateRules
-from orthonav.records import ViewResult
-from orthonav.sources.opening import open_source
 
 S = 10**9
 FRAME = LocalFrame(47.0, 8.0)

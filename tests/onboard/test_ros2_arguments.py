@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.errors import MissingFileError, VariantError
+from orthonav.core.errors import MissingFileError, VariantError
 from orthonav.onboard.ros2.arguments import RosArguments, ros_arguments
 from orthonav.onboard.ros2.messages import ros_type_name
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.errors import CameraError, FlightError, MissingFileError
-from orthonav.flight import open_flight, read_image
-from orthonav.localizer import Localizer
+from orthonav.core.errors import CameraError, FlightError, MissingFileError
+from orthonav.core.flight import open_flight, read_image
+from orthonav.core.localize import Localizer
+from orthonav.core.records import Fix, NoFix, Prior, View
 from orthonav.onboard.run import SingleViews, localize_flight, locate_view
-from orthonav.records import Fix, NoFix, Prior, View
 
 VIEWS = 8
 

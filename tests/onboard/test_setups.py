@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from orthonav.cli.setups import setup_text
-from orthonav.confidence.accept import Acceptance
-from orthonav.geo.camera import Camera
-from orthonav.geo.headings import seem_radians
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.headings import seem_radians
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.accept import Acceptance
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
 from orthonav.onboard.setups import (
     SAMPLE,
     LowConfidenceViews,
@@ -20,7 +21,6 @@ from orthonav.onboard.setups import (
     mirrored_camera,
     try_setups,
 )
-from orthonav.records import Fix, NoFix, Prior, View, ViewResult
 
 ACCEPTS = Acceptance("confidence", 0.9).accepts
 

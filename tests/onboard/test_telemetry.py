@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from orthonav.core.flight.telemetry_track import RecordedTrack, Samples, attitude_of_angles
+from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.onboard.telemetry import (
     BufferLimits,
     ClockSync,
@@ -16,8 +18,6 @@ from orthonav.onboard.telemetry import (
     VehicleState,
     wxyz_of_angles,
 )
-from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
-from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
 
 ANGLES = st.tuples(st.floats(-40, 40), st.floats(-40, 40), st.floats(-180, 180))
 

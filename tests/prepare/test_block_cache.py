@@ -16,21 +16,21 @@ import rasterio
 from rasterio.transform import Affine
 
 from helpers import textured
-from orthonav.confidence.registered import USUAL_CONFIDENCE
-from orthonav.errors import AreaError, ImageryError, OutputError, VariantError
-from orthonav.geo.area import Area
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.block_cache import BlockCache
-from orthonav.prepare.blocks import Block
-from orthonav.prepare.calibrate import CropSampler
-from orthonav.prepare.calibrate_registration import RegistrationCalibration
-from orthonav.prepare.layout import grid_of
-from orthonav.prepare.parallel import AHEAD, in_order
-from orthonav.prepare.pictures import SheetPictures
-from orthonav.prepare.sheet import SheetReader
-from orthonav.represent.gray import Gray
+from orthonav.core.errors import AreaError, ImageryError, OutputError, VariantError
+from orthonav.core.localize.registered import USUAL_CONFIDENCE
+from orthonav.core.tiles.gray import Gray
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.block_cache import BlockCache
+from orthonav.ground.build.blocks import Block
+from orthonav.ground.build.calibrate import CropSampler
+from orthonav.ground.build.calibrate_registration import RegistrationCalibration
+from orthonav.ground.build.layout import grid_of
+from orthonav.ground.build.parallel import AHEAD, in_order
+from orthonav.ground.build.pictures import SheetPictures
+from orthonav.ground.build.sheet import SheetReader
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 BLOCKS = 9
 SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
@@ -40,10 +40,10 @@ SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 def small_blocks(monkeypatch):
     """Many small blocks, few crops, registration as if it was calibrated."""
     learnt = RegistrationCalibration(USUAL_CONFIDENCE, 0.5)
-    monkeypatch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
-    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 128)
-    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 4)
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+    monkeypatch.setattr("orthonav.ground.build.build.calibrate_registration", lambda *_: learnt)
+    monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", 128)
+    monkeypatch.setattr("orthonav.ground.build.sheet.MIN_CACHED_BLOCKS", 4)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_images_for_networks_are_cached_too(ortho, tmp_path, reads):
 KILLED = """
     import os, signal, sys
     from pathlib import Path
-    from orthonav.prepare import BuildRequest, build_map, calibrate, sheet
+    from orthonav.ground.build import BuildRequest, build_map, calibrate, sheet
 
     sheet.BLOCK_PX, sheet.MIN_CACHED_BLOCKS, calibrate.CROPS = 128, 4, 16
 
@@ -259,13 +259,13 @@ def test_few_blocks_are_not_cached(ortho, tmp_path, names_in, monkeypatch):
     out = tmp_path / "map.onav"
     stopped(ortho, out)
     assert len(names_in(tmp_path)) > 2
-    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 1000)
+    monkeypatch.setattr("orthonav.ground.build.sheet.MIN_CACHED_BLOCKS", 1000)
     stopped(ortho, out)
     assert names_in(tmp_path) == []  # not even those of the build before
 
 
 def test_a_work_folder_that_was_named(ortho, tmp_path, names_in, monkeypatch, reads):
-    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 1000)
+    monkeypatch.setattr("orthonav.ground.build.sheet.MIN_CACHED_BLOCKS", 1000)
     out, work = tmp_path / "map.onav", tmp_path / "work"
     stopped(ortho, out, work=work)
     assert all(name.startswith("work") for name in names_in(tmp_path))
@@ -313,7 +313,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_partial_block(
 
 
 def test_too_little_disk_space_is_an_error_before_reading(ortho, tmp_path, monkeypatch, reads):
-    monkeypatch.setattr("orthonav.prepare.sheet.CACHED_BYTES_PER_PX", 1e12)
+    monkeypatch.setattr("orthonav.ground.build.sheet.CACHED_BYTES_PER_PX", 1e12)
     with pytest.raises(OutputError, match=r"MB are free.*--work"):
         built(ortho, tmp_path / "map.onav")
     assert not reads and not any(tmp_path.iterdir())
@@ -395,8 +395,8 @@ def test_memory_of_cells_is_that_of_what_is_written():
     """A corridor across a large box: only its pages are there."""
     code = """
         import numpy as np
-        from orthonav.embed.cells import CellLayout
-        from orthonav.embed.whitened import CellSheet
+        from orthonav.core.tiles.cells import CellLayout
+        from orthonav.core.tiles.whitened import CellSheet
 
         sheet = CellSheet(CellLayout(8, 8), 40_000, 40_000, 7)
         part = np.ones((128, 128, 7), np.float32), np.ones((128, 128), np.float32)

@@ -9,19 +9,25 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav import represent
-from orthonav.confidence.logistic import FEATURES, LogisticConfidence
-from orthonav.confidence.registered import RegisteredConfidence
-from orthonav.errors import AreaError, MissingFileError, OrthonavError, OutputError, VariantError
-from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera
-from orthonav.geo.route import Route
-from orthonav.geo.swapped import HINT
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.calibrate import RADIUS_STRIDES
-from orthonav.records import Fix, Telemetry, View
+from orthonav.core.errors import (
+    AreaError,
+    MissingFileError,
+    OrthonavError,
+    OutputError,
+    VariantError,
+)
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.swapped import HINT
+from orthonav.core.localize.logistic import FEATURES, LogisticConfidence
+from orthonav.core.localize.registered import RegisteredConfidence
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, Telemetry, View
+from orthonav.core.tiles import represent
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.calibrate import RADIUS_STRIDES
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 CAMERA = Camera(256, 256, 256.0, 256.0, 128.0, 128.0)
 """It sees as many metres of ground as it is above it."""
@@ -50,14 +56,14 @@ def frame(ortho):
 @pytest.fixture(autouse=True)
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
+    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture
 def calibrated(fewer_crops, monkeypatch):
     """More crops, where the confidence itself is looked at."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 48)
 
 
 WITH_LAYER = {"registration": True, "calibration_views": 2}
@@ -213,7 +219,7 @@ def test_the_finest_orthophoto_gives_the_resolution(make_ortho, tmp_path):
 
 def test_blocks_do_not_matter(small_ortho, tmp_path, monkeypatch):
     whole = built(small_ortho, tmp_path, "a.onav")
-    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 90)
+    monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", 90)
     blocks = built(small_ortho, tmp_path, "b.onav")
     scores = np.einsum(
         "nd,nd->n",
@@ -421,7 +427,7 @@ def test_slow_representations_are_calibrated_on_fewer_crops(small_ortho, tmp_pat
         if name == "slow":
             table = {**represent.TABLE, "canny": replace(represent.TABLE["canny"], flies=False)}
             monkeypatch.setattr(represent, "TABLE", table)
-        monkeypatch.setattr("orthonav.prepare.calibrate.SLOW_CROPS", 6)
+        monkeypatch.setattr("orthonav.ground.build.calibrate.SLOW_CROPS", 6)
         shares = []
 
         def progress(stage, share, shares=shares):

@@ -8,25 +8,25 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.confidence.registered import (
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.registered import (
     USUAL_CHANCES,
     USUAL_CONFIDENCE,
     RegisteredConfidence,
 )
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.localizer.registration import RegistrationLocalizer
-from orthonav.mapfile import SheetInfo, open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare import calibrate_registration as module
-from orthonav.prepare.calibrate import Crop
-from orthonav.prepare.calibrate_registration import (
+from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.mapfile import SheetInfo, open_map
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build import calibrate_registration as module
+from orthonav.ground.build.calibrate import Crop
+from orthonav.ground.build.calibrate_registration import (
     FLOOR_LIMITS_PX,
     FLOOR_PX,
     RegistrationCalibration,
     calibrate_registration,
 )
-from orthonav.prepare.layer import halved
+from orthonav.ground.build.layer import halved
 
 SIDE_PX, TILE_PX = 240, 64
 CROP_PX = round(1.5 * TILE_PX)
@@ -229,7 +229,7 @@ def test_without_mirrored_views_the_weights_are_the_usual_ones(localizer, monkey
 @pytest.fixture
 def small(make_ortho, tmp_path, monkeypatch):
     """Function that builds a map of 200 x 200 m and gives what it says of registration."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 10)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 10)
     grey = textured((240, 240), 11)
 
     def build(made_of=grey[20:220, 20:220], *other_dates, nodata=None):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.embed.cells import CellLayout
-from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
-from orthonav.errors import MapFileError
-from orthonav.geo.grid import TileGrid
-from orthonav.mapfile.reader import MapFile
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.cellparts import StoredCells, cell_parts
-from orthonav.represent.gradients import OrientedGradients
+from orthonav.core.errors import MapFileError
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.cellparts import StoredCells, cell_parts
 
 GRID = TileGrid(0.0, 0.0, 1.0, 128, 32, 6, 5)
 LAYOUT = CellLayout(4, 4)
@@ -61,7 +61,7 @@ def test_tiles_are_embedded_as_from_the_imagery(cells):
 
 
 def test_threads_learn_and_embed_the_same(cells, monkeypatch):
-    monkeypatch.setattr("orthonav.embed.whitened.CHUNK_TILES", 4)
+    monkeypatch.setattr("orthonav.core.tiles.whitened.CHUNK_TILES", 4)
     tiles_px = np.mgrid[:6, :5].reshape(2, -1).T * 32
     one, three = (learn(WhitenedRecipe(dims=16), cells, tiles_px, each) for each in (1, 3))
     assert np.array_equal(one.mean, three.mean) and np.array_equal(one.basis, three.basis)
@@ -122,7 +122,7 @@ def test_cells_that_are_not_those_of_the_grid_are_refused(cells, name):
 
 
 def test_maps_carry_cells_only_where_asked(make_ortho, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
     ortho = make_ortho(tmp_path / "2019-06.tif", textured((200, 200)))
     made = {}
     for cells in (False, True):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.prepare.change import changed
-from orthonav.register.evidence import evidence
+from orthonav.core.register.evidence import evidence
+from orthonav.ground.build.change import changed
 
 SIZE = 128
 GREY, OTHER = textured((SIZE, SIZE), 1), textured((SIZE, SIZE), 2)

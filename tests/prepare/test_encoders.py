@@ -5,18 +5,18 @@ import functools
 import numpy as np
 import pytest
 
-from orthonav.embed.network import NetworkEmbedder
-from orthonav.embed.words import WordsEmbedder
-from orthonav.errors import MapFileError, MissingExtraError, VariantError
-from orthonav.flight import open_flight, read_truth
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.core.errors import MapFileError, MissingExtraError, VariantError
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix
+from orthonav.core.tiles.network import NetworkEmbedder
+from orthonav.core.tiles.represent import TABLE
+from orthonav.core.tiles.words import WordsEmbedder
+from orthonav.core.variants import make_variant
+from orthonav.ground.build import BuildRequest, build_map, methods
+from orthonav.ground.build.methods import stored_representation, usual_edges
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map, methods
-from orthonav.prepare.methods import stored_representation, usual_edges
-from orthonav.records import Fix
-from orthonav.represent import TABLE
-from orthonav.variants import make_variant
 
 SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
 METHODS = {
@@ -39,7 +39,7 @@ def built(area, tmp_path_factory):
         if key not in made:
             path = tmp_path_factory.mktemp("methods") / "area.onav"
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+                patch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
                 request = BuildRequest([area.past], path, method=method, **{**SMALL, **more})
                 made[key] = build_map(request)
             made[key] = path
@@ -112,12 +112,12 @@ def test_interrupted_training_resumes(area, tmp_path):
         work=tmp_path / "work",
         **SMALL,
     )
-    from orthonav.neural import training
+    from orthonav.research import training
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
         often = functools.partial(training.Means, save_every_s=0.0)
-        patch.setattr("orthonav.neural.training.Means", often)
+        patch.setattr("orthonav.research.training.Means", often)
         with pytest.raises(Killed):
             build_map(request, kill)
         assert not (tmp_path / "a.onav").exists()
@@ -151,7 +151,7 @@ def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
     parts = []
     for name in ("a.onav", "b.onav"):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
+            patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
             request = BuildRequest(
                 [area.past], tmp_path / name, method="bovw:words=256", registration=False, **SMALL
             )
@@ -169,7 +169,7 @@ def test_a_map_does_not_name_the_machine_that_built_it(monkeypatch):
 
 
 def test_words_of_files_elsewhere_do_not_fly():
-    from orthonav.embed.stored import embedder_of
+    from orthonav.core.tiles.stored import embedder_of
 
     plain = {"name": "bovw", "features": "superpoint", "weights": "/etc", "words": 256}
     with pytest.raises(MapFileError, match="do not fly"):
@@ -182,6 +182,6 @@ def test_what_is_missing_is_named_before_imagery_is_read(
 ):
     found = methods.find_spec
     monkeypatch.setattr(methods, "find_spec", lambda name: None if name == hidden else found(name))
-    monkeypatch.setattr("orthonav.prepare.request.Mosaic.open", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr("orthonav.ground.build.request.Mosaic.open", lambda *_: pytest.fail("read"))
     with pytest.raises(MissingExtraError, match=rf"{hidden}: pip install 'orthonav\[train\]'"):
         build_map(BuildRequest([area.past], tmp_path / "a.onav", method=method, **SMALL))

@@ -9,13 +9,10 @@ import pytest
 
 from helpers import textured
 from orthonav.cli import main
-from orthonav.geo.area import Area
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.mapfile import GreyLayer, open_map
-from orthonav.mapfile.layer import ChunkTable, decode_chunk, part_names
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.layer import (
+from orthonav.core.mapfile import GreyLayer, open_map
+from orthonav.core.mapfile.layer import ChunkTable, decode_chunk, part_names
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.layer import (
     CHUNK_PX,
     MAX_BYTES_PER_PX,
     GreyLayerWriter,
@@ -23,6 +20,9 @@ from orthonav.prepare.layer import (
     halved,
     level_count,
 )
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 NAMES = part_names(0)
 
@@ -30,7 +30,7 @@ NAMES = part_names(0)
 @pytest.fixture(autouse=True)
 def fewer_crops(monkeypatch):
     """Calibration from few crops."""
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
 
 
 def holes(shape, seed=0):
@@ -227,13 +227,13 @@ def built(ortho, folder, name="map.onav", **request):
 def small_map(ortho, tmp_path_factory):
     """A map of it, for tests that only read one; not to be changed."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+        patch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
         return built(ortho, tmp_path_factory.mktemp("map"))
 
 
 @pytest.mark.parametrize("block_px", [1024, 150])
 def test_a_map_carries_its_imagery(ortho, tmp_path, monkeypatch, block_px):
-    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", block_px)
+    monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", block_px)
     opened = built(ortho, tmp_path)
     sheet, layer = opened.manifest.sheets[0], GreyLayer.of(opened)
     with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:

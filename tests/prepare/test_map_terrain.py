@@ -14,19 +14,19 @@ import pytest
 
 from helpers import write_dem
 from orthonav.cli.heights import map_heights
-from orthonav.errors import AreaError
-from orthonav.flight import open_flight, read_truth
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.geo.route import Route
-from orthonav.imagery.terrain import open_dem
-from orthonav.mapfile import open_map, write_map
-from orthonav.mapfile.reader import MapFile
-from orthonav.mapfile.terrain import TerrainLayer
+from orthonav.core.errors import AreaError
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile import open_map, write_map
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.records import Fix
+from orthonav.ground.build.terrain import terrain_of_dem
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 from orthonav.onboard.run import localize_flight
-from orthonav.prepare.terrain import terrain_of_dem
-from orthonav.records import Fix
 
 FRAME = LocalFrame(46.5, 2.5)
 LOCAL_DEG = 46.4982, 3.0026
@@ -62,7 +62,7 @@ def hill_map(map_path, dem, tmp_path_factory):
 
 
 def test_terrain_is_all_that_a_map_gains(run, make_ortho, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
     ortho = make_ortho(tmp_path / "past.tif")
     frame = LocalFrame(*LOCAL_DEG)
     dem = write_dem(tmp_path / "dem.tif", frame, hill)
@@ -136,7 +136,7 @@ def test_build_names_what_is_wrong_before_the_work(run, area, dem, tmp_path):
 @pytest.fixture(scope="module")
 def flown(area, frame, dem, tmp_path_factory):
     """A flight at a constant altitude over the hill."""
-    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+    from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
     corners = np.array([[-350.0, -250.0], [350.0, -250.0], [350.0, 250.0]])
     lat, lon = frame.latlon_from_en(corners)
@@ -147,7 +147,7 @@ def flown(area, frame, dem, tmp_path_factory):
         terrain=open_dem(dem, "msl"), seed=1,
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
+        patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
         simulate_flight(request)
     return out
 
@@ -269,7 +269,7 @@ def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
 
 
 def test_random_views_report_heights_above_sea_only(run, area, flown, dem, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
+    monkeypatch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
     done = run(
         "simulate", "--ortho", area.present, "--random", 3, "--agl-m", 250, "--dem", dem,
         "--dem-datum", "msl", "--camera", flown / "flight.json", "--out", tmp_path / "flight",
@@ -294,8 +294,8 @@ def test_terrain_is_flown_without_gdal_and_proj(hill_map, flown):
 import sys
 for name in ("rasterio", "pyproj", "torch"): sys.modules[name] = None
 from orthonav.cli.heights import map_heights
-from orthonav.flight import open_flight
-from orthonav.mapfile import open_map, write_map
+from orthonav.core.flight import open_flight
+from orthonav.core.mapfile import open_map, write_map
 heights = map_heights(open_map({str(hill_map)!r}))
 view = open_flight({str(flown)!r}).views[0]
 print(heights.corrected(view.telemetry).agl_m)

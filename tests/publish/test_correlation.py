@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.geo.ellipse import error_ellipse
-from orthonav.publish.correlation import (
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.records import MAP_STD_M
+from orthonav.onboard.messages.correlation import (
     AT_STD_M,
     AVERAGING_S,
     FilterCovariance,
     for_filter,
     messages_averaged,
 )
-from orthonav.publish.estimate import NavigationEstimate
-from orthonav.records import MAP_STD_M
+from orthonav.onboard.messages.estimate import NavigationEstimate
 
 S = 10**9
 COV = np.array([[25.0, 6.0], [6.0, 16.0]])

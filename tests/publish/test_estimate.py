@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.geo.ellipse import error_ellipse
-from orthonav.publish.estimate import (
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.onboard.messages.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
     ellipse_95,
     estimate_from_result,
 )
-from orthonav.publish.gpstime import gps_time
-from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.onboard.messages.gpstime import gps_time
 
 COV = np.array([[16.0, 3.0], [3.0, 9.0]])
 PLAIN = NavigationEstimate(48.0, -4.0, COV, 0.95, utc_ns=1_789_000_000_000_000_000)

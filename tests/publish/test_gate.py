@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
-from orthonav.publish.gate import Gate, GateRules
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.gate import Gate, GateRules
 
 START_NS = 1_789_000_000_000_000_000
 SECOND = 10**9

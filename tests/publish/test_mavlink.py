@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from orthonav.errors import MissingExtraError
-from orthonav.geo.frames import LocalFrame
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
-from orthonav.publish.local import Autopilot, Origin, north_east_m
-from orthonav.publish.mavlink import (
+from orthonav.core.errors import MissingExtraError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.local import Autopilot, Origin, north_east_m
+from orthonav.onboard.messages.mavlink import (
     Packer,
     Signing,
     Target,
@@ -31,7 +31,7 @@ from orthonav.publish.mavlink import (
     signing_timestamp,
     status_texts,
 )
-from orthonav.publish.mavlink_local import (
+from orthonav.onboard.messages.mavlink_local import (
     LocalPose,
     odometry,
     set_gps_global_origin,
@@ -486,8 +486,9 @@ def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 def test_localizing_does_not_load_pymavlink() -> None:
     script = (
-        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.flight.fixes, "
-        "orthonav.publish.gate, orthonav.publish.mavlink_local, orthonav.publish.nmea\n"
+        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.core.flight.fixes, "
+        "orthonav.onboard.messages.gate, orthonav.onboard.messages.mavlink_local, "
+        "orthonav.onboard.messages.nmea\n"
         "assert not [name for name in sys.modules if name.startswith('pymavlink')]"
     )
     subprocess.run([sys.executable, "-c", script], check=True)

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.publish.estimate import EstimateError, NavigationEstimate
-from orthonav.publish.nmea import MPS_PER_KNOT, Quality, checksum, gga, gst, rmc
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
+from orthonav.onboard.messages.nmea import MPS_PER_KNOT, Quality, checksum, gga, gst, rmc
 
 MAX_LENGTH = 82  # characters of a sentence with `$` and the line end, NMEA 0183
 UTC_NS = 1_789_000_000_123_456_789  # 2026-09-10 00:26:40

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from orthonav.register.pose import Pose
-from orthonav.register.reference import Reference
-from orthonav.register.template import ViewTemplates
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.reference import Reference
+from orthonav.core.register.template import ViewTemplates
 
 
 class Ground:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scenes import Ground, as_grey, pixel_centres, reference_of, templates_of
 
-from orthonav.register.blocks import block_scores
-from orthonav.register.pose import Pose
-from orthonav.register.template import BLOCKS, ViewTemplates
+from orthonav.core.register.blocks import block_scores
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.template import BLOCKS, ViewTemplates
 
 GROUND = Ground(px=(5.0, 40.0))
 SHAPE, REACH_PX = (120, 150), 7

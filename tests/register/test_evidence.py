@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.register.evidence import CHANNELS, COARSE, FINE, GROUPS, EvidenceRecipe, evidence
+from orthonav.core.register.evidence import CHANNELS, COARSE, FINE, GROUPS, EvidenceRecipe, evidence
 
 RECIPES = {"fine": FINE, "coarse": COARSE}
 SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (96, 130)]

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scenes import Sheet
 
 from helpers import textured
-from orthonav.register import reference as module
-from orthonav.register.evidence import COARSE, FINE, evidence
-from orthonav.register.reference import Reference
+from orthonav.core.register import reference as module
+from orthonav.core.register.evidence import COARSE, FINE, evidence
+from orthonav.core.register.reference import Reference
 
 SHAPE = (160, 232)
 

@@ -18,12 +18,12 @@ from scenes import (
     turned_rad,
 )
 
-import orthonav.register.registrar as registrar_module
-from orthonav.register.evidence import COARSE, FINE
-from orthonav.register.pose import Pose
-from orthonav.register.reference import Reference
-from orthonav.register.refine import Refiner
-from orthonav.register.registrar import (
+import orthonav.core.register.registrar as registrar_module
+from orthonav.core.register.evidence import COARSE, FINE
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.reference import Reference
+from orthonav.core.register.refine import Refiner
+from orthonav.core.register.registrar import (
     EXCLUSION_SHARE,
     LOOK_PX,
     MAX_KEPT_WINDOWS,
@@ -36,8 +36,8 @@ from orthonav.register.registrar import (
     Registrar,
     view_side_px,
 )
-from orthonav.register.search import Candidate, bank, search
-from orthonav.register.template import ViewTemplates
+from orthonav.core.register.search import Candidate, bank, search
+from orthonav.core.register.template import ViewTemplates
 
 SHAPE = (384, 448)
 VIEW = (96, 128)
@@ -216,7 +216,7 @@ def test_what_lies_beside_the_best_is_no_rival(registrar):
 def test_candidates_move_to_the_best_place_near_by_and_places_are_named_once(
     registrar, monkeypatch, whole_px
 ):
-    monkeypatch.setattr("orthonav.register.registrar.WHOLE_WINDOW_PX", whole_px)
+    monkeypatch.setattr("orthonav.core.register.registrar.WHOLE_WINDOW_PX", whole_px)
     for pose in random_poses(6, SHAPE, 110, seed=16):
         templates = templates_of(GROUND, pose)
         asked = [near(pose, 20.0, -14.0), near(pose, -9.0, 18.0), near(pose, 90.0, 60.0)]

@@ -15,9 +15,9 @@ from scenes import (
     turned_rad,
 )
 
-from orthonav.register.evidence import FINE
-from orthonav.register.pose import Pose
-from orthonav.register.search import (
+from orthonav.core.register.evidence import FINE
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.search import (
     Bank,
     SearchWindow,
     _best_of,
@@ -26,7 +26,7 @@ from orthonav.register.search import (
     largest_half_px,
     search,
 )
-from orthonav.register.template import Template
+from orthonav.core.register.template import Template
 
 SHAPE = (384, 448)
 GROUND = Ground()
@@ -167,7 +167,7 @@ def test_no_middle_is_sought_in_the_margin(reference):
 def test_a_window_as_small_as_a_view_allows_gives_the_same(monkeypatch, reference, by_kernel):
     """No middle sought sees across the border, however its view is turned and scaled."""
     if not by_kernel:
-        monkeypatch.setattr("orthonav.register.search.KERNEL", None)
+        monkeypatch.setattr("orthonav.core.register.search.KERNEL", None)
     made, margin_px, poses = reference.window(LEVEL, 20, 30, 90, 84), 27, ALL_TURNS.poses[::3]
     poses += [(turn, 0.2) for turn, _ in poses]
     template = templates_of(GROUND, Pose(150.0, 130.0, 0.4, 0.1)).at(LEVEL)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scenes import Ground, as_grey, reference_of, seen, templates_of
 
-from orthonav.register.evidence import COARSE, FINE, GROUPS, evidence
-from orthonav.register.pose import Pose
-from orthonav.register.search import posed_channels, posed_half_px
-from orthonav.register.template import (
+from orthonav.core.register.evidence import COARSE, FINE, GROUPS, evidence
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.search import posed_channels, posed_half_px
+from orthonav.core.register.template import (
     BLOCKS,
     Template,
     ViewTemplates,

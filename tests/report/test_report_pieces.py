@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import MissingExtraError, OutputError
-from orthonav.report import (
+from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.ground.report import (
     Background,
     Drawing,
     Figure,
@@ -29,8 +29,8 @@ from orthonav.report import (
     write_figures,
     write_page,
 )
-from orthonav.report.figures import LIST
-from orthonav.report.page import joined_scripts
+from orthonav.ground.report.figures import LIST
+from orthonav.ground.report.page import joined_scripts
 
 
 def figure(name: str, content: str = "a") -> Figure:
@@ -105,7 +105,7 @@ def test_without_matplotlib_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch)
 
 def test_importing_does_not_import_matplotlib() -> None:
     code = (
-        "import sys, orthonav.report; unwanted = {'matplotlib', 'jinja2', 'PIL', 'cv2'}; "
+        "import sys, orthonav.ground.report; unwanted = {'matplotlib', 'jinja2', 'PIL', 'cv2'}; "
         "assert not unwanted & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -303,7 +303,7 @@ def test_without_jinja_the_remedy_is_named(rendered, monkeypatch) -> None:
 
 
 def test_scripts_of_a_page_are_joined_without_module_syntax() -> None:
-    text = joined_scripts(("format.js", "plane.js", "chart.js"), "orthonav.report", ())
+    text = joined_scripts(("format.js", "plane.js", "chart.js"), "orthonav.ground.report", ())
     assert text.startswith("(() => {") and "function metres(" in text
     assert not re.search(r"^(export|import)\b", text, re.MULTILINE)
 

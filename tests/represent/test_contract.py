@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from edge_networks import write
 
-from orthonav.errors import VariantError
-from orthonav.represent import TABLE
-from orthonav.represent.canny import Canny
-from orthonav.represent.gradients import OrientedGradients
-from orthonav.represent.gray import Gray
-from orthonav.represent.segments import Segments
-from orthonav.variants import make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.errors import VariantError
+from orthonav.core.tiles.canny import Canny
+from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.gray import Gray
+from orthonav.core.tiles.represent import TABLE
+from orthonav.core.variants import make_variant, variant_from_recipe, variant_recipe
+from orthonav.research.segments import Segments
 
 SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (64, 64), (256, 255)]
 

@@ -7,14 +7,15 @@ import onnx
 import pytest
 from edge_networks import sharp, write
 
-from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, VariantError
-from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.methods import stored_representation
-from orthonav.represent import TABLE, learned
-from orthonav.represent.learned import VARIABLE, LearnedEdges
-from orthonav.variants import make_variant, variant_from_recipe
+from orthonav.core.errors import MapFileError, MissingExtraError, MissingFileError, VariantError
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.tiles import learned
+from orthonav.core.tiles.learned import VARIABLE, LearnedEdges
+from orthonav.core.tiles.represent import TABLE
+from orthonav.core.variants import make_variant, variant_from_recipe
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.build.methods import stored_representation
 
 DOUBLE = onnx.TensorProto.DOUBLE
 
@@ -107,7 +108,7 @@ def test_the_extra_is_named_where_onnxruntime_is_absent(network, monkeypatch):
 
 
 def test_a_map_with_such_edges_flies_with_its_network_only(area, tmp_path, monkeypatch, network):
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 12)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
     path = tmp_path / "area.onav"
     build_map(
         BuildRequest(

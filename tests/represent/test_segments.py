@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import MissingExtraError, VariantError
-from orthonav.represent.segments import Segments, boundaries
-from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.errors import MissingExtraError, VariantError
+from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.research.segments import Segments, boundaries
 
-TABLE = {"segments": Variant("orthonav.represent.segments:Segments", extra="segments")}
+TABLE = {"segments": Variant("orthonav.research.segments:Segments", extra="segments")}
 SHAPES = [(1, 1), (1, 40), (40, 1), (2, 3), (16, 16), (33, 47), (128, 127)]
 
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import MapFileError
-from orthonav.geo.grid import TileGrid
-from orthonav.search.peak import TileNeighbours, find, parabola_peak
+from orthonav.core.errors import MapFileError
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.tiles.peak import TileNeighbours, find, parabola_peak
 
 GRID = TileGrid.covering((0.0, 0.0, 900.0, 600.0), gsd_m=1.0, tile_px=256, overlap=0.875)
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from orthonav.geo.camera import Camera
-from orthonav.simulate.clouds import EDGE, GRID, HEIGHT, MOST_VIEWS, Clouds
+from orthonav.core.geo.camera import Camera
+from orthonav.ground.simulate.clouds import EDGE, GRID, HEIGHT, MOST_VIEWS, Clouds
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
 AGL_M = 1000.0

@@ -8,18 +8,18 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.errors import AreaError, FlightError, OutputError
-from orthonav.flight import FlightWriter, open_flight, read_image, read_truth
-from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera
-from orthonav.geo.route import Route
-from orthonav.geo.swapped import HINT
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import downsampled, rectify
-from orthonav.records import View
-from orthonav.simulate import flight as flight_module
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.render import ViewEffects
+from orthonav.core.errors import AreaError, FlightError, OutputError
+from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.swapped import HINT
+from orthonav.core.localize import downsampled, rectify
+from orthonav.core.records import View
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate import flight as flight_module
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.render import ViewEffects
 
 PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthonav.errors import AreaError
-from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
-from orthonav.simulate.landscape.network import Network
-from orthonav.simulate.landscape.noise import fractal_grid, key_of, noise_at, noise_grid, white_grid
-from orthonav.simulate.landscape.relief import lighting
-from orthonav.simulate.landscape.window import PixelWindow
+from orthonav.core.errors import AreaError
+from orthonav.ground.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
+from orthonav.ground.simulate.landscape.network import Network
+from orthonav.ground.simulate.landscape.noise import (
+    fractal_grid,
+    key_of,
+    noise_at,
+    noise_grid,
+    white_grid,
+)
+from orthonav.ground.simulate.landscape.relief import lighting
+from orthonav.ground.simulate.landscape.window import PixelWindow
 
 SUMMER, AUTUMN, SPRING = DEFAULT_DATES
 WEST_M, NORTH_M = ORIGIN_M[0] + 600.0, ORIGIN_M[1] + 1500.0

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from orthonav.errors import FlightError
-from orthonav.geo.camera import enu_from_camera
-from orthonav.geo.route import distance_to_polyline_m
-from orthonav.simulate.motion import (
+from orthonav.core.errors import FlightError
+from orthonav.core.geo.camera import enu_from_camera
+from orthonav.ground.planning.route import distance_to_polyline_m
+from orthonav.ground.simulate.motion import (
     DRIFT_TIME_S,
     GUST_STD,
     GUST_TIME_S,

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from test_flight import FISH, LENS, PLAIN, SEEN
 
-from orthonav.errors import FlightError
-from orthonav.flight import open_flight, read_image, read_truth
-from orthonav.geo.camera import Camera
-from orthonav.imagery.terrain import open_dem
-from orthonav.simulate.flight import SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import generate_area, generate_heights
-from orthonav.simulate.landscape.epoch import DEFAULT_DATES
-from orthonav.simulate.landscape.scene import Landscape
-from orthonav.simulate.perspective import Raster, met, rays_enu, seen_view
-from orthonav.simulate.render import render_view
+from orthonav.core.errors import FlightError
+from orthonav.core.flight import open_flight, read_image, read_truth
+from orthonav.core.geo.camera import Camera
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
+from orthonav.ground.simulate.landscape import generate_area, generate_heights
+from orthonav.ground.simulate.landscape.epoch import DEFAULT_DATES
+from orthonav.ground.simulate.landscape.scene import Landscape
+from orthonav.ground.simulate.perspective import Raster, met, rays_enu, seen_view
+from orthonav.ground.simulate.render import render_view
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 AUTUMN = DEFAULT_DATES[1]

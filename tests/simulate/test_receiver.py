@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from orthonav.errors import FlightError, VariantError
-from orthonav.flight.gnss import read_gnss
-from orthonav.geo.area import Area
-from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.simulate.receiver import RATE_HZ, RECEIVERS, receiver_of, samples_of, solutions
+from orthonav.core.errors import FlightError, VariantError
+from orthonav.core.flight.gnss import read_gnss
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.simulate.receiver import RATE_HZ, RECEIVERS, receiver_of, samples_of, solutions
 
 TIMES = np.arange(0.0, 301.0)
 PLACES = np.stack([20.0 * TIMES, 0.0 * TIMES], axis=1)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.errors import FlightError
-from orthonav.flight import open_flight
-from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera, axis_on_ground_en_m
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.simulate import flight as flight_module
-from orthonav.simulate.attitude import HORIZON_TIME_S, camera_attitude, horizon_errors
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.core.errors import FlightError
+from orthonav.core.flight import open_flight
+from orthonav.core.geo.camera import Camera, axis_on_ground_en_m
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate import flight as flight_module
+from orthonav.ground.simulate.attitude import HORIZON_TIME_S, camera_attitude, horizon_errors
+from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 LEVEL = (0.0, 0.0, 0.0)

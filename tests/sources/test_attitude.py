@@ -9,10 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from orthonav.geo.camera import attitude_of, enu_from_camera
-from orthonav.onboard.aiding import AIDED_TILT_STD_DEG, UNAIDED_TILT_STD_DEG
-from orthonav.records import DEFAULT_TILT_STD_DEG
-from orthonav.sources.attitude import (
+from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
     GIMBAL_TILT_STD_DEG,
@@ -22,6 +19,9 @@ from orthonav.sources.attitude import (
     ned_from_angles,
     rotations_of_wxyz,
 )
+from orthonav.core.geo.camera import attitude_of, enu_from_camera
+from orthonav.core.records import DEFAULT_TILT_STD_DEG
+from orthonav.onboard.aiding import AIDED_TILT_STD_DEG, UNAIDED_TILT_STD_DEG
 
 angles = st.floats(-180, 180)
 

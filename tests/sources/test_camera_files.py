@@ -9,9 +9,9 @@ import pytest
 import yaml
 from recorders import camera_file
 
-from orthonav.errors import CameraError, MissingFileError
-from orthonav.geo.camera import Camera
-from orthonav.sources.cameras import read_camera_file
+from orthonav.core.errors import CameraError, MissingFileError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera_files import read_camera_file
 
 MATRIX = np.array([[500.25, 0, 319.5], [0, 501.5, 239.5], [0, 0, 1]])
 BROWN = [-0.25, 0.08, 1e-3, -5e-4, -0.01]

@@ -12,11 +12,11 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from recorders import START_S, camera_file, dji, packet, photo, place, tlog, video
 
-from orthonav.flight import FlightWriter, open_flight, read_image
-from orthonav.flight.fixes import read_results
-from orthonav.geo.camera import Camera
-from orthonav.records import Fix, Telemetry
-from orthonav.sources.recording import LEVEL_GROUND, LEVEL_GROUND_IN_GAPS
+from orthonav.core.flight import FlightWriter, open_flight, read_image
+from orthonav.core.flight.fixes import read_results
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Fix, Telemetry
+from orthonav.ground.recordings.recording import LEVEL_GROUND, LEVEL_GROUND_IN_GAPS
 
 DATA = Path(__file__).parents[1] / "data"
 MAP = DATA / "golden_v1.onav"

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from orthonav.errors import FlightError, OrthonavError
-from orthonav.flight import open_flight, read_image
-from orthonav.flight import png as png_module
-from orthonav.flight.fixes import read_results, result_to_json
-from orthonav.flight.logged import (
+from orthonav.core.errors import FlightError, OrthonavError
+from orthonav.core.flight import open_flight, read_image
+from orthonav.core.flight import png as png_module
+from orthonav.core.flight.fixes import read_results, result_to_json
+from orthonav.core.flight.logged import (
     PROFILE,
     SESSION,
     TELEMETRY,
@@ -32,22 +32,22 @@ from orthonav.flight.logged import (
     to_json,
     view_of,
 )
-from orthonav.flight.mount import Bias, Mount, write_mount
-from orthonav.flight.png import lossless_png
-from orthonav.geo.camera import Camera
-from orthonav.geo.ground import Ground
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
-from orthonav.mapfile.signature import map_digest
+from orthonav.core.flight.mount import Bias, Mount, write_mount
+from orthonav.core.flight.png import lossless_png
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.ground import Ground
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.signature import map_digest
+from orthonav.core.records import NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.track.tracker import Tracker
+from orthonav.ground.recordings import SourceOptions, open_source, source_kind
+from orthonav.ground.recordings import flightlog as flightlog_module
 from orthonav.onboard import log as log_module
 from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.run import locate_view
 from orthonav.onboard.segment import Segment
-from orthonav.records import NoFix, Prior, Telemetry, View, ViewResult
-from orthonav.sources import SourceOptions, open_source, source_kind
-from orthonav.sources import flightlog as flightlog_module
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 VIEWS = 5

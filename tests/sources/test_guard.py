@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from orthonav.errors import CameraError, FlightError, MissingExtraError
-from orthonav.sources.guard import needed, reading
+from orthonav.core.errors import CameraError, FlightError, MissingExtraError
+from orthonav.core.guard import needed, reading
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from recorders import dji, photo, picture, place
 
-from orthonav.errors import CameraError, FlightError
-from orthonav.sources import SourceOptions, open_source
+from orthonav.core.errors import CameraError, FlightError
+from orthonav.ground.recordings import SourceOptions, open_source
 
 FOV = SourceOptions(fov_deg=60.0)
 

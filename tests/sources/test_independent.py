@@ -30,12 +30,12 @@ from recorders import (
     ulog,
 )
 
-from orthonav.errors import FlightError
-from orthonav.sources import open_source
-from orthonav.sources.exif import read_photo
-from orthonav.sources.logs import read_log
-from orthonav.sources.photo_poses import poses_of
-from orthonav.sources.subtitles import read_srt
+from orthonav.core.errors import FlightError
+from orthonav.ground.recordings import open_source
+from orthonav.ground.recordings.exif import read_photo
+from orthonav.ground.recordings.logs import read_log
+from orthonav.ground.recordings.photo_poses import poses_of
+from orthonav.ground.recordings.subtitles import read_srt
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = (

@@ -18,11 +18,11 @@ from recorders import (
     video,
 )
 
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight import open_flight
-from orthonav.sources import SourceOptions, import_flight, open_source
-from orthonav.sources.logs import log_kind, read_log
-from orthonav.sources.track import angles_at
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.flight import open_flight
+from orthonav.core.flight.telemetry_track import angles_at
+from orthonav.ground.recordings import SourceOptions, import_flight, open_source
+from orthonav.ground.recordings.logs import log_kind, read_log
 
 DOWN = (0.0, 0.0, 0.0)
 WRITERS = {

@@ -5,19 +5,19 @@ import math
 import pytest
 from recorders import DJI, SENSEFLY, START_S, dji, maker_notes, packet, photo, place
 
-from orthonav.errors import CameraError, FlightError
-from orthonav.flight import open_flight, read_camera
-from orthonav.sources import SourceOptions, import_flight, open_source
-from orthonav.sources.attitude import (
+from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.flight import open_flight, read_camera
+from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
     GIMBAL_TILT_STD_DEG,
 )
-from orthonav.sources.exif import read_photo
-from orthonav.sources.focal import FocalLength, Optics, focal_length
-from orthonav.sources.makernotes import read_maker_notes
-from orthonav.sources.photo_poses import UNKNOWN_YAW_STD_DEG
-from orthonav.sources.xmp import Xmp
+from orthonav.ground.recordings import SourceOptions, import_flight, open_source
+from orthonav.ground.recordings.exif import read_photo
+from orthonav.ground.recordings.focal import FocalLength, Optics, focal_length
+from orthonav.ground.recordings.makernotes import read_maker_notes
+from orthonav.ground.recordings.photo_poses import UNKNOWN_YAW_STD_DEG
+from orthonav.ground.recordings.xmp import Xmp
 
 MODEL, SOFTWARE, XMP_TAG, MAKER_NOTE = 0x0110, 0x0131, 700, 0x927C
 FIRMWARE, VIEWER = "v01.43.0039", "Microsoft Windows Photo Viewer 10.0"

@@ -19,14 +19,14 @@ from recorders import (
     place,
 )
 
-from orthonav.errors import CameraError, FlightError, MissingFileError
-from orthonav.flight import open_flight, read_image, read_truth
-from orthonav.records import Prior
-from orthonav.sources import SourceOptions, import_flight, open_source
-from orthonav.sources.exif import read_photo
-from orthonav.sources.focal import focal_length
-from orthonav.sources.photo_poses import poses_of
-from orthonav.sources.recording import LEVEL_GROUND
+from orthonav.core.errors import CameraError, FlightError, MissingFileError
+from orthonav.core.flight import open_flight, read_image, read_truth
+from orthonav.core.records import Prior
+from orthonav.ground.recordings import SourceOptions, import_flight, open_source
+from orthonav.ground.recordings.exif import read_photo
+from orthonav.ground.recordings.focal import focal_length
+from orthonav.ground.recordings.photo_poses import poses_of
+from orthonav.ground.recordings.recording import LEVEL_GROUND
 
 SUBSEC, OFFSET = 0x9291, 0x9011
 FILM_NOTE = "focal length 44 px, good to 3 %: 35 mm equivalent of EXIF"

@@ -10,9 +10,9 @@ import pytest
 import zstandard
 from bags import Messages, flight, record
 
-from orthonav.errors import FlightError
-from orthonav.sources import import_flight, open_source, ros_limits
-from orthonav.sources.ros_limits import bound_inflation, check_held
+from orthonav.core.errors import FlightError
+from orthonav.ground.recordings import import_flight, open_source, ros_limits
+from orthonav.ground.recordings.ros_limits import bound_inflation, check_held
 
 MB = 2**20
 

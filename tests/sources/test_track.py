@@ -7,18 +7,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import FlightError
-from orthonav.geo.camera import enu_from_camera
-from orthonav.records import Prior
-from orthonav.sources.attitude import (
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.source_options import SourceOptions
+from orthonav.core.flight.telemetry_track import (
+    GAP_NS,
+    RecordedTrack,
+    Samples,
+    angles_at,
+    attitude_of_angles,
+)
+from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
     GIMBAL_TILT_STD_DEG,
     enu_from_body_camera,
     ned_from_angles,
 )
-from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import (
+from orthonav.core.geo.camera import enu_from_camera
+from orthonav.core.records import Prior
+from orthonav.ground.recordings.recording import (
     LEVEL_GROUND_IN_GAPS,
     SourceView,
     check_overlap,
@@ -27,7 +34,6 @@ from orthonav.sources.recording import (
     with_mean_velocities,
     with_options,
 )
-from orthonav.sources.track import GAP_NS, RecordedTrack, Samples, angles_at, attitude_of_angles
 
 S = 10**9
 
@@ -218,8 +224,8 @@ def test_recordings_that_do_not_overlap_are_an_error(tmp_path):
 
 
 def test_cameras_fit_images_of_the_same_aspect_ratio():
-    from orthonav.errors import CameraError
-    from orthonav.geo.camera import Camera
+    from orthonav.core.errors import CameraError
+    from orthonav.core.geo.camera import Camera
 
     camera = Camera(4000, 3000, 3000.0, 3000.0, 2010.0, 1490.0)
     assert fitted(camera, 2000, 1500, "x").cx_px == 1005.0

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from recorders import camera_file, dji_subtitle, picture, subtitles, video
 
-from orthonav.errors import CameraError, FlightError
-from orthonav.flight import open_flight, read_image, read_truth
-from orthonav.sources import SourceOptions, import_flight, open_source
-from orthonav.sources.attitude import (
+from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.flight import open_flight, read_image, read_truth
+from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
     GIMBAL_TILT_STD_DEG,
 )
-from orthonav.sources.subtitles import blocks, read_srt
+from orthonav.ground.recordings import SourceOptions, import_flight, open_source
+from orthonav.ground.recordings.subtitles import blocks, read_srt
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.geo.camera import axis_on_ground_en_m
-from orthonav.track import (
+from orthonav.core.geo.camera import axis_on_ground_en_m
+from orthonav.core.track import (
     CameraDisplacement,
     Mixture,
     Model,
@@ -17,8 +17,8 @@ from orthonav.track import (
     Sighting,
     State,
 )
-from orthonav.track.model import HORIZON, SEEN, STATE, TILT, WHITE_SHARE
-from orthonav.track.motion import by_camera, predicted
+from orthonav.core.track.model import HORIZON, SEEN, STATE, TILT, WHITE_SHARE
+from orthonav.core.track.motion import by_camera, predicted
 
 SIDE_M, RADIUS_M, AGL_M, STEP_S, VIEWS = 2000.0, 35.0, 300.0, 1.0, 60
 EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.track import (
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.track import (
     CameraDisplacement,
     Mixture,
     Model,
@@ -18,9 +18,9 @@ from orthonav.track import (
     Sighting,
     State,
 )
-from orthonav.track.hypotheses import within
-from orthonav.track.model import SEEN, STATE, WHITE_SHARE
-from orthonav.track.smooth import History
+from orthonav.core.track.hypotheses import within
+from orthonav.core.track.model import SEEN, STATE, WHITE_SHARE
+from orthonav.core.track.smooth import History
 
 AREA_M2 = 4e6
 SIDE_M = math.sqrt(AREA_M2)
@@ -266,7 +266,7 @@ def test_history_in_many_blocks_gives_the_same(monkeypatch):
     whole, blocks = History(), History()
     _flown(7, views=20, history=whole)
     expected = whole.smoothed()
-    monkeypatch.setattr("orthonav.track.smooth.ROWS_OF_BLOCK", 3)
+    monkeypatch.setattr("orthonav.core.track.smooth.ROWS_OF_BLOCK", 3)
     mixture = _flown(7, views=20, history=blocks)[1]
     smoothed = blocks.smoothed()
     copies = [(each.mean.copy(), each.covariance.copy()) for each in smoothed]

@@ -10,8 +10,8 @@ sys.path.append(str(Path(__file__).parents[1] / "localizer"))  # blots.py: the k
 
 from small_run import PLACES_EN_M, Small, result, serving, write_small_flight, write_small_map
 
-from orthonav.flight.fixes import write_results
-from orthonav.web.opening import ViewRequest, open_run
+from orthonav.core.flight.fixes import write_results
+from orthonav.ground.view.opening import ViewRequest, open_run
 
 
 @pytest.fixture(scope="session")

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from blots import CAMERA, GROUND, as_grey, rendered
 
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.mapfile import Manifest, SheetInfo, write_map
-from orthonav.prepare.layer import GreyLayerWriter
-from orthonav.records import Fix, NoFix, ViewResult
-from orthonav.web.assets import load_assets
-from orthonav.web.server import Pages, Server
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile import Manifest, SheetInfo, write_map
+from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.ground.build.layer import GreyLayerWriter
+from orthonav.ground.view.assets import load_assets
+from orthonav.ground.view.server import Pages, Server
 
 FRAME = LocalFrame(46.5, 2.5)
 WEST_M, NORTH_M, GSD_M = -180.0, 160.0, 0.5

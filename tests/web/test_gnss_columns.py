@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from small_run import COV_EN_M2, FRAME, GSD_M, NORTH_M, WEST_M
 
-from orthonav.flight.gnss import FAULTS
-from orthonav.records import Fix, ViewResult
-from orthonav.web.columns import columns_of
+from orthonav.core.flight.gnss import FAULTS
+from orthonav.core.records import Fix, ViewResult
+from orthonav.ground.view.columns import columns_of
 
 SHEET = SimpleNamespace(
     frame=FRAME,

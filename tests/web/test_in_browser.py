@@ -12,9 +12,9 @@ from browsing import LAPTOP, TABLET, Visit, painted
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
-from orthonav.flight.fixes import result_to_json, write_results
-from orthonav.report import metres_text
-from orthonav.web.opening import ViewRequest, open_run
+from orthonav.core.flight.fixes import result_to_json, write_results
+from orthonav.ground.report import metres_text
+from orthonav.ground.view.opening import ViewRequest, open_run
 
 pytestmark = pytest.mark.long
 

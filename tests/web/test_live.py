@@ -10,17 +10,17 @@ import pytest
 from blots import CAMERA
 from small_run import result
 
-from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight.fixes import result_to_json
-from orthonav.flight.mount import Bias, Mount, write_mount
+from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.flight.fixes import result_to_json
+from orthonav.core.flight.mount import Bias, Mount, write_mount
+from orthonav.core.records import Telemetry
+from orthonav.ground.view import feed as feed_module
+from orthonav.ground.view import logs as logs_module
+from orthonav.ground.view.feed import LineFeed
+from orthonav.ground.view.logs import LogReader
+from orthonav.ground.view.opening import ViewRequest, open_run
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.outputs import JsonOut
-from orthonav.records import Telemetry
-from orthonav.web import feed as feed_module
-from orthonav.web import logs as logs_module
-from orthonav.web.feed import LineFeed
-from orthonav.web.logs import LogReader
-from orthonav.web.opening import ViewRequest, open_run
 
 HEALTH = {"health": "DEGRADED", "reasons": ["searching"], "utc_s": 1.5, "counts": {"taken": 3}}
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from small_run import FRAME, GSD_M, NORTH_M, WEST_M
 
-from orthonav.report.page import static_text
-from orthonav.web.assets import SHARED, load_assets
+from orthonav.ground.report.page import static_text
+from orthonav.ground.view.assets import SHARED, load_assets
 
-STATIC = files("orthonav.web").joinpath("static")
+STATIC = files("orthonav.ground.view").joinpath("static")
 OURS = {entry.name: entry.read_text(encoding="utf-8") for entry in STATIC.iterdir()}
 OURS |= {name: static_text(name) for name in SHARED}
 SCRIPTS = {name: text for name, text in OURS.items() if name.endswith(".js")}

@@ -23,10 +23,10 @@ from small_run import (
     write_small_map,
 )
 
-from orthonav.errors import MissingExtraError, OutputError
-from orthonav.web.assets import load_assets
-from orthonav.web.opening import ViewRequest, open_run
-from orthonav.web.server import Pages, Server
+from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.ground.view.assets import load_assets
+from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.view.server import Pages, Server
 
 
 def as_json(reply):

@@ -10,10 +10,10 @@ import pytest
 from small_run import NO_FIX, WRONG, result
 
 from orthonav.cli import view as view_module
-from orthonav.flight.fixes import write_results
-from orthonav.flight.identity import Identity
-from orthonav.records import Fix, ViewResult
-from orthonav.web.opening import ViewRequest, open_run
+from orthonav.core.flight.fixes import write_results
+from orthonav.core.flight.identity import Identity
+from orthonav.core.records import Fix, ViewResult
+from orthonav.ground.view.opening import ViewRequest, open_run
 
 
 def refused(done, *words):
@@ -30,7 +30,7 @@ def served(monkeypatch):
     def stop(self, poll_interval):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("orthonav.web.server.Server.serve_forever", stop)
+    monkeypatch.setattr("orthonav.ground.view.server.Server.serve_forever", stop)
 
 
 def test_it_prints_the_address_and_ends(run, small, served):

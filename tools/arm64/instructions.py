@@ -97,12 +97,12 @@ def located(run: str, views: int) -> int:
     """Locate the first views of the stored flight, one by one or as a track; how many fixes."""
     import cv2
 
-    from orthonav.flight import open_flight
-    from orthonav.localizer import Localizer
-    from orthonav.localizer.tracker import Tracker
-    from orthonav.mapfile import open_map
+    from orthonav.core.flight import open_flight
+    from orthonav.core.localize import Localizer
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.records import Fix
+    from orthonav.core.track.tracker import Tracker
     from orthonav.onboard.run import Locator, SingleViews, localize_flight
-    from orthonav.records import Fix
 
     cv2.setNumThreads(1)
     localizer = Localizer(open_map(GOLDEN / "area.onav"))

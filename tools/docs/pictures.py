@@ -27,12 +27,12 @@ from matplotlib.patches import Ellipse
 from PIL import Image
 from rasterio.windows import Window
 
-from orthonav import represent
-from orthonav.flight import FlightFolder, open_flight, read_image, read_truth
-from orthonav.geo.camera import footprint_en_m
-from orthonav.localizer import downsampled, rectify
-from orthonav.records import Telemetry, View
-from orthonav.variants import make_variant
+from orthonav.core.flight import FlightFolder, open_flight, read_image, read_truth
+from orthonav.core.geo.camera import footprint_en_m
+from orthonav.core.localize import downsampled, rectify
+from orthonav.core.records import Telemetry, View
+from orthonav.core.tiles import represent
+from orthonav.core.variants import make_variant
 
 TUTORIAL = ROOT / "docs" / "tutorials" / "operator.md"
 FIGURES = ROOT / "docs" / "figures"

@@ -25,13 +25,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from orthonav.files import write_text
-from orthonav.flight import Flight, open_flight
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
+from orthonav.core.files import write_text
+from orthonav.core.flight import Flight, open_flight
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, ViewResult
+from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.run import SingleViews, localize_flight, smoothed_track
-from orthonav.records import Fix, ViewResult
 
 STORED = Path(__file__).resolve().parents[2] / "tests" / "data" / "golden_flight"
 LIMITS_M = {"views": 0.01, "any_heading": 0.01, "track": 0.05, "smoothed": 0.05}
@@ -109,10 +109,10 @@ def digest(of: Places) -> str:
 
 def make(folder: Path) -> None:
     """Generate an area at two dates, a map of the first and a flight over the second."""
-    from orthonav.files import replacing_folder
-    from orthonav.geo.camera import Camera
-    from orthonav.geo.route import Route
-    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+    from orthonav.core.files import replacing_folder
+    from orthonav.core.geo.camera import Camera
+    from orthonav.ground.planning.route import Route
+    from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
     with replacing_folder(folder, lambda _: True) as made, tempfile.TemporaryDirectory() as area:
         past, present = _imagery(Path(area))
@@ -135,14 +135,14 @@ def make(folder: Path) -> None:
 
 def build(ortho: Path, out: Path) -> None:
     """Build the map whose fixes are compared."""
-    from orthonav.prepare import BuildRequest, build_map
+    from orthonav.ground.build import BuildRequest, build_map
 
     build_map(BuildRequest([ortho], out, gsd_m=1.0, tile_px=128, method="gradient:dims=32"))
 
 
 def _imagery(folder: Path) -> list[Path]:
     """Orthophotos of the generated area at two dates."""
-    from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+    from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
     return generate_area(folder, size_m=(600.0, 600.0), dates=DEFAULT_DATES[:2], seed=4)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 
 from orthonav.cli.needs import require_extras
-from orthonav.errors import OrthonavError
+from orthonav.core.errors import OrthonavError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 """Last words of option names that are units."""

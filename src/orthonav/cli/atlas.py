@@ -9,7 +9,7 @@ from orthonav.cli import build_atlas
 from orthonav.cli.common import add_area, print_json, progress
 
 if TYPE_CHECKING:
-    from orthonav.atlas.catalog import Atlas
+    from orthonav.ground.atlas.catalog import Atlas
 
 NOT_WHOLE = 3
 EVERYDAY = {
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> int | None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from orthonav.atlas.catalog import Atlas
+    from orthonav.ground.atlas.catalog import Atlas
 
     plain = summary(Atlas.open(options.atlas))
     if options.json:
@@ -181,8 +181,8 @@ def summary_text(plain: dict[str, Any]) -> str:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.integrity import check_atlas
+    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.integrity import check_atlas
 
     atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
@@ -213,7 +213,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _add(options: argparse.Namespace) -> None:
-    from orthonav.atlas.catalog import Atlas, copy_sheets
+    from orthonav.ground.atlas.catalog import Atlas, copy_sheets
 
     source = Atlas.open(options.source)
     atlas = Atlas.open_or_create(options.atlas, source.recipe)
@@ -223,7 +223,7 @@ def _add(options: argparse.Namespace) -> None:
 
 
 def _retire(options: argparse.Namespace) -> None:
-    from orthonav.atlas.catalog import Atlas
+    from orthonav.ground.atlas.catalog import Atlas
 
     atlas = Atlas.open(options.atlas)
     for sheet in dict.fromkeys(options.sheets):
@@ -233,8 +233,8 @@ def _retire(options: argparse.Namespace) -> None:
 
 
 def _index(options: argparse.Namespace) -> None:
-    from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.index import make_index
+    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.index import make_index
 
     atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
@@ -248,12 +248,12 @@ def _index(options: argparse.Namespace) -> None:
 
 
 def _cut(options: argparse.Namespace) -> None:
-    from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.cut import cut_map
     from orthonav.cli.info import summary as map_summary
     from orthonav.cli.info import summary_text as map_text
-    from orthonav.geo.area import Area, require_one_area
-    from orthonav.geo.route import read_route
+    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.cut import cut_map
+    from orthonav.ground.planning.area import Area, require_one_area
+    from orthonav.ground.planning.route import read_route
 
     atlas = Atlas.open(options.atlas)
     if options.route is None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
 if TYPE_CHECKING:
-    from orthonav.mapfile import Manifest
+    from orthonav.core.mapfile import Manifest
 
 LEAST_SHIFT_M = 0.3
 """Drift of a plate that is named: a pixel of the finest orthophotos of countries."""
@@ -145,8 +145,8 @@ def reporter(options: argparse.Namespace) -> Callable[[str], None]:
 def run(options: argparse.Namespace) -> int:
     """Build the map and print a summary."""
     from orthonav.cli.info import summary, summary_text
-    from orthonav.geo.route import read_route
-    from orthonav.prepare import BuildRequest, build_map
+    from orthonav.ground.build import BuildRequest, build_map
+    from orthonav.ground.planning.route import read_route
 
     start = time.perf_counter()
     request = BuildRequest(
@@ -183,7 +183,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _plates(manifest: "Manifest") -> list[dict[str, Any]]:
     """Systems of the orthophotos that their tectonic plate has moved away from WGS 84 by now."""
-    from orthonav.imagery.plates import plate_shift_m
+    from orthonav.ground.imagery.plates import plate_shift_m
 
     now = time.gmtime()
     year = round(now.tm_year + now.tm_yday / 366, 1)

@@ -10,7 +10,7 @@ from orthonav.cli.build import add_recipe, recipe_of, reporter
 from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
 if TYPE_CHECKING:
-    from orthonav.atlas.cluster import TaskRunner
+    from orthonav.ground.atlas.cluster import TaskRunner
 
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--gsd-m", "--sheet-km"),
@@ -84,10 +84,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Build, print a summary; returns 1 where a sheet failed."""
-    from orthonav.atlas.build import build_atlas
-    from orthonav.atlas.sheet_tasks import AtlasRequest
-    from orthonav.errors import AtlasError
-    from orthonav.geo.route import read_route
+    from orthonav.core.errors import AtlasError
+    from orthonav.ground.atlas.build import build_atlas
+    from orthonav.ground.atlas.sheet_tasks import AtlasRequest
+    from orthonav.ground.planning.route import read_route
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise AtlasError("torchrun trains one map: use --cluster to build an atlas in parallel")
@@ -124,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _recipe(options: argparse.Namespace) -> dict[str, Any]:
     """The fields of `AtlasRecipe` that were given."""
-    from orthonav.errors import AtlasError
+    from orthonav.core.errors import AtlasError
 
     given = recipe_of(options)
     if options.sheet_km is not None:
@@ -139,7 +139,7 @@ def _recipe(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _runner(options: argparse.Namespace) -> "TaskRunner":
-    from orthonav.atlas.cluster import RayRunner, SerialRunner
+    from orthonav.ground.atlas.cluster import RayRunner, SerialRunner
 
     if options.cluster is None and options.workers in (None, 1):
         return SerialRunner()

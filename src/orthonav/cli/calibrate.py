@@ -12,9 +12,9 @@ from orthonav.cli.source import add_source, open_source
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from orthonav.flight.recording import RecordedView
+    from orthonav.core.flight.recording import RecordedView
+    from orthonav.core.records import ViewResult
     from orthonav.onboard.calibrate import MountCalibration
-    from orthonav.records import ViewResult
 
 EVERYDAY = (
     *("--latency", "--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry"),
@@ -63,8 +63,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Estimate the biases from the confident views of a flight, and write them."""
-    from orthonav.errors import FlightError
-    from orthonav.flight.mount import write_mount
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight.mount import write_mount
 
     if options.latency:
         if options.dem is not None:
@@ -95,16 +95,16 @@ def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_trac
 def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     """The mount by the smoothed track of the flight, and True; by its single views, and False,
     where these make no track."""
-    from orthonav.flight import read_truth
-    from orthonav.flight.recording import WithTelemetry
+    from orthonav.core.flight import read_truth
+    from orthonav.core.flight.recording import WithTelemetry
+    from orthonav.core.localize import Localizer
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.records import Prior
+    from orthonav.core.track.tracker import Tracker
     from orthonav.ground.evaluate.truth import check_truth
-    from orthonav.localizer import Localizer
-    from orthonav.localizer.tracker import Tracker
-    from orthonav.mapfile import open_map
     from orthonav.onboard.calibrate import MIN_VIEWS, calibrate_mount, confident_views
     from orthonav.onboard.calibrate_views import RecordedSingleViews, calibrate_mount_by_views
     from orthonav.onboard.run import Locator, localize_flight, smoothed_track
-    from orthonav.records import Prior
 
     dem, opened = dem_of(options), open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
@@ -148,8 +148,8 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
 
 def _run_latency(options: argparse.Namespace) -> None:
     """Estimate the latency of the camera and write it."""
-    from orthonav.flight.latency import write_latency
-    from orthonav.onboard.calibrate_latency import arrivals_of, calibrate_latency
+    from orthonav.core.flight.latency import write_latency
+    from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
 
     flight = open_source(options.flight, options)
     with progress(options) as shown:

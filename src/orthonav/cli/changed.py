@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.errors import MapFileError
+from orthonav.core.errors import MapFileError
 
 if TYPE_CHECKING:
-    from orthonav.changes.record import ChangedGround
     from orthonav.cli.common import Progress
-    from orthonav.flight.recording import Flight
-    from orthonav.localizer.registration import RegistrationLocalizer
-    from orthonav.mapfile.reader import MapFile
-    from orthonav.records import ViewResult
+    from orthonav.core.flight.recording import Flight
+    from orthonav.core.localize.registration import RegistrationLocalizer
+    from orthonav.core.mapfile.reader import MapFile
+    from orthonav.core.records import ViewResult
+    from orthonav.ground.changes.record import ChangedGround
 
 
 def add_report_changes(parser: argparse._ActionsContainer) -> None:
@@ -49,11 +49,11 @@ def report_changes(
     None, and nothing is written, where it was not asked for or no view is confident. Raises
     `MapFileError` for a map without a registration layer.
     """
-    from orthonav.changes.ground import changed_ground
-    from orthonav.changes.record import ChangeGrid, write_changes
-    from orthonav.changes.views import cell_side_m, views_beside_map
-    from orthonav.localizer import Localizer
-    from orthonav.mapfile.signature import map_digest
+    from orthonav.core.localize import Localizer
+    from orthonav.core.mapfile.signature import map_digest
+    from orthonav.ground.changes.ground import changed_ground
+    from orthonav.ground.changes.record import ChangeGrid, write_changes
+    from orthonav.ground.changes.views import cell_side_m, views_beside_map
 
     if options.report_changes is None:
         return None

@@ -25,11 +25,11 @@ _REFERENCES = {
 }
 
 if TYPE_CHECKING:
-    from orthonav.changes.record import ChangedGround
-    from orthonav.geo.route import Route
-    from orthonav.geo.terrain import LegProfile
+    from orthonav.ground.changes.record import ChangedGround
     from orthonav.ground.check.outcome import CheckedInputs
     from orthonav.ground.check.request import CheckRequest
+    from orthonav.ground.planning.route import Route
+    from orthonav.ground.planning.terrain import LegProfile
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -203,8 +203,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _accepted(text: str) -> float:
     """The least confidence of `--accept`; raises `VariantError`."""
-    from orthonav.confidence.accept import Acceptance
-    from orthonav.errors import VariantError
+    from orthonav.core.errors import VariantError
+    from orthonav.core.localize.accept import Acceptance
 
     accept = Acceptance.parse(text)
     if accept.criterion != "confidence":
@@ -213,11 +213,11 @@ def _accepted(text: str) -> float:
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.errors import CheckError
-    from orthonav.geo.planning import DEFAULT_CAMERA
-    from orthonav.geo.route import read_route
+    from orthonav.core.errors import CheckError
+    from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.check.request import CheckRequest
-    from orthonav.sources.cameras import read_camera_file
+    from orthonav.ground.planning.route import read_route
+    from orthonav.ground.planning.spacing import DEFAULT_CAMERA
 
     if options.band_m is not None and options.route is None:
         raise CheckError("--band-m is the width of a band around a route; give --route too")
@@ -253,8 +253,8 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
 
 def _changes(options: argparse.Namespace) -> "ChangedGround | None":
     """Ground that changed, with a warning where it was seen with another map."""
-    from orthonav.changes.record import read_changes
-    from orthonav.mapfile.signature import map_digest
+    from orthonav.core.mapfile.signature import map_digest
+    from orthonav.ground.changes.record import read_changes
 
     if options.changes is None:
         return None
@@ -275,8 +275,8 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
-    from orthonav.errors import CheckError
-    from orthonav.geo.terrain import LANDING_M
+    from orthonav.core.errors import CheckError
+    from orthonav.ground.planning.terrain import LANDING_M
 
     if options.dem_datum is not None and options.dem is None:
         raise CheckError("--dem-datum needs a terrain model: give --dem too")
@@ -310,10 +310,10 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProfile"], str]:
     """Heights above ground along a route, and the terrain in words; none without a terrain."""
     from orthonav.cli.heights import dem_for_route
-    from orthonav.errors import CheckError, RouteError
-    from orthonav.geo.terrain import profile
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.terrain import TerrainLayer
+    from orthonav.core.errors import CheckError, RouteError
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.mapfile.terrain import TerrainLayer
+    from orthonav.ground.planning.terrain import profile
 
     dem = dem_for_route(options, route)
     terrain = TerrainLayer.of(open_map(options.map)) if dem is None else dem
@@ -329,8 +329,8 @@ def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProf
 def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "CheckedInputs":
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
+    from orthonav.core.mapfile import open_map
     from orthonav.ground.check.outcome import CheckedInputs
-    from orthonav.mapfile import open_map
 
     manifest = open_map(options.map).manifest
     terms = []

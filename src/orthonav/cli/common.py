@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 if TYPE_CHECKING:
-    from orthonav.localizer.plan import SearchPlan
+    from orthonav.core.localize.plan import SearchPlan
 
 MAX_THREADS = 64
 
@@ -128,8 +128,8 @@ def add_search(parser: argparse._ActionsContainer) -> None:
 
 def search_plan(options: argparse.Namespace) -> "SearchPlan":
     """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
-    from orthonav.errors import VariantError
-    from orthonav.localizer.plan import DEFAULT_PLAN
+    from orthonav.core.errors import VariantError
+    from orthonav.core.localize.plan import DEFAULT_PLAN
 
     budget_ms = math.inf if options.budget_ms is None else options.budget_ms
     if not budget_ms > 0:
@@ -142,7 +142,7 @@ def search_plan(options: argparse.Namespace) -> "SearchPlan":
 @contextmanager
 def beside(*outputs: Path | None) -> Iterator[None]:
     """What is printed goes to stderr where one of the outputs of a command is `-`, stdout."""
-    from orthonav.files import is_stdout
+    from orthonav.core.files import is_stdout
 
     taken = any(path is not None and is_stdout(path) for path in outputs)
     with redirect_stdout(sys.stderr) if taken else nullcontext():

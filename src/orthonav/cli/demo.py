@@ -54,7 +54,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the demo and print its results."""
-    from orthonav.files import replacing_folder
+    from orthonav.core.files import replacing_folder
 
     start = time.perf_counter()
     with progress(options) as shown, replacing_folder(options.out, _is_earlier_demo) as folder:
@@ -108,19 +108,19 @@ def _is_earlier_demo(out: Path) -> bool:
 def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[dict[str, Any], str]:
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
-    from orthonav.flight import open_flight, read_truth
-    from orthonav.flight.fixes import write_results
-    from orthonav.flight.identity import Identity, flight_digest
-    from orthonav.geo.route import read_route
+    from orthonav.core.flight import open_flight, read_truth
+    from orthonav.core.flight.fixes import write_results
+    from orthonav.core.flight.identity import Identity, flight_digest
+    from orthonav.core.localize import Localizer
+    from orthonav.core.mapfile import open_map
+    from orthonav.ground.build import BuildRequest, build_map
     from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.evaluate.metrics import compare, measure
     from orthonav.ground.evaluate.report import MadeFrom, write_report
-    from orthonav.localizer import Localizer
-    from orthonav.mapfile import open_map
+    from orthonav.ground.planning.route import read_route
+    from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+    from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
     from orthonav.onboard.run import SingleViews, localize_flight
-    from orthonav.prepare import BuildRequest, build_map
-    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-    from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
     _say(options, f"1/5 generating 2 x 2 km at two dates (seed {options.seed})")
     past, present = generate_area(
@@ -187,12 +187,12 @@ def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
     """The prediction for the route in one line; writes the report of the check to `check`."""
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
-    from orthonav.geo.route import read_route
+    from orthonav.core.mapfile import open_map
     from orthonav.ground.check.outcome import CheckedInputs
     from orthonav.ground.check.request import CheckRequest
     from orthonav.ground.check.run import check_map
     from orthonav.ground.check.write import write_check
-    from orthonav.mapfile import open_map
+    from orthonav.ground.planning.route import read_route
 
     manifest = open_map(map_path).manifest
     request = CheckRequest(

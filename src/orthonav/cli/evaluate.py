@@ -18,15 +18,15 @@ from orthonav.cli.common import beside, print_json, progress
 from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
-    from orthonav.changes.record import ChangedGround
-    from orthonav.flight import FlightFolder
+    from orthonav.core.flight import FlightFolder
+    from orthonav.core.mapfile.layer import GreyLayer
+    from orthonav.core.mapfile.reader import MapFile
+    from orthonav.core.records import ViewResult
+    from orthonav.ground.changes.record import ChangedGround
     from orthonav.ground.evaluate.contact_sheet import Row
     from orthonav.ground.evaluate.flights import FlightReport
     from orthonav.ground.evaluate.metrics import Comparison, Metrics
-    from orthonav.mapfile.layer import GreyLayer
-    from orthonav.mapfile.reader import MapFile
-    from orthonav.records import ViewResult
-    from orthonav.report import Background
+    from orthonav.ground.report import Background
 
 log = logging.getLogger(__name__)
 
@@ -89,10 +89,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
-    from orthonav.errors import FlightError
-    from orthonav.files import write_text
+    from orthonav.core.errors import FlightError
+    from orthonav.core.files import write_text
+    from orthonav.core.mapfile import open_map
     from orthonav.ground.evaluate.flights import flights_to_json, total
-    from orthonav.mapfile import open_map
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
     options.truth = _one_each(options.truth, options.fixes, "--truth")
@@ -127,7 +127,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
     """One path per file of fixes: a single one is for all; none stays none."""
-    from orthonav.errors import FlightError
+    from orthonav.core.errors import FlightError
 
     if len(given) == 1:
         return given * len(fixes)
@@ -162,8 +162,8 @@ def _print(
 
 def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
     """Write `--report-changes` by the views of all flights; None where it was not asked for."""
-    from orthonav.flight import open_flight
-    from orthonav.flight.fixes import read_results
+    from orthonav.core.flight import open_flight
+    from orthonav.core.flight.fixes import read_results
 
     if options.report_changes is None or opened is None:
         return None
@@ -177,8 +177,8 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     """Metrics of every flight, with its worst views if their images are given."""
-    from orthonav.flight import open_flight, read_truth
-    from orthonav.flight.fixes import read_results
+    from orthonav.core.flight import open_flight, read_truth
+    from orthonav.core.flight.fixes import read_results
     from orthonav.ground.evaluate.flights import FlightReport
     from orthonav.ground.evaluate.gnss import measure_gnss
     from orthonav.ground.evaluate.metrics import compare, measure
@@ -214,9 +214,9 @@ def _warn_of_another_run(
 
     Without a flight, it is the flight folder in which the truth is, if any.
     """
-    from orthonav.errors import OrthonavError
-    from orthonav.flight import open_flight
-    from orthonav.flight.identity import Identity, flight_digest, read_identity
+    from orthonav.core.errors import OrthonavError
+    from orthonav.core.flight import open_flight
+    from orthonav.core.flight.identity import Identity, flight_digest, read_identity
 
     if flight is None and (truth.parent / "telemetry.csv").is_file():
         with suppress(OrthonavError):
@@ -233,8 +233,8 @@ def _warn_of_another_run(
 
 def _grey_layer(opened: "MapFile") -> "GreyLayer":
     """The grey pyramid of a map; raises `MapFileError` without one."""
-    from orthonav.errors import MapFileError
-    from orthonav.mapfile.layer import GreyLayer
+    from orthonav.core.errors import MapFileError
+    from orthonav.core.mapfile.layer import GreyLayer
 
     layer = GreyLayer.of(opened)
     if layer is None:
@@ -286,7 +286,7 @@ def _write_report(
 
 def map_background(opened: "MapFile") -> "Background":
     """The preview of a map as background; raises `MapFileError` where it is damaged."""
-    from orthonav.mapfile.layer import preview
-    from orthonav.report import Background
+    from orthonav.core.mapfile.layer import preview
+    from orthonav.ground.report import Background
 
     return Background(preview(opened), *opened.manifest.sheets[0].grid.extent_en_m)

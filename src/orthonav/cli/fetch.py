@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import add_area, bounds, print_json, progress
 from orthonav.cli.needs import require_extras
-from orthonav.errors import FetchError
+from orthonav.core.errors import FetchError
 
 if TYPE_CHECKING:
-    from orthonav.fetch.options import ImageryOptions
-    from orthonav.fetch.run import FetchRequest, FetchResult
-    from orthonav.geo.area import Area
+    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.run import FetchRequest, FetchResult
+    from orthonav.ground.planning.area import Area
 
 PACKAGE = "ign-package:"
 EVERYDAY = (
@@ -154,7 +154,7 @@ def run(options: argparse.Namespace) -> None:
     if options.source.startswith(PACKAGE):
         _run_package(options)
         return
-    from orthonav.fetch.run import estimate_fetch, fetch
+    from orthonav.ground.fetch.run import estimate_fetch, fetch
 
     request = _request(options)
     if options.dry_run:
@@ -175,10 +175,10 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":
-    from orthonav.fetch.politeness import RequestLimits
-    from orthonav.fetch.run import FetchRequest
-    from orthonav.fetch.sources import parse_source
-    from orthonav.fetch.write import Packing
+    from orthonav.ground.fetch.politeness import RequestLimits
+    from orthonav.ground.fetch.run import FetchRequest
+    from orthonav.ground.fetch.sources import parse_source
+    from orthonav.ground.fetch.write import Packing
 
     if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
         raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
@@ -210,7 +210,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
 
 def _imagery(options: argparse.Namespace) -> "ImageryOptions":
-    from orthonav.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.options import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
@@ -244,8 +244,8 @@ def _bands(text: str | None) -> tuple[int, ...] | None:
 
 
 def _area(options: argparse.Namespace) -> "Area":
-    from orthonav.geo.area import Area
-    from orthonav.geo.route import read_route
+    from orthonav.ground.planning.area import Area
+    from orthonav.ground.planning.route import read_route
 
     route, box = options.route, options.bounds
     if options.area is not None:
@@ -266,8 +266,8 @@ def _area(options: argparse.Namespace) -> "Area":
 
 
 def _run_package(options: argparse.Namespace) -> None:
-    from orthonav.fetch.client import Client
-    from orthonav.fetch.package import (
+    from orthonav.ground.fetch.client import Client
+    from orthonav.ground.fetch.package import (
         ATTRIBUTION,
         LIMITS,
         download_package,
@@ -322,7 +322,7 @@ def _summary(out: Path, result: "FetchResult") -> str:
 
 
 def _print_presets(as_json: bool) -> None:
-    from orthonav.fetch.presets import presets
+    from orthonav.ground.fetch.presets import presets
 
     if as_json:
         print_json([preset.describe() for preset in presets().values()])

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from orthonav.flight.mount import Mount
-    from orthonav.records import ViewResult
-    from orthonav.sources import Recording
+    from orthonav.core.flight.mount import Mount
+    from orthonav.core.records import ViewResult
+    from orthonav.ground.recordings import Recording
 
 log = logging.getLogger(__name__)
 _CHOICES = {
@@ -25,9 +25,9 @@ def take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | Non
     Logs a warning where options or the map differ from those of the flight. Raises `FlightError`
     for invalid logged options.
     """
-    from orthonav.errors import FlightError
-    from orthonav.flight.mount import read_mount
-    from orthonav.sources import LoggedFlight
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight.mount import read_mount
+    from orthonav.ground.recordings import LoggedFlight
 
     mount: Mount | None = read_mount(options.mount) if options.mount else None
     if not isinstance(flight, LoggedFlight):
@@ -58,7 +58,7 @@ def take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | Non
 
 def compare_with_flight(flight: "Recording", results: Sequence["ViewResult"]) -> None:
     """Log how many results of a replay differ from those of the flight."""
-    from orthonav.sources import LoggedFlight
+    from orthonav.ground.recordings import LoggedFlight
 
     if not isinstance(flight, LoggedFlight):
         return
@@ -76,13 +76,13 @@ def _comparable(result: "ViewResult") -> str:
     """A result as text, without its latency."""
     from dataclasses import replace
 
-    from orthonav.flight.fixes import result_to_json
+    from orthonav.core.flight.fixes import result_to_json
 
     return result_to_json(replace(result, latency_ms=0.0))
 
 
 def _check_map(options: argparse.Namespace, logged: Any) -> None:
-    from orthonav.mapfile.signature import map_digest
+    from orthonav.core.mapfile.signature import map_digest
 
     flown = logged.get("manifest_sha256") if isinstance(logged, dict) else None
     if flown is not None and flown != map_digest(options.map):
@@ -93,8 +93,8 @@ def _check_map(options: argparse.Namespace, logged: Any) -> None:
 
 def _flown(logged: Any) -> dict[str, Any]:
     """Options of a log, validated: a log is untrusted input."""
-    from orthonav.errors import FlightError
-    from orthonav.flight.mount import logged_mount
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight.mount import logged_mount
 
     if not isinstance(logged, dict):
         return {}

@@ -369,7 +369,7 @@ def run(options: argparse.Namespace) -> None:
     import signal
     import threading
 
-    from orthonav.errors import StoppedError
+    from orthonav.core.errors import StoppedError
 
     _check(options)
     stopping = threading.Event()
@@ -397,7 +397,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Raise `VariantError` where images or telemetry have no source, or two."""
-    from orthonav.errors import VariantError
+    from orthonav.core.errors import VariantError
 
     if options.ros2 and (options.source or options.autopilot):
         raise VariantError("--ros2 replaces SOURCE and --autopilot: give one or the other")

@@ -16,17 +16,19 @@ from orthonav.cli.flying_console import awaited, camera_line, opened_console, pl
 from orthonav.cli.flying_start import start_of
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
-from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError, OutputError, VariantError
-from orthonav.files import require_file
-from orthonav.flight import read_camera
-from orthonav.flight.identity import Identity
-from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
-from orthonav.flight.mount import Mount, read_mount
-from orthonav.geo.camera import Camera
-from orthonav.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import MapFile, open_map
+from orthonav.core.errors import CameraError, OutputError, VariantError
+from orthonav.core.files import require_file
+from orthonav.core.flight import read_camera
+from orthonav.core.flight.identity import Identity
+from orthonav.core.flight.latency import MOST_MS, CameraLatency, read_latency
+from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera_files import read_camera_file
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.accept import Acceptance
+from orthonav.core.mapfile import MapFile, open_map
+from orthonav.core.records import CONFIDENT
+from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
 from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread, NewestImage
@@ -34,6 +36,11 @@ from orthonav.onboard.fly import FlyOptions, LogSink, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
+from orthonav.onboard.messages.estimate import Clock
+from orthonav.onboard.messages.gate import Gate, GateRules
+from orthonav.onboard.messages.local import Origin
+from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
+from orthonav.onboard.messages.nmea import Quality
 from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import (
     KINDS,
@@ -51,13 +58,6 @@ from orthonav.onboard.run import Locator
 from orthonav.onboard.serials import require_newest
 from orthonav.onboard.state import load
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
-from orthonav.publish.estimate import Clock
-from orthonav.publish.gate import Gate, GateRules
-from orthonav.publish.local import Origin
-from orthonav.publish.mavlink import Signing, signing_timestamp
-from orthonav.publish.nmea import Quality
-from orthonav.records import CONFIDENT
-from orthonav.sources.cameras import read_camera_file
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0

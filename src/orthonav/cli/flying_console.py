@@ -6,8 +6,8 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from orthonav.geo.camera import Camera
-from orthonav.mapfile import MapFile
+from orthonav.core.geo.camera import Camera
+from orthonav.core.mapfile import MapFile
 from orthonav.onboard import cameras
 from orthonav.onboard.console import Console
 from orthonav.onboard.outputs import KINDS

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import VariantError
-from orthonav.flight.gnss import FILE, GnssSample, read_gnss
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import VariantError
+from orthonav.core.flight.gnss import FILE, GnssSample, read_gnss
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.learner import Resumed
 from orthonav.onboard.gnss.watch import (

@@ -7,7 +7,7 @@ import os
 import threading
 from contextlib import ExitStack
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.graph import Graph
 from orthonav.onboard.ros2.publisher import Ros2Publisher

@@ -5,12 +5,12 @@ import logging
 from collections.abc import Callable
 
 from orthonav.cli.source import FAR_M, distance_from_map, far_text
-from orthonav.errors import UsageError
-from orthonav.geo.swapped import swapped_hint
-from orthonav.localizer import Localizer
+from orthonav.core.errors import UsageError
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.core.localize import Localizer
+from orthonav.core.records import Prior
 from orthonav.onboard.state import boot_id, load, prior_of
 from orthonav.onboard.telemetry import Clocks
-from orthonav.records import Prior
 
 log = logging.getLogger(__name__)
 START_OFF_M, START_SIGMAS = 3000.0, 3.0

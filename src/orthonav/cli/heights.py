@@ -5,12 +5,12 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from orthonav.flight.heights import Array, FlownHeights, Undulation
-    from orthonav.geo.ground import TerrainHeights
-    from orthonav.geo.route import Route
-    from orthonav.imagery.terrain import Dem
-    from orthonav.mapfile import MapFile
-    from orthonav.sources import Recording
+    from orthonav.core.flight.heights import Array, FlownHeights, Undulation
+    from orthonav.core.geo.ground import TerrainHeights
+    from orthonav.core.mapfile import MapFile
+    from orthonav.ground.imagery.terrain import Dem
+    from orthonav.ground.planning.route import Route
+    from orthonav.ground.recordings import Recording
 
 AREA_POINTS = 48
 """Positions along a side of a map at which its terrain is averaged."""
@@ -23,7 +23,7 @@ def dem_of(options: argparse.Namespace) -> "Dem | None":
     Raises `ImageryError`, `MissingFileError`, `MissingExtraError`, and `FlightError` for options
     that exclude each other.
     """
-    from orthonav.errors import FlightError
+    from orthonav.core.errors import FlightError
 
     if options.dem is None:
         if options.dem_datum is not None:
@@ -33,7 +33,7 @@ def dem_of(options: argparse.Namespace) -> "Dem | None":
         raise FlightError("--ground-alt-m assumes level ground: give it or --dem")
     if hasattr(options, "fov_deg") and options.agl_m is not None:  # of a recording, not of a plan
         raise FlightError("--agl-m is the height above ground of the views: give it or --dem")
-    from orthonav.imagery.terrain import open_dem
+    from orthonav.ground.imagery.terrain import open_dem
 
     return open_dem(options.dem, options.dem_datum)
 
@@ -43,8 +43,8 @@ def dem_for_route(options: argparse.Namespace, route: "Route") -> "Dem | None":
 
     Raises also `ImageryError` where none does; it names swapped coordinates as the cause.
     """
-    from orthonav.errors import ImageryError
-    from orthonav.geo.swapped import swapped_hint
+    from orthonav.core.errors import ImageryError
+    from orthonav.core.geo.swapped import swapped_hint
 
     dem = dem_of(options)
     if dem is not None and not any(dem.covers(*waypoint) for waypoint in route.waypoints):
@@ -62,8 +62,8 @@ def map_heights(
     use_prior: bool = True,
 ) -> "FlownHeights | None":
     """Heights above ground on a map by `terrain`, else by its own; None where it has none."""
-    from orthonav.flight.heights import FlownHeights
-    from orthonav.mapfile.terrain import TerrainLayer
+    from orthonav.core.flight.heights import FlownHeights
+    from orthonav.core.mapfile.terrain import TerrainLayer
 
     terrain = terrain or TerrainLayer.of(opened)
     if terrain is None:
@@ -97,7 +97,7 @@ def flight_heights(
     What is assumed about heights is logged once. Raises `ImageryError` where the terrain model lies
     outside the map.
     """
-    from orthonav.errors import ImageryError
+    from orthonav.core.errors import ImageryError
 
     if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
         raise ImageryError(f"the terrain lies outside the map: {dem.path}")
@@ -129,7 +129,7 @@ def say_assumed_heights(
 
     `advice`: what would help. Other recordings than flights have said it when they were opened.
     """
-    from orthonav.flight.heights import assumed_heights
+    from orthonav.core.flight.heights import assumed_heights
 
     first = next(iter(flight.views), None)
     said = None if first is None else assumed_heights(first.telemetry, terrain, advice)
@@ -142,13 +142,13 @@ def geoid_for(flight: "Recording") -> "Undulation | None":
 
     Where it is needed and missing, a warning says what to install.
     """
-    from orthonav.errors import ImageryError, MissingExtraError
+    from orthonav.core.errors import ImageryError, MissingExtraError
 
     first = next(iter(flight.views), None)
     if first is None or first.telemetry.hae_m is None or first.telemetry.amsl_m is not None:
         return None
     try:
-        from orthonav.imagery.datum import geoid
+        from orthonav.ground.imagery.datum import geoid
 
         return geoid()
     except (ImageryError, MissingExtraError) as error:

@@ -51,8 +51,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Import and print a summary."""
-    from orthonav.geo.headings import RADIANS
-    from orthonav.sources import OverTerrain, import_flight
+    from orthonav.core.geo.headings import RADIANS
+    from orthonav.ground.recordings import OverTerrain, import_flight
 
     dem = dem_of(options)
     recording = open_source(options.source, options, over_terrain=dem is not None)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import beside, print_json
 
 if TYPE_CHECKING:
-    from orthonav.mapfile.manifest import Manifest, SheetInfo
+    from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -31,9 +31,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Open the map, which checks its contents, and print a summary."""
-    from orthonav.files import write_text
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.shown import footprint_geojson, write_preview
+    from orthonav.core.files import write_text
+    from orthonav.core.mapfile import open_map
+    from orthonav.ground.build.shown import footprint_geojson, write_preview
 
     opened = open_map(options.map)
     if options.footprint is not None:
@@ -116,7 +116,7 @@ def _registration(manifest: "Manifest") -> dict[str, Any] | None:
     `ground_km2` is the area with imagery, which extends beyond the tile centres; `raw_bytes` is the
     size of the same pixels as uncompressed RGB.
     """
-    from orthonav.mapfile.layer import part_names
+    from orthonav.core.mapfile.layer import part_names
 
     size, raw, ground_km2 = 0, 0, 0.0
     infos = [sheet.grey for sheet in manifest.sheets if sheet.grey is not None]
@@ -141,7 +141,7 @@ def _registration(manifest: "Manifest") -> dict[str, Any] | None:
 
 def _terrain(manifest: "Manifest") -> dict[str, Any] | None:
     """Heights and size of the terrain layer of the first sheet; None without one."""
-    from orthonav.mapfile.terrain import terrain_part_names
+    from orthonav.core.mapfile.terrain import terrain_part_names
 
     info = manifest.sheets[0].terrain
     if info is None:

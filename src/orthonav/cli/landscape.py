@@ -35,7 +35,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Generate the files and print their names."""
-    from orthonav.simulate.landscape import generate_area, generate_heights
+    from orthonav.ground.simulate.landscape import generate_area, generate_heights
 
     with progress(options) as shown:
         heights = []

@@ -27,11 +27,11 @@ from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
-    from orthonav.changes.record import ChangedGround
-    from orthonav.confidence.accept import Acceptance
-    from orthonav.localizer import Localizer
-    from orthonav.mapfile import MapFile
-    from orthonav.records import ViewResult
+    from orthonav.core.localize import Localizer
+    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.mapfile import MapFile
+    from orthonav.core.records import ViewResult
+    from orthonav.ground.changes.record import ChangedGround
 
 EVERYDAY = (
     "--heading",
@@ -187,14 +187,14 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _on_map(options: argparse.Namespace) -> None:
-    from orthonav.confidence.accept import Acceptance
-    from orthonav.errors import VariantError
-    from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.identity import FlightDigest, Identity
-    from orthonav.flight.mount import MountedFlight
-    from orthonav.localizer.tracker import Tracker
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.terrain import TerrainLayer
+    from orthonav.core.errors import VariantError
+    from orthonav.core.flight.identity import FlightDigest, Identity
+    from orthonav.core.flight.mount import MountedFlight
+    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.mapfile.terrain import TerrainLayer
+    from orthonav.core.track.tracker import Tracker
+    from orthonav.ground.recordings.export import export_all, export_of
     from orthonav.onboard.calibrate import MountCorrected, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
 
@@ -254,9 +254,9 @@ def _on_map(options: argparse.Namespace) -> None:
 
 def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":
     """The localizer of a map; raises `VariantError` where the criterion does not fit it."""
-    from orthonav.errors import VariantError
-    from orthonav.localizer import Localizer
-    from orthonav.search.position import check_rule
+    from orthonav.core.errors import VariantError
+    from orthonav.core.localize import Localizer
+    from orthonav.core.tiles.position import check_rule
 
     made = Localizer(
         opened,
@@ -274,14 +274,14 @@ def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptan
 def _on_atlas(options: argparse.Namespace) -> None:
     """Localize on an atlas without a prior; a fix needs the agreement of several views."""
     require_extras("localize --atlas")
-    from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.locate import AtlasLocator
-    from orthonav.atlas.sheet_registration import SheetRegistrar
-    from orthonav.atlas.tile_search import TileSearch
-    from orthonav.confidence.accept import Acceptance
-    from orthonav.errors import VariantError
-    from orthonav.flight.export import export_all, export_of
-    from orthonav.flight.identity import FlightDigest, Identity
+    from orthonav.core.errors import VariantError
+    from orthonav.core.flight.identity import FlightDigest, Identity
+    from orthonav.core.localize.accept import Acceptance
+    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.locate import AtlasLocator
+    from orthonav.ground.atlas.sheet_registration import SheetRegistrar
+    from orthonav.ground.atlas.tile_search import TileSearch
+    from orthonav.ground.recordings.export import export_all, export_of
     from orthonav.onboard.run import localize_flight
 
     asked = [
@@ -354,7 +354,7 @@ def _print_counts(
 ) -> None:
     import numpy as np
 
-    from orthonav.files import is_stdout
+    from orthonav.core.files import is_stdout
 
     counts = Counts.of(results)
     latencies = np.array([result.latency_ms for result in results])

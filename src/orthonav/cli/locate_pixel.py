@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import print_json
 
 if TYPE_CHECKING:
-    from orthonav.flight import FlightFolder, FlightView
-    from orthonav.geo.camera import Camera
-    from orthonav.mapfile.terrain import TerrainLayer
+    from orthonav.core.flight import FlightFolder, FlightView
+    from orthonav.core.geo.camera import Camera
+    from orthonav.core.mapfile.terrain import TerrainLayer
 
 log = logging.getLogger(__name__)
 
@@ -52,14 +52,14 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Locate and print."""
-    from orthonav.errors import FlightError
-    from orthonav.flight import open_flight
-    from orthonav.flight.fixes import read_results
-    from orthonav.flight.identity import Identity, flight_digest, read_identity
-    from orthonav.flight.mount import read_mount
-    from orthonav.flight.pixel import locate_pixel
-    from orthonav.publish.estimate import ellipse_95
-    from orthonav.records import Fix
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight import open_flight
+    from orthonav.core.flight.fixes import read_results
+    from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+    from orthonav.core.flight.mount import read_mount
+    from orthonav.core.records import Fix
+    from orthonav.ground.recordings.pixel import locate_pixel
+    from orthonav.onboard.messages.estimate import ellipse_95
 
     results = {each.frame: each for each in read_results(options.fixes)}
     if options.frame not in results and Path(options.frame).name in results:
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
     """The camera at the size of the image of a view; as calibrated where that cannot be read."""
-    from orthonav.errors import FlightError, MissingFileError
+    from orthonav.core.errors import FlightError, MissingFileError
 
     try:
         height_px, width_px = view.grey().shape
@@ -122,9 +122,9 @@ def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
 
 def _terrain(path: Path) -> "tuple[TerrainLayer, str]":
     """The terrain of a map, and its digest; raises `FlightError` without one."""
-    from orthonav.errors import FlightError
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.terrain import TerrainLayer
+    from orthonav.core.errors import FlightError
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.mapfile.terrain import TerrainLayer
 
     opened = open_map(path)
     terrain = TerrainLayer.of(opened)

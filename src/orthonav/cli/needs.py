@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from orthonav.extras import require
+from orthonav.core.extras import require
 
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": ("geo", "report", "web"),

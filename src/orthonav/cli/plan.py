@@ -12,10 +12,10 @@ EVERYDAY = (
 )
 
 if TYPE_CHECKING:
-    from orthonav.geo.area import Area, Extent
-    from orthonav.geo.planning import Caution, ViewPlan
-    from orthonav.geo.route import Route
-    from orthonav.geo.terrain import LegProfile
+    from orthonav.ground.planning.area import Area, Extent
+    from orthonav.ground.planning.route import Route
+    from orthonav.ground.planning.spacing import Caution, ViewPlan
+    from orthonav.ground.planning.terrain import LegProfile
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -66,10 +66,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute and print the plan."""
     from orthonav.cli.plan_text import plan_text
-    from orthonav.errors import RouteError
-    from orthonav.geo.planning import default_band_m, rate_cautions, view_cautions
-    from orthonav.geo.route import read_route
-    from orthonav.geo.terrain import terrain_cautions
+    from orthonav.core.errors import RouteError
+    from orthonav.ground.planning.route import read_route
+    from orthonav.ground.planning.spacing import default_band_m, rate_cautions, view_cautions
+    from orthonav.ground.planning.terrain import terrain_cautions
 
     route = read_route(options.route) if options.route else None
     if options.dem_datum is not None and options.dem is None:
@@ -111,8 +111,8 @@ def _sheets(
     options: argparse.Namespace, route: "Route | None"
 ) -> "tuple[list[Route | Extent], list[Area]]":
     """Sheets as arguments of `build` (routes or bounds), and their areas."""
-    from orthonav.geo.area import Area
-    from orthonav.geo.sheets import sheets_of_bounds, sheets_of_route
+    from orthonav.ground.planning.area import Area
+    from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
 
     if route is None:
         boxes = sheets_of_bounds(options.bounds)
@@ -123,9 +123,9 @@ def _sheets(
 
 def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
     """The view from `--agl-m`, else from the lowest height of the route."""
-    from orthonav.errors import CameraError
-    from orthonav.geo.planning import DEFAULT_CAMERA, ViewPlan
-    from orthonav.sources.cameras import read_camera_file
+    from orthonav.core.errors import CameraError
+    from orthonav.core.geo.camera_files import read_camera_file
+    from orthonav.ground.planning.spacing import DEFAULT_CAMERA, ViewPlan
 
     agl_m = options.agl_m
     if agl_m is None and route is not None:
@@ -143,7 +143,7 @@ def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | Non
 
 def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
     """Lowest height above ground along the route, without take-off and landing; None: unknown."""
-    from orthonav.geo.terrain import LANDING_M
+    from orthonav.ground.planning.terrain import LANDING_M
 
     if options.dem is not None and route.heights:
         heights_m = [height for leg in _profile(options, route, None) for height in leg.agl_m]
@@ -155,8 +155,8 @@ def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
 
 def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float, int]:
     """Ground resolution and tile width: from the options, else chosen for the view."""
-    from orthonav.errors import AreaError
-    from orthonav.geo.planning import suited_map, suited_tile_px
+    from orthonav.core.errors import AreaError
+    from orthonav.ground.planning.spacing import suited_map, suited_tile_px
 
     if view is None:
         if options.gsd_m is None:
@@ -175,7 +175,7 @@ def _profile(
     options: argparse.Namespace, route: "Route", view: "ViewPlan | None"
 ) -> list["LegProfile"]:
     from orthonav.cli.heights import dem_for_route
-    from orthonav.geo.terrain import profile
+    from orthonav.ground.planning.terrain import profile
 
     bands_m = route.bands_m(options.band_m) or ()
     view_m = 0.0 if view is None else view.short_m
@@ -186,7 +186,7 @@ def _profile(
 
 
 def _route_plain(route: "Route", options: argparse.Namespace) -> dict[str, Any]:
-    from orthonav.geo.route import leg_lengths_m
+    from orthonav.ground.planning.route import leg_lengths_m
 
     length_m, speed_mps = float(leg_lengths_m(route).sum()), options.speed_mps
     frames = {each.frame for each in route.heights if each is not None}
@@ -220,7 +220,7 @@ def _map_plain(
     gsd_m: float,
     tile_px: int,
 ) -> dict[str, Any]:
-    from orthonav.geo.estimate import estimate_map
+    from orthonav.ground.planning.estimate import estimate_map
 
     made = [
         estimate_map(
@@ -269,7 +269,7 @@ def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
 
 
 def _write(path: Path, sheets: list["Route"]) -> None:
-    from orthonav.files import write_text
-    from orthonav.geo.routes.geojson import to_geojson
+    from orthonav.core.files import write_text
+    from orthonav.ground.planning.routes.geojson import to_geojson
 
     write_text(path, to_geojson(sheets))

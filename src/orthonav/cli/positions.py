@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from orthonav.flight.identity import Identity
-    from orthonav.records import Fix, ViewResult
+    from orthonav.core.flight.identity import Identity
+    from orthonav.core.records import Fix, ViewResult
 
 _HINTS = (
     ("yaw_deg", "give --heading unknown"),
@@ -20,9 +20,9 @@ _HINTS = (
 
 def check_destination(options: argparse.Namespace) -> None:
     """Raise `VariantError` where positions have no place to go, or share it with the summary."""
-    from orthonav.errors import VariantError
-    from orthonav.files import is_stdout
-    from orthonav.sources.photo_files import is_photo
+    from orthonav.core.errors import VariantError
+    from orthonav.core.files import is_stdout
+    from orthonav.ground.recordings.photo_files import is_photo
 
     if options.out is not None and is_stdout(options.out) and options.json:
         raise VariantError("--out - and --json both write to stdout: give one of them")
@@ -36,7 +36,7 @@ def write_positions(
     options: argparse.Namespace, results: "Sequence[ViewResult]", identity: "Identity"
 ) -> None:
     """Write one line of JSON per view to the file or to stdout, or print them for people."""
-    from orthonav.flight.fixes import write_results
+    from orthonav.core.flight.fixes import write_results
 
     if options.out is not None:
         write_results(options.out, results, identity)
@@ -49,7 +49,7 @@ def positions_to_plain(
     options: argparse.Namespace, results: "Sequence[ViewResult]"
 ) -> dict[str, Any]:
     """The positions as JSON values, where they are written nowhere else."""
-    from orthonav.flight.fixes import result_to_json
+    from orthonav.core.flight.fixes import result_to_json
 
     if options.out is not None:
         return {}
@@ -58,7 +58,7 @@ def positions_to_plain(
 
 def position_text(result: "ViewResult") -> str:
     """The position of one view in words, over several lines."""
-    from orthonav.records import Fix
+    from orthonav.core.records import Fix
 
     outcome = result.outcome
     if isinstance(outcome, Fix):

@@ -13,13 +13,13 @@ from orthonav.cli.source import FAR_M, far_from_map, far_text
 
 if TYPE_CHECKING:
     from orthonav.cli.common import Progress
-    from orthonav.confidence.accept import Acceptance
-    from orthonav.flight.heights import FlownHeights
-    from orthonav.flight.mount import Mount
-    from orthonav.localizer import Localizer
+    from orthonav.core.flight.heights import FlownHeights
+    from orthonav.core.flight.mount import Mount
+    from orthonav.core.localize import Localizer
+    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.records import Telemetry, ViewResult
+    from orthonav.ground.recordings import Recording, SourceView
     from orthonav.onboard.setups import Tried
-    from orthonav.records import Telemetry, ViewResult
-    from orthonav.sources import Recording, SourceView
 
 BUDGET_S = 15.0
 """After so long no further view is placed: the search for another set-up takes at most 20 s."""
@@ -47,7 +47,7 @@ class Counts:
     @classmethod
     def of(cls, results: "Sequence[ViewResult]") -> "Counts":
         """The counts of these results."""
-        from orthonav.records import Fix, NoFix
+        from orthonav.core.records import Fix, NoFix
 
         reasons = Counter(
             each.outcome.reason for each in results if isinstance(each.outcome, NoFix)
@@ -113,7 +113,7 @@ class SetupAdvice:
 
         Both are empty where enough views are confident.
         """
-        from orthonav.geo.headings import RADIANS, seem_radians
+        from orthonav.core.geo.headings import RADIANS, seem_radians
 
         options, counts = self._options, Counts.of(results)
         known = options.heading == "known"

@@ -25,8 +25,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write a key, a signature, or both."""
-    from orthonav.errors import MapFileError
-    from orthonav.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
+    from orthonav.core.errors import MapFileError
+    from orthonav.core.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
 
     key = options.key
     if options.new_key is not None:

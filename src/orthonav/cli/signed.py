@@ -4,10 +4,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.errors import VariantError
+from orthonav.core.errors import VariantError
 
 if TYPE_CHECKING:
-    from orthonav.mapfile.signature import Signature
+    from orthonav.core.mapfile.signature import Signature
 
 
 def add_signature(group: argparse._ActionsContainer) -> None:
@@ -31,7 +31,7 @@ def checked_signature(options: argparse.Namespace) -> "Signature | None":
 
     Raises `VariantError`, and as `require_signature`.
     """
-    from orthonav.mapfile.signature import require_signature
+    from orthonav.core.mapfile.signature import require_signature
 
     if options.require_signed is not None:
         return require_signature(options.map, options.require_signed, options.not_before)

@@ -201,13 +201,18 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate a flight and report the number of views."""
-    from orthonav.errors import FlightError
-    from orthonav.geo.route import read_route
-    from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-    from orthonav.simulate.motion import Wind
-    from orthonav.simulate.receiver import receiver_of
-    from orthonav.simulate.render import ViewEffects
-    from orthonav.sources.cameras import read_camera_file
+    from orthonav.core.errors import FlightError
+    from orthonav.core.geo.camera_files import read_camera_file
+    from orthonav.ground.planning.route import read_route
+    from orthonav.ground.simulate.flight import (
+        DEFAULT_CAMERA,
+        Errors,
+        SimulateRequest,
+        simulate_flight,
+    )
+    from orthonav.ground.simulate.motion import Wind
+    from orthonav.ground.simulate.receiver import receiver_of
+    from orthonav.ground.simulate.render import ViewEffects
 
     if options.wind_from_deg is not None and options.wind_mps is None:
         raise FlightError("--wind-from-deg needs the speed of the wind (--wind-mps)")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import add_dem
 
 if TYPE_CHECKING:
-    from orthonav.localizer import Localizer
-    from orthonav.sources import Recording, SourceView
+    from orthonav.core.localize import Localizer
+    from orthonav.ground.recordings import Recording, SourceView
 
 FAR_M = 1000.0
 """A recorded position farther from the map causes a warning: GNSS and logs err by less."""
@@ -118,7 +118,7 @@ def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -
     longitude explain it, else an empty text."""
     import numpy as np
 
-    from orthonav.geo.swapped import swapped_hint
+    from orthonav.core.geo.swapped import swapped_hint
 
     grid, frame = localizer.grid, localizer.sheet.frame
     low, high = np.reshape(grid.extent_en_m, (2, 2))
@@ -161,7 +161,7 @@ def open_source(
 
     `over_terrain`: whether a terrain turns its heights into heights above ground.
     """
-    from orthonav.sources import SourceOptions, open_source
+    from orthonav.ground.recordings import SourceOptions, open_source
 
     source_options = SourceOptions(
         kind=options.kind,

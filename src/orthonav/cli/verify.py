@@ -23,8 +23,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Check the signature, then every part; an error where one of them is wrong."""
-    from orthonav.mapfile import open_map
-    from orthonav.mapfile.signature import require_signature
+    from orthonav.core.mapfile import open_map
+    from orthonav.core.mapfile.signature import require_signature
 
     found = require_signature(options.map, options.public_key, options.not_before)
     open_map(options.map, found.manifest_sha256)

@@ -11,8 +11,8 @@ from typing import Any
 
 from orthonav import __version__
 from orthonav.cli.needs import NEEDS
-from orthonav.cores import usable_cores
-from orthonav.extras import missing, packages, pip_line
+from orthonav.core.cores import usable_cores
+from orthonav.core.extras import missing, packages, pip_line
 
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
@@ -83,7 +83,7 @@ def _processor() -> dict[str, Any]:
 def _has_kernel() -> bool:
     """Whether registration uses its compiled kernel; false without NumPy or OpenCV."""
     try:
-        from orthonav.register.kernel import KERNEL
+        from orthonav.core.register.kernel import KERNEL
     except ImportError:
         return False
     return KERNEL is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from orthonav.web.server import Server
+    from orthonav.ground.view.server import Server
 
 log = logging.getLogger(__name__)
 EVERYDAY = ("--flight", "--truth", "--live")
@@ -76,9 +76,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read the run and serve it until interrupted."""
-    from orthonav.web.assets import load_assets
-    from orthonav.web.opening import ViewRequest, open_run
-    from orthonav.web.server import Pages, Server
+    from orthonav.ground.view.assets import load_assets
+    from orthonav.ground.view.opening import ViewRequest, open_run
+    from orthonav.ground.view.server import Pages, Server
 
     request = ViewRequest(
         run=options.run,

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import FlightError
-from orthonav.flight.mount import Bias, Mount
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.mount import Bias, Mount
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.track import Model
 from orthonav.onboard.run import Locator
-from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
-from orthonav.track import Model
 
 MIN_VIEWS = 5
 MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0

@@ -1,7 +1,7 @@
 """The mount of views that make no track, such as photographs taken far apart.
 
-Each confident view shows its own pitch and roll (`orthonav.localizer.camera`). The mount is their
-robust mean over the reported values.
+Each confident view shows its own pitch and roll (`orthonav.core.localize.camera`). The mount is
+their robust mean over the reported values.
 """
 
 import math
@@ -11,12 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import FlightError
-from orthonav.flight.mount import Bias, Mount
-from orthonav.localizer.camera import tilt_std_deg
-from orthonav.onboard.calibrate import MAD_TO_STD, MIN_VIEWS, STD_FLOOR, MountCalibration
-from orthonav.onboard.run import SingleViews
-from orthonav.records import (
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.mount import Bias, Mount
+from orthonav.core.localize.camera import tilt_std_deg
+from orthonav.core.records import (
     CONFIDENT,
     DEFAULT_YAW_STD_DEG,
     Fix,
@@ -25,6 +23,8 @@ from orthonav.records import (
     View,
     ViewResult,
 )
+from orthonav.onboard.calibrate import MAD_TO_STD, MIN_VIEWS, STD_FLOOR, MountCalibration
+from orthonav.onboard.run import SingleViews
 
 OUTLIER_SIGMAS = 3.0
 """Views that are off by more of their standard deviations, scatter included, do not count."""

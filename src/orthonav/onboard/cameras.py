@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import CameraError, FlightError, MissingFileError
-from orthonav.files import require_file
-from orthonav.flight import decode_image, open_flight
+from orthonav.core.errors import CameraError, FlightError, MissingFileError
+from orthonav.core.files import require_file
+from orthonav.core.flight import decode_image, open_flight
+from orthonav.core.records import NoFix, Telemetry
 from orthonav.onboard.arrival import Arrival, ArrivalWatch
 from orthonav.onboard.telemetry import Clocks, VehicleState
-from orthonav.records import NoFix, Telemetry
 
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
@@ -282,7 +282,9 @@ def _video(capture: Any, rate_hz: float) -> Iterator[RecordedImage]:
     try:
         while capture.grab():
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            if math.isfinite(rate_hz):  # the same frames as `orthonav.sources.video` takes
+            if math.isfinite(
+                rate_hz
+            ):  # the same frames as `orthonav.ground.recordings.video` takes
                 if time_ns < due / rate_hz * 1e9 - 1:
                     continue
                 due = math.floor(time_ns / 1e9 * rate_hz + 1e-6) + 1

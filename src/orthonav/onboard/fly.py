@@ -16,12 +16,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError, MapChangedError, MapFileError
-from orthonav.flight.heights import FlownHeights, assumed_heights
-from orthonav.flight.mount import Mount
-from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_picture
+from orthonav.core.errors import CameraError, MapChangedError, MapFileError
+from orthonav.core.flight.heights import FlownHeights, assumed_heights
+from orthonav.core.flight.mount import Mount
+from orthonav.core.flight.recording import LONG_GAP_NS, fitted
+from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.checks import check_picture
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
 from orthonav.onboard.gnss.watch import GnssWatch
@@ -37,14 +40,11 @@ from orthonav.onboard.health import (
 )
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.mavlink import dialect, status_texts
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.start_check import StartCheck
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
-from orthonav.publish.mavlink import dialect, status_texts
-from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
-from orthonav.sources.attitude import LOOKS_DOWN, Angles
-from orthonav.sources.recording import LONG_GAP_NS, fitted
 
 log = logging.getLogger(__name__)
 TICK_NS = 10**9

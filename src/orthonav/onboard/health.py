@@ -17,9 +17,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from orthonav.errors import MapFileError
-from orthonav.localizer.localizer import Localizer
-from orthonav.records import Fix, Telemetry, View
+from orthonav.core.errors import MapFileError
+from orthonav.core.localize.localizer import Localizer
+from orthonav.core.records import Fix, Telemetry, View
 
 log = logging.getLogger(__name__)
 WINDOW_S = 10.0

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.geo.camera import Camera
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.arrival import GAP_S, Arrival
 from orthonav.onboard.delay import EXPLAINED, UNEXPLAINED, DelayEstimate, DelayEstimator
 from orthonav.onboard.delay_check import DelayCheck
@@ -21,7 +22,6 @@ from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import Grey, PictureOdometry
 from orthonav.onboard.position_check import PositionCheck
 from orthonav.onboard.telemetry import VehicleState
-from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 
 UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
 EVERY_NS, DOUBT_EVERY_NS = 10**9, 5 * 10**8

@@ -1,7 +1,7 @@
 """The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages.
 
-pymavlink (extra `autopilot`) decodes incoming messages; `orthonav.publish.mavlink` packs outgoing
-ones.
+pymavlink (extra `autopilot`) decodes incoming messages; `orthonav.onboard.messages.mavlink` packs
+outgoing ones.
 """
 
 import logging
@@ -13,21 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from orthonav.extras import needed
-from orthonav.flight.gnss import GnssSample
+from orthonav.core.extras import needed
+from orthonav.core.flight.gnss import GnssSample
 from orthonav.onboard.aiding import Aiding
 from orthonav.onboard.gnss.mavlink import gnss_sample
-from orthonav.onboard.ports import Transport
-from orthonav.onboard.telemetry import (
-    Clocks,
-    ClockSync,
-    TelemetryBuffer,
-    VehicleState,
-    wxyz_of_angles,
-)
-from orthonav.publish.estimate import Clock, EstimateError
-from orthonav.publish.local import Autopilot, Origin
-from orthonav.publish.mavlink import (
+from orthonav.onboard.messages.estimate import Clock, EstimateError
+from orthonav.onboard.messages.local import Autopilot, Origin
+from orthonav.onboard.messages.mavlink import (
     COMPONENT_ID,
     Message,
     Packer,
@@ -35,6 +27,14 @@ from orthonav.publish.mavlink import (
     Target,
     dialect,
     signing_timestamp,
+)
+from orthonav.onboard.ports import Transport
+from orthonav.onboard.telemetry import (
+    Clocks,
+    ClockSync,
+    TelemetryBuffer,
+    VehicleState,
+    wxyz_of_angles,
 )
 
 log = logging.getLogger(__name__)

@@ -3,7 +3,7 @@
 The flight never waits for the log. Messages go into a bounded queue; a thread encodes them and
 writes a chunk about once a second, each synced to disk before the next. Where the thread falls
 behind or the disk is full, images are dropped first and other messages last; dropped messages are
-counted. `docs/flights.md` describes the files, `orthonav.sources` reads them.
+counted. `docs/flights.md` describes the files, `orthonav.ground.recordings` reads them.
 """
 
 import contextlib
@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.errors import CameraError, OutputError, described
-from orthonav.extras import needed
-from orthonav.flight.fixes import result_to_json
-from orthonav.flight.logged import (
+from orthonav.core.errors import CameraError, OutputError, described
+from orthonav.core.extras import needed
+from orthonav.core.flight.fixes import result_to_json
+from orthonav.core.flight.logged import (
     CAMERA,
     FORMAT,
     GNSS,
@@ -48,10 +48,10 @@ from orthonav.flight.logged import (
     telemetry_message,
     to_json,
 )
-from orthonav.flight.png import lossless_png
-from orthonav.geo.camera import Camera
-from orthonav.records import CONFIDENT, Fix, Telemetry, ViewResult
-from orthonav.sources.recording import fitted
+from orthonav.core.flight.png import lossless_png
+from orthonav.core.flight.recording import fitted
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import CONFIDENT, Fix, Telemetry, ViewResult
 
 if TYPE_CHECKING:
     from orthonav.onboard.segment import Message, Segment

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera, undistort
+from orthonav.core.geo.camera import Camera, undistort
 
 SIDE_PX = 240
 """Images are compared at this width or height, whichever is larger: corners are then found to about

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.onboard.cameras import NewestImage
 from orthonav.onboard.console import Console
 from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, HealthLimits, Level
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.local import Autopilot
 from orthonav.onboard.telemetry import Clocks
-from orthonav.publish.local import Autopilot
-from orthonav.records import Fix, NoFix, ViewResult
 
 TERMINAL_S, FILE_S = 5.0, 30.0
 """Interval of the status line on a terminal, and elsewhere."""

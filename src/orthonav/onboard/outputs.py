@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, TextIO
 
-from orthonav.errors import VariantError
-from orthonav.flight.fixes import UNKNOWN, result_to_json
-from orthonav.flight.identity import Identity
-from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
-from orthonav.onboard.telemetry import Clocks, VehicleState
-from orthonav.publish.correlation import FilterCovariance
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
-from orthonav.publish.gate import Gate
-from orthonav.publish.local import Autopilot, Origin
-from orthonav.publish.mavlink import (
+from orthonav.core.errors import VariantError
+from orthonav.core.flight.fixes import UNKNOWN, result_to_json
+from orthonav.core.flight.identity import Identity
+from orthonav.core.records import CONFIDENT, ViewResult
+from orthonav.onboard.messages.correlation import FilterCovariance
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.gate import Gate
+from orthonav.onboard.messages.local import Autopilot, Origin
+from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Message,
     Target,
@@ -29,14 +28,15 @@ from orthonav.publish.mavlink import (
     gps_input,
     request_message,
 )
-from orthonav.publish.mavlink_local import (
+from orthonav.onboard.messages.mavlink_local import (
     LocalPose,
     odometry,
     set_gps_global_origin,
     vision_position_estimate,
 )
-from orthonav.publish.nmea import Quality, gga, gst, rmc
-from orthonav.records import CONFIDENT, ViewResult
+from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
+from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
+from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
 KINDS = {

@@ -14,7 +14,7 @@ import tty
 from collections.abc import Callable
 from typing import Protocol
 
-from orthonav.errors import VariantError
+from orthonav.core.errors import VariantError
 
 LOOPBACK = "127.0.0.1"
 DEFAULT_BAUD = 57_600

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.track.motion import usual_velocity_std_mps
 from orthonav.onboard.history import StateHistory
-from orthonav.track.motion import usual_velocity_std_mps
 
 KEEP_S, LONGEST_GAP_S = 5.0, 30.0
 """Earlier positions with which one is compared: a track moves to a new place within seconds. The

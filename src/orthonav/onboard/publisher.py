@@ -5,13 +5,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
+from orthonav.core.records import CONFIDENT, ViewResult
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.correlation import FilterCovariance
+from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, estimate_from_result
+from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.outputs import Messenger, NmeaOut
 from orthonav.onboard.telemetry import Clocks, VehicleState
-from orthonav.publish.correlation import FilterCovariance
-from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
-from orthonav.publish.gate import Gate
-from orthonav.records import CONFIDENT, ViewResult
 
 log = logging.getLogger(__name__)
 

@@ -9,19 +9,19 @@ from typing import Protocol
 
 import numpy as np
 
-from orthonav.confidence.accept import Acceptance
-from orthonav.errors import (
+from orthonav.core.errors import (
     CameraError,
     FlightError,
     MapChangedError,
     MapFileError,
     MissingFileError,
 )
-from orthonav.flight.heights import FlownHeights
-from orthonav.flight.recording import Flight, RecordedView
-from orthonav.localizer.localizer import Localizer
-from orthonav.localizer.tracker import Tracker
-from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.flight.heights import FlownHeights
+from orthonav.core.flight.recording import Flight, RecordedView
+from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.localizer import Localizer
+from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.track.tracker import Tracker
 
 log = logging.getLogger(__name__)
 MAP_CHANGED = "map_file_changed"

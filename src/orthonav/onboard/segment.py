@@ -18,7 +18,7 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from orthonav import __version__
-from orthonav.flight.logged import PROFILE, TOPICS, VIEW, Topic
+from orthonav.core.flight.logged import PROFILE, TOPICS, VIEW, Topic
 
 _INDEX_BYTES = 64_000, 300
 """Upper bound of the size of the index: constant part, and per chunk."""

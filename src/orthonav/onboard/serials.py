@@ -8,9 +8,9 @@ import json
 import logging
 from pathlib import Path
 
-from orthonav.errors import MapFileError, OutputError
-from orthonav.files import write_text
-from orthonav.mapfile.signature import MAX_SERIAL, Signature
+from orthonav.core.errors import MapFileError, OutputError
+from orthonav.core.files import write_text
+from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 
 MAX_BYTES = 100_000
 log = logging.getLogger(__name__)

@@ -13,13 +13,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from orthonav.errors import FlightError
-from orthonav.flight.recording import RecordedView
-from orthonav.geo.camera import Camera
-from orthonav.geo.headings import seem_radians
-from orthonav.localizer.localizer import Localizer
-from orthonav.localizer.prepared import MAX_AGL_STD
-from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.recording import RecordedView
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.headings import seem_radians
+from orthonav.core.localize.localizer import Localizer
+from orthonav.core.localize.prepared import MAX_AGL_STD
+from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 
 V = TypeVar("V", bound=RecordedView)
 FEW = 0.5

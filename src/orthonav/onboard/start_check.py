@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, Prior, Telemetry
+from orthonav.core.track.motion import usual_velocity_std_mps
 from orthonav.onboard.state import SPEED_MPS
-from orthonav.records import Fix, Prior, Telemetry
-from orthonav.track.motion import usual_velocity_std_mps
 
 SIGMAS = 3.0
 """A place farther from the start than this many deviations contradicts it."""

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from orthonav.core.records import Prior
 from orthonav.onboard.gnss.biases import Biases, biases_from_plain
 from orthonav.onboard.gnss.learner import Resumed, before_flight
-from orthonav.records import Prior
 
 VERSION = 1
 MAX_BYTES = 100_000
@@ -38,7 +38,8 @@ class SavedState:
     `utc_ns`: time of exposure in UTC.
     `mono_ns`: the same by the monotonic clock, valid while `boot_id` is the same.
     `boot_id`: identifies the run of the operating system.
-    `signing_timestamp_10us`: must not decrease for a key, see `orthonav.publish.mavlink.Signing`.
+    `signing_timestamp_10us`: must not decrease for a key, see
+    `orthonav.onboard.messages.mavlink.Signing`.
     `saved_utc_ns`, `saved_mono_ns`: time of the last save, when the program still ran.
     """
 

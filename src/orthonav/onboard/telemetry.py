@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from orthonav.geo.camera import attitude_of
-from orthonav.records import Telemetry
-from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
+from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
+from orthonav.core.geo.camera import attitude_of
+from orthonav.core.records import Telemetry
 
 HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
 """Sources of the height above ground, best first: a rangefinder that looks down, the autopilot's

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.outcome import Lookalike
 from orthonav.ground.check.trials import Trial
 

@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
 
 Array = NDArray[np.float64]
 

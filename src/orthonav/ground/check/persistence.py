@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.register.evidence import FINE, evidence
+from orthonav.core.register.evidence import FINE, evidence
 
 Array = NDArray[np.float32]
 PATCH_PX = 24

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.changes.record import ChangedGround
-from orthonav.errors import AreaError
-from orthonav.geo.area import Area, Extent
-from orthonav.geo.frames import LocalFrame
-from orthonav.geo.grid import TileGrid
-from orthonav.register.reference import GreyPyramid
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.register.reference import GreyPyramid
+from orthonav.ground.changes.record import ChangedGround
+from orthonav.ground.planning.area import Area, Extent
 
 # Limits of work and of what a page can show; the benchmark's maps need no more trials.
 MAX_CELLS = 4000

@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from orthonav.changes.record import ChangedGround
-from orthonav.errors import CheckError
-from orthonav.files import with_paths
-from orthonav.geo.camera import Camera
-from orthonav.geo.planning import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
-from orthonav.geo.route import Route
+from orthonav.core.errors import CheckError
+from orthonav.core.files import with_paths
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import CONFIDENT
+from orthonav.ground.changes.record import ChangedGround
 from orthonav.ground.check.outcome import CheckedInputs
 from orthonav.ground.check.recalibrate import LEARNT, Recalibration
-from orthonav.records import CONFIDENT
+from orthonav.ground.planning.route import Route
+from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 
 DEFAULT_SPEED_MPS = 20.0
 """Cruise speed of a small fixed-wing aircraft."""

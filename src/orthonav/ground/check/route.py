@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.area import Area
-from orthonav.geo.route import along_polyline_en_m
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.outcome import Along, BlindStretch, Conditions
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import along_polyline_en_m
 
 Array = NDArray[np.float64]
 BLIND = 0.5

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.cores import usable_cores
-from orthonav.errors import AreaError, CameraError, MapFileError
-from orthonav.files import Progress, no_progress
-from orthonav.geo.area import Area
-from orthonav.geo.planning import MIN_BAND_VIEWS, default_band_m
-from orthonav.geo.route import distance_to_polyline_m
+from orthonav.core.cores import usable_cores
+from orthonav.core.errors import AreaError, CameraError, MapFileError
+from orthonav.core.files import Progress, no_progress
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.records import MAP_STD_M
 from orthonav.ground.check.envelope import (
     envelope_of,
     envelope_work,
@@ -44,9 +44,9 @@ from orthonav.ground.check.route import blind_stretches, predicted_along
 from orthonav.ground.check.trials import Trial, registration_of, run_many
 from orthonav.ground.check.verdict import verdict_of
 from orthonav.ground.check.views import MIN_VALID, TrialPlan, require_overlap
-from orthonav.mapfile import open_map
-from orthonav.mapfile.reader import MapFile
-from orthonav.records import MAP_STD_M
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import distance_to_polyline_m
+from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
 
 Array = NDArray[np.float64]
 ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30

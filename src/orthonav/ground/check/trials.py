@@ -21,7 +21,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MapFileError, WorkerError
+from orthonav.core.errors import MapFileError, WorkerError
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.records import NoFix, Prior, View
+from orthonav.core.register.registrar import Levels, apart_px
 from orthonav.ground.check.change import another_year, displaced
 from orthonav.ground.check.persistence import MARGIN_PX
 from orthonav.ground.check.views import (
@@ -32,12 +38,6 @@ from orthonav.ground.check.views import (
     reported_persistence,
     view_of,
 )
-from orthonav.localizer import Localizer
-from orthonav.localizer.registration import RegistrationLocalizer
-from orthonav.mapfile import open_map
-from orthonav.mapfile.reader import MapFile
-from orthonav.records import NoFix, Prior, View
-from orthonav.register.registrar import Levels, apart_px
 
 AT_ONCE = 8
 """Trials that a worker takes at a time: about a second of work."""

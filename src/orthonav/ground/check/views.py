@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import AreaError
-from orthonav.geo.camera import Camera
-from orthonav.geo.grid import TileGrid
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile.layer import level_shape
+from orthonav.core.mapfile.manifest import SheetInfo
+from orthonav.core.records import Telemetry, View
+from orthonav.core.register.pose import rotation
+from orthonav.core.register.reference import GreyPyramid
 from orthonav.ground.check.persistence import MARGIN_PX, default_model, features
 from orthonav.ground.check.request import CheckRequest
-from orthonav.imagery.mosaic import Mosaic
-from orthonav.imagery.raster import SheetRaster
-from orthonav.mapfile.layer import level_shape
-from orthonav.mapfile.manifest import SheetInfo
-from orthonav.records import Telemetry, View
-from orthonav.register.pose import rotation
-from orthonav.register.reference import GreyPyramid
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.raster import SheetRaster
 
 EVERY_PX, PERSISTENCE_LEVELS = 8, 3
 """Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""

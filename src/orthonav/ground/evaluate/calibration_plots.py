@@ -12,7 +12,7 @@ from orthonav.ground.evaluate.calibration import (
     CovarianceConsistency,
     nees_bound,
 )
-from orthonav.report.canvas import (
+from orthonav.ground.report.canvas import (
     BACKING,
     GREY,
     OFFSET,

@@ -14,8 +14,8 @@ from orthonav.ground.evaluate.calibration import (
 from orthonav.ground.evaluate.figures import or_none
 from orthonav.ground.evaluate.metrics import CriterionRow, Metrics, wrong_key
 from orthonav.ground.evaluate.standard import RPE_FRAMES, ErrorStatistics
-from orthonav.report.figures import Figure
-from orthonav.report.numbers import measure_text, percent_text, plain_text
+from orthonav.ground.report.figures import Figure
+from orthonav.ground.report.numbers import measure_text, percent_text, plain_text
 
 
 def row_to_json(row: CriterionRow) -> dict[str, object]:

@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import FlightError, OrthonavError
-from orthonav.flight.recording import Flight, RecordedView
-from orthonav.geo.camera import Camera
-from orthonav.geo.grid import TileGrid
+from orthonav.core.errors import FlightError, OrthonavError
+from orthonav.core.flight.recording import Flight, RecordedView
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.checks import check_telemetry
+from orthonav.core.localize.rectify import downsampled, rectify
+from orthonav.core.records import Fix, Telemetry, View, ViewResult
+from orthonav.core.register.reference import GreyPyramid
 from orthonav.ground.evaluate.calibration import is_covariance
 from orthonav.ground.evaluate.metrics import Comparison
-from orthonav.localizer.checks import check_telemetry
-from orthonav.localizer.rectify import downsampled, rectify
-from orthonav.records import Fix, Telemetry, View, ViewResult
-from orthonav.register.reference import GreyPyramid
-from orthonav.report.canvas import BACKING, INK, RIGHT, SOFT, WRONG, Drawing, draw_figure
+from orthonav.ground.report.canvas import BACKING, INK, RIGHT, SOFT, WRONG, Drawing, draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,8 +17,8 @@ from orthonav.ground.evaluate.metrics import Comparison, Metrics, measure, pool,
 from orthonav.ground.evaluate.standard import standard_to_json
 from orthonav.ground.evaluate.track import TrackMetrics
 from orthonav.ground.evaluate.track_report import track_lines, track_to_json, tracks_to_json
-from orthonav.report.maps import Background
-from orthonav.report.numbers import measure_text, percent_text
+from orthonav.ground.report.maps import Background
+from orthonav.ground.report.numbers import measure_text, percent_text
 
 _COLUMNS = (
     "flight",

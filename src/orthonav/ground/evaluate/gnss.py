@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orthonav.flight.gnss import BIASES, biases_of, fault_of, gnss_of
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight.gnss import BIASES, biases_of, fault_of, gnss_of
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import ViewResult
 from orthonav.ground.evaluate.figures import FloatArray, frozen, or_none, percentile, runs
 from orthonav.ground.evaluate.gaps import seconds_since_first
 from orthonav.ground.evaluate.metrics import Comparison
-from orthonav.records import ViewResult
-from orthonav.report.canvas import GREY, RIGHT, TRUTH, WRONG, Drawing, draw_figure
-from orthonav.report.figures import Figure
-from orthonav.report.numbers import measure_text
+from orthonav.ground.report.canvas import GREY, RIGHT, TRUTH, WRONG, Drawing, draw_figure
+from orthonav.ground.report.figures import Figure
+from orthonav.ground.report.numbers import measure_text
 
 if TYPE_CHECKING:
     from matplotlib import figure as mpl

@@ -15,10 +15,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from orthonav.errors import FlightError
-from orthonav.flight import read_truth
-from orthonav.flight.fixes import read_results
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.errors import FlightError
+from orthonav.core.flight import read_truth
+from orthonav.core.flight.fixes import read_results
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     ConfidenceCalibration,
     CovarianceConsistency,
@@ -37,7 +38,6 @@ from orthonav.ground.evaluate.figures import (
 from orthonav.ground.evaluate.gaps import Longest, longest, path_so_far_m, seconds_since_first
 from orthonav.ground.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 from orthonav.ground.evaluate.truth import check_truth
-from orthonav.records import Fix, NoFix, ViewResult
 
 Positions = Mapping[str, tuple[float, float]]
 """Frame name -> (latitude, longitude) in degrees."""

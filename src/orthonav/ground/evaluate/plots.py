@@ -11,7 +11,7 @@ import numpy as np
 from orthonav.ground.evaluate.figures import BoolArray, FloatArray, runs
 from orthonav.ground.evaluate.gaps import seconds_since_first
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison, CriterionCurve, Metrics
-from orthonav.report.canvas import (
+from orthonav.ground.report.canvas import (
     BACKING,
     GREY,
     LOW_CONFIDENCE,
@@ -23,7 +23,7 @@ from orthonav.report.canvas import (
     Drawing,
     draw_axes,
 )
-from orthonav.report.maps import Background, draw_map, map_size_in
+from orthonav.ground.report.maps import Background, draw_map, map_size_in
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

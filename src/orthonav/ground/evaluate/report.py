@@ -24,7 +24,7 @@ from orthonav.ground.evaluate.gnss import gnss_figure, gnss_rows
 from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
 from orthonav.ground.evaluate.track_plots import track_figures
 from orthonav.ground.evaluate.track_report import track_rows
-from orthonav.report import (
+from orthonav.ground.report import (
     Figure,
     file_names,
     measure_text,
@@ -69,7 +69,8 @@ def write_report(
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
     `whole`: what `total` gives for these flights, computed where it is None. Figures are also
-    written beside the page, as `orthonav.report.write_page` does. Raises `ValueError` as `total`,
+    written beside the page, as `orthonav.ground.report.write_page` does. Raises `ValueError` as
+    `total`,
     `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot be written.
     """
     page, figures = page_of(flights, whole or total(flights), made_from or MadeFrom(), title)

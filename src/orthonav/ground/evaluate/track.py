@@ -13,7 +13,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.flight.fixes import STATES
+from orthonav.core.flight.fixes import STATES
+from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     is_covariance,
     nees_bound,
@@ -36,7 +37,6 @@ from orthonav.ground.evaluate.gaps import (
     seconds_since_first,
 )
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison
-from orthonav.records import Fix, ViewResult
 
 RADII_M = (25.0, 60.0)
 """Radii of accuracy: a usual and a large error of a track."""

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.evaluate.calibration import is_covariance, nees_bound
 from orthonav.ground.evaluate.figures import FloatArray, runs
 from orthonav.ground.evaluate.metrics import Comparison
 from orthonav.ground.evaluate.plots import view_box
 from orthonav.ground.evaluate.track import TrackMetrics, TrackSeries
 from orthonav.ground.evaluate.track_report import consistency_text, spread_text
-from orthonav.records import CONFIDENT
-from orthonav.report.canvas import (
+from orthonav.ground.report.canvas import (
     GREY,
     RIGHT,
     SOFT,
@@ -23,8 +23,8 @@ from orthonav.report.canvas import (
     draw_axes,
     draw_figure,
 )
-from orthonav.report.figures import Figure
-from orthonav.report.maps import Background, draw_map, map_size_in
+from orthonav.ground.report.figures import Figure
+from orthonav.ground.report.maps import Background, draw_map, map_size_in
 
 if TYPE_CHECKING:
     from matplotlib import figure as mpl

@@ -4,14 +4,14 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from orthonav.flight.fixes import STATES
+from orthonav.core.flight.fixes import STATES
 from orthonav.ground.evaluate.calibration import nees_bound
 from orthonav.ground.evaluate.calibration_report import nees_text
 from orthonav.ground.evaluate.figures import FloatArray, or_none
 from orthonav.ground.evaluate.gaps import Longest
 from orthonav.ground.evaluate.metrics import radius_key
 from orthonav.ground.evaluate.track import Spread, TrackConsistency, TrackMetrics, TrackSeries
-from orthonav.report.numbers import percent_text
+from orthonav.ground.report.numbers import percent_text
 
 
 def track_rows(track: TrackMetrics) -> tuple[tuple[str, str], ...]:

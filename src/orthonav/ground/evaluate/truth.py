@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from orthonav.errors import FlightError
-from orthonav.geo.frames import distances_m
-from orthonav.geo.swapped import HINT
-from orthonav.records import Fix, ViewResult
+from orthonav.core.errors import FlightError
+from orthonav.core.geo.frames import distances_m
+from orthonav.core.geo.swapped import HINT
+from orthonav.core.records import Fix, ViewResult
 
 FAR_M = 50_000.0
 """A larger median error is none of the method: maps of one sheet are smaller."""

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthonav.core.records import MAP_STD_M
 from orthonav.onboard.gnss.records import Array
-from orthonav.records import MAP_STD_M
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
 """Biases in the order of `Biases.mean`."""

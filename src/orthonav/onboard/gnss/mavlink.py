@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from orthonav.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import GnssSample
 
 _LATE_NS = 2 * 10**9
 """Timestamps of GNSS solutions that differ more from their arrival are of another clock."""

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthonav.flight.gnss import GnssSample
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import LARGEST_M, Biases, unknown
 from orthonav.onboard.gnss.difference import (
     BIN_S,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import GnssSample
 from orthonav.onboard.gnss.records import NANOSECONDS, Array, Fault
 
 LOST_STD_M = 50.0

@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.flight.gnss import FAULTS
+from orthonav.core.flight.gnss import FAULTS
 
 Array = NDArray[np.float64]
 NANOSECONDS = 1e-9

@@ -14,9 +14,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from orthonav.flight.gnss import BIASES, GnssSample
-from orthonav.flight.logged import gnss_message
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight.gnss import BIASES, GnssSample
+from orthonav.core.flight.logged import gnss_message
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
 from orthonav.onboard.gnss.biases import Biases, at_start, design
 from orthonav.onboard.gnss.learner import SETTLED_S, Resumed
 from orthonav.onboard.gnss.monitor import GnssMonitor
@@ -27,7 +28,6 @@ from orthonav.onboard.gnss.records import (
     GnssStatus,
     MapPosition,
 )
-from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
 
 log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"

@@ -14,9 +14,9 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import VariantError
-from orthonav.extras import needed
-from orthonav.files import require_file
+from orthonav.core.errors import VariantError
+from orthonav.core.extras import needed
+from orthonav.core.files import require_file
 
 log = logging.getLogger(__name__)
 MAX_DOMAIN_ID = 232

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Protocol
 
-from orthonav.errors import described
+from orthonav.core.errors import described
 from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.messages import Definitions
 

@@ -9,7 +9,7 @@ import importlib
 from collections.abc import Sequence
 from typing import Any
 
-from orthonav.errors import MissingExtraError
+from orthonav.core.errors import MissingExtraError
 
 TIME_NS = 10**9
 _GEOGRAPHIC = {

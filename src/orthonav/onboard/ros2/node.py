@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from orthonav.errors import OutputError
+from orthonav.core.errors import OutputError
 from orthonav.onboard.ros2 import names
 from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.graph import Graph, Handler

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.flight.logged import NO_ALTITUDE_M2
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.flight.logged import NO_ALTITUDE_M2
+from orthonav.core.geo.attitude import ros_xyzw_from_ned
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import CONFIDENT
+from orthonav.onboard.messages.estimate import NavigationEstimate, floored
+from orthonav.onboard.messages.mavlink import require_confident
 from orthonav.onboard.ros2.graph import Graph
 from orthonav.onboard.telemetry import VehicleState
-from orthonav.publish.estimate import NavigationEstimate, floored
-from orthonav.publish.mavlink import require_confident
-from orthonav.records import CONFIDENT
-from orthonav.sources.attitude import ros_xyzw_from_ned
 
 NOT_MEASURED_RAD2 = math.pi**2
 """Variance of an angle that is not measured: (180 deg)^2."""

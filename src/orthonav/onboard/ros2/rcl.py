@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from orthonav.errors import OutputError
+from orthonav.core.errors import OutputError
 from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.graph import Graph, Handler, Writer
 from orthonav.onboard.ros2.messages import Definitions

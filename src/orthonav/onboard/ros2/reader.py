@@ -11,28 +11,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from orthonav.errors import CameraError, FlightError, StoppedError
-from orthonav.flight.gnss import FIX_3D, GnssSample
-from orthonav.geo.camera import Camera
-from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.graph import Graph
-from orthonav.onboard.ros2.lost import LostImages
-from orthonav.onboard.ros2.messages import TIME_NS
-from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
-from orthonav.records import NoFix
-from orthonav.sources.attitude import (
-    AUTOPILOT_TILT_STD_DEG,
-    LOOKS_DOWN,
-    Angles,
-    ned_wxyz_from_ros,
-)
-from orthonav.sources.ros_images import camera_of_info, grey_of_message
-from orthonav.sources.ros_track import (
+from orthonav.core.errors import CameraError, FlightError, StoppedError
+from orthonav.core.flight.gnss import FIX_3D, GnssSample
+from orthonav.core.flight.ros_images import camera_of_info, grey_of_message
+from orthonav.core.flight.ros_track import (
     attitude_of_message,
     height_of_message,
     stamp_ns,
     tilt_std_of_message,
 )
+from orthonav.core.geo.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+    LOOKS_DOWN,
+    Angles,
+    ned_wxyz_from_ros,
+)
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import NoFix
+from orthonav.onboard.cameras import CameraImage
+from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.lost import LostImages
+from orthonav.onboard.ros2.messages import TIME_NS
+from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS

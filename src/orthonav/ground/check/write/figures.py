@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.mapfile.layer import GreyLayer, preview
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.outcome import Along, BlindStretch, CheckResult, Envelope
 from orthonav.ground.check.write.plain import summarize
 from orthonav.ground.check.write.risk import EDGE_PX, RISKS, segments, shade
 from orthonav.ground.check.write.shapes import stretch_en_m
 from orthonav.ground.check.write.wording import share_text, tolerance_sentence
-from orthonav.mapfile.layer import GreyLayer, preview
-from orthonav.mapfile.reader import MapFile
-from orthonav.records import CONFIDENT
-from orthonav.report import Background, Figure, draw_axes, draw_figure, draw_map, map_size_in
-from orthonav.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
+from orthonav.ground.report import Background, Figure, draw_axes, draw_figure, draw_map, map_size_in
+from orthonav.ground.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
 
 if TYPE_CHECKING:
     from matplotlib import figure as mpl

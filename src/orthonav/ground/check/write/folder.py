@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from orthonav.errors import OutputError
-from orthonav.extras import needed
-from orthonav.files import replacing, replacing_folder, write_text
+from orthonav.core.errors import OutputError
+from orthonav.core.extras import needed
+from orthonav.core.files import replacing, replacing_folder, write_text
+from orthonav.core.mapfile.reader import MapFile
 from orthonav.ground.check.outcome import CELL_VALUES, CheckResult
 from orthonav.ground.check.write.figures import FIGURE_NAMES, figures, map_image, visible_box
 from orthonav.ground.check.write.page import page_of
 from orthonav.ground.check.write.plain import FORMAT, to_json
 from orthonav.ground.check.write.shapes import to_geojson
-from orthonav.mapfile.reader import MapFile
-from orthonav.report import write_figures
-from orthonav.report.figures import FOLDER, LIST
-from orthonav.report.leaflet import leaflet_files, load_leaflet
+from orthonav.ground.report import write_figures
+from orthonav.ground.report.figures import FOLDER, LIST
+from orthonav.ground.report.leaflet import leaflet_files, load_leaflet
 
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
 _SIDECAR = "check.tif.aux.xml"

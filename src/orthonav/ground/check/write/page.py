@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.outcome import CELL_VALUES, CheckResult
 from orthonav.ground.check.write.figures import MAX_LOOKALIKES, jpeg, visible_box
 from orthonav.ground.check.write.plain import Plain, plain, summarize, to_plain
@@ -25,10 +26,9 @@ from orthonav.ground.check.write.wording import (
     tolerance_sentence,
     verdict_sentence,
 )
-from orthonav.records import CONFIDENT
-from orthonav.report import Background, Figure, metres_text, render
-from orthonav.report.leaflet import Leaflet
-from orthonav.report.page import data_url, joined_scripts, static_text
+from orthonav.ground.report import Background, Figure, metres_text, render
+from orthonav.ground.report.leaflet import Leaflet
+from orthonav.ground.report.page import data_url, joined_scripts, static_text
 
 PACKAGE = "orthonav.ground.check.write"
 _SHARED = ("format.js", "plane.js", "chart.js")

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.outcome import CELL_VALUES, Cells, CheckResult
-from orthonav.records import CONFIDENT
 
 FORMAT, VERSION = "orthonav-check", 1
 _DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}

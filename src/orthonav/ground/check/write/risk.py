@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.records import CONFIDENT
+from orthonav.core.records import CONFIDENT
 
 KNEE = 0.5, 0.2
 """A probability and its place on the colour scale: most of the scale is for what is likely."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.outcome import CELL_VALUES, Along, CheckResult
 from orthonav.ground.check.write.plain import Plain, lookalikes_to_plain, plain, stretches_to_plain
 from orthonav.ground.check.write.risk import RISKS, risk_of

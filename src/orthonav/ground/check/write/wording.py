@@ -3,6 +3,7 @@
 import math
 import textwrap
 
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.outcome import (
     Alternative,
     BlindStretch,
@@ -13,8 +14,7 @@ from orthonav.ground.check.outcome import (
     Word,
 )
 from orthonav.ground.check.write.plain import summarize
-from orthonav.records import CONFIDENT
-from orthonav.report.numbers import metres_text
+from orthonav.ground.report.numbers import metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {

@@ -1,1 +1,0 @@
-"""Confidence: numbers that separate right from wrong fixes, and a probability from them."""

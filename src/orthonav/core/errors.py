@@ -1,0 +1,114 @@
+"""Errors raised for broken input; each says what came, what was expected, and what to do.
+
+All derive from `OrthonavError`, which the command line turns into one line and `exit_code`,
+and from the builtin that fits, so that callers who know nothing of orthonav can still catch them.
+A view that cannot be placed is not an error: see `orthonav.core.records.NoFix`.
+"""
+
+
+class OrthonavError(Exception):
+    """Root of everything orthonav raises on purpose."""
+
+    exit_code = 1
+
+
+class MissingFileError(OrthonavError, FileNotFoundError):
+    """A file or folder that was named does not exist or cannot be read."""
+
+
+class ImageryError(OrthonavError, ValueError):
+    """An orthophoto cannot be used: no georeference, no valid pixels, unreadable, wrong bands."""
+
+
+class AreaError(OrthonavError, ValueError):
+    """The requested area is empty, too large, outside the imagery, or smaller than one tile."""
+
+
+class RouteError(OrthonavError, ValueError):
+    """A route file cannot be read as a route."""
+
+
+class MapFileError(OrthonavError, ValueError):
+    """A map file is not a map, is truncated, or was altered."""
+
+
+class MapChangedError(MapFileError):
+    """An open map file was truncated or rewritten in place, or cannot be read any more."""
+
+
+class MapVersionError(MapFileError):
+    """A map file was written for a newer schema than this program knows."""
+
+
+class FlightError(OrthonavError, ValueError):
+    """A flight folder, its telemetry, its truth or one of its images is broken."""
+
+
+class CameraError(OrthonavError, ValueError):
+    """Camera parameters are impossible or do not belong to the images."""
+
+
+class StoppedError(CameraError):
+    """The program was stopped while it waited for the calibration of a camera."""
+
+
+class CheckError(OrthonavError, ValueError):
+    """A check was asked for under conditions that cannot be: a share above 1, a negative seed."""
+
+
+class WorkerError(OrthonavError, RuntimeError):
+    """A process that was to do part of the work ended on its own: killed, or out of memory."""
+
+
+class VariantError(OrthonavError, ValueError):
+    """An unknown method, representation or parameter was named."""
+
+
+class UsageError(VariantError):
+    """The value of an option is impossible."""
+
+    exit_code = 2
+
+
+class OutputError(OrthonavError, OSError):
+    """A result could not be written (disk full, no permission); nothing was left behind."""
+
+
+class FetchError(OrthonavError, OSError):
+    """Imagery could not be fetched: a service refused, lacks the layer or sent no image."""
+
+
+class MissingExtraError(OrthonavError, ImportError):
+    """An optional dependency is needed for this and is not installed."""
+
+
+class AtlasError(OrthonavError, ValueError):
+    """An atlas cannot be used as asked: its catalogue and files disagree, its recipe is another,
+    a sheet is damaged or half there."""
+
+
+class StorageError(OrthonavError, OSError):
+    """The place where an atlas lies cannot be reached, read or written: address, credentials."""
+
+
+_LFS_STARTS = (
+    b"version https://git-lfs.github.com/spec/",
+    b"version https://hawser.github.com/spec/",
+)
+
+
+def lfs_pointer(head: bytes) -> str | None:
+    """What is wrong with a file that begins like this, if it is a pointer of Git LFS."""
+    if not head.startswith(_LFS_STARTS):
+        return None
+    return "is a Git LFS pointer, not the file itself; run `git lfs pull` in its repository"
+
+
+def described(error: BaseException) -> str:
+    """What went wrong, in words for a message, at most 120 characters.
+
+    A `KeyError` only holds the name that was sought, and some exceptions hold nothing.
+    """
+    if isinstance(error, KeyError) and len(error.args) == 1:
+        return f"{str(error.args[0])[:120]} is missing"
+    return " ".join(str(error).split())[:120] or type(error).__name__

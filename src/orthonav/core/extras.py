@@ -1,0 +1,152 @@
+"""Optional dependencies: which extra brings what, what of it is installed, one error where not.
+
+Which packages an extra has is read from the metadata of the installed orthonav, so that it is
+written down once, in pyproject.toml.
+"""
+
+import importlib
+import platform
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import util
+from typing import Any
+
+from orthonav.core.errors import MissingExtraError
+
+NAME = "orthonav"
+_REQUIREMENT = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?([^;]*)(?:;(.*))?")
+_OF_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
+_CONDITION = re.compile(r"""(python_version|platform_machine)\s*(==|<)\s*["']([^"']+)["']""")
+"""Of environment markers, what pyproject.toml uses: such comparisons, joined by `and`."""
+_MODULES = {
+    "faiss-cpu": "faiss",
+    "opencv-python-headless": "cv2",
+    "pillow": "PIL",
+    "pyyaml": "yaml",
+    "scikit-image": "skimage",
+    "xstatic-leaflet": "xstatic.pkg.leaflet",
+}
+"""Modules that are not named as the package that brings them."""
+
+
+@dataclass(frozen=True)
+class RequiredPackage:
+    """A package that orthonav or one of its extras asks for.
+
+    `name`: as pyproject.toml writes it. `asked`: version range, such as `>=1.4`. `version`: the one
+    that is installed; empty where its module cannot be found. `available`: whether its
+    environment marker lets it be installed on this machine with this Python.
+    """
+
+    name: str
+    asked: str
+    version: str
+    available: bool
+
+
+@lru_cache(maxsize=1)
+def _requirements() -> dict[str, list[tuple[str, str, str, str]]]:
+    """(package, its extras, range, marker) by extra, "" for the core; {} if not installed."""
+    from importlib import metadata  # takes as long as the rest of the command line to import
+
+    try:
+        lines = metadata.requires(NAME) or []
+    except metadata.PackageNotFoundError:  # run from its sources
+        return {}
+    found: dict[str, list[tuple[str, str, str, str]]] = {"": []}
+    for extra in metadata.metadata(NAME).get_all("Provides-Extra") or []:
+        found[extra] = []
+    for line in lines:
+        match = _REQUIREMENT.match(line)
+        assert match is not None, line
+        name, extras, asked, marker = (part or "" for part in match.groups())
+        of = _OF_EXTRA.search(marker)
+        found.setdefault(of[1] if of else "", []).append((name, extras, asked.strip(" ()"), marker))
+    return found
+
+
+def _holds(marker: str) -> bool:
+    """Whether an environment marker, without its extra, holds on this machine."""
+    here = {"python_version": platform.python_version(), "platform_machine": platform.machine()}
+    for name, comparison, value in _CONDITION.findall(marker):
+        if comparison == "==" and here[name] != value:
+            return False
+        if comparison == "<" and _numbers(here[name]) >= _numbers(value):
+            return False
+    return True
+
+
+def _numbers(version: str) -> list[int]:
+    """Major and minor number of a version."""
+    return [int(part) for part in version.split(".")[:2]]
+
+
+def packages(extra: str = "") -> tuple[RequiredPackage, ...]:
+    """Packages of an extra, those of the extras that it includes too, each once; "" is the core."""
+    found: dict[str, RequiredPackage] = {}
+    for name, included, asked, marker in _requirements().get(extra, []):
+        if name == NAME:
+            for each in included.split(","):
+                found.update({package.name: package for package in packages(each.strip())})
+        else:
+            found[name] = RequiredPackage(name, asked, _version(name), _holds(marker))
+    return tuple(found.values())
+
+
+def missing(extra: str) -> tuple[str, ...]:
+    """Names of the packages of an extra that are not installed."""
+    return tuple(package.name for package in packages(extra) if not package.version)
+
+
+def pip_line(*names: str) -> str:
+    """What to type for these extras."""
+    return f"pip install '{NAME}[{','.join(names)}]'"
+
+
+def require(what: str, *names: str) -> None:
+    """Raise `MissingExtraError` unless all packages of these extras are installed.
+
+    The message names every package that is missing, and one line that installs all of them.
+    """
+    absent = {name: missing(name) for name in names}
+    wanted = [name for name, gone in absent.items() if gone]
+    if wanted:
+        gone = ", ".join(dict.fromkeys(sum(absent.values(), ())))
+        raise MissingExtraError(f"{what} needs {gone}: {pip_line(*wanted)}")
+
+
+def needed(module: str, extra: str, what: str) -> Any:
+    """The module of that name. Raises `MissingExtraError` that names the extra which brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise missing_extra(what, extra, module, error) from error
+
+
+def missing_extra(what: str, extra: str, module: str, error: Exception) -> MissingExtraError:
+    """The error to raise where importing `module` of an extra failed with `error`."""
+    top = module.partition(".")[0]
+    names = (package.name for package in packages(extra))
+    package = next((name for name in names if module_of(name).partition(".")[0] == top), top)
+    return MissingExtraError(f"{what} needs {package}: {pip_line(extra)} ({error})")
+
+
+def module_of(package: str) -> str:
+    """The module that a package brings."""
+    plain = re.sub(r"[-_.]+", "-", package).lower()
+    return _MODULES.get(plain, plain.replace("-", "_"))
+
+
+def _version(package: str) -> str:
+    """Version of an installed package, "" where its module cannot be found."""
+    from importlib import metadata
+
+    try:
+        if util.find_spec(module_of(package)) is None:
+            return ""
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"  # there, but not installed by pip
+    except (ImportError, ValueError):
+        return ""

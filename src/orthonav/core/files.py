@@ -1,0 +1,202 @@
+"""Writing results so that a kill or a full disk leaves either the old file or the whole new one."""
+
+import errno
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from orthonav.core.errors import MissingFileError, OutputError, lfs_pointer
+
+Progress = Callable[[str, float], None]
+"""Receives the stage of a long task and the share of it that is done, 0 to 1."""
+
+
+def no_progress(stage: str, share: float) -> None:
+    """Progress that nobody watches."""
+
+
+_ALMOST_NONE = 2**20
+"""With less free space, bytes, a failed write is that of a full disk."""
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success it is synced and renamed to `path`.
+
+    On any exception, an interrupt included, the temporary file and the folders made for it are
+    removed and `path` is untouched. Raises `OutputError` where the system refuses to write (disk
+    full, no permission).
+    """
+    path = Path(path).resolve()
+    if path.exists() and not path.is_file():
+        raise OutputError(f"cannot write over a folder or a device: {path}")
+    made: list[Path] = []
+    try:
+        made = _made_folders(path.parent)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.name}.", suffix=f".tmp{path.suffix}", dir=path.parent
+        )
+    except OSError as error:
+        _remove_empty(made)
+        raise _output_error(error, path) from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        _sync(temporary)
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:
+        if isinstance(error, MissingFileError | OutputError) or error.errno is None:
+            raise
+        raise _output_error(error, path) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+        _remove_empty(made)
+
+
+@contextmanager
+def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; on success it takes the place of `path`.
+
+    An existing empty folder is replaced; an existing folder with content is refused before any
+    work is done, unless `is_ours` says that it may go. On any exception the temporary folder is
+    removed and the old one stays. Raises `OutputError` where the system refuses to write into it.
+    """
+    path = Path(path)
+    if not _may_be_replaced(path, is_ours):
+        raise OutputError(
+            f"output folder exists and is not empty; remove it or name another: {path}"
+        )
+    made: list[Path] = []
+    try:
+        made = _made_folders(path.parent)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    except OSError as error:
+        _remove_empty(made)
+        raise _output_error(error, path) from error
+    try:
+        yield temporary
+        temporary.chmod(0o777 & ~_umask())
+        if is_ours is not None and path.exists() and is_ours(path):
+            _remove_folder(path)
+        elif path.exists():
+            path.rmdir()  # refuses what appeared in it meanwhile
+        temporary.replace(path)
+    except OSError as error:
+        cause = error.__cause__ if isinstance(error, OutputError) else error  # of a file in it
+        if isinstance(error, MissingFileError) or not isinstance(cause, OSError):
+            raise
+        if cause.errno is None:
+            raise
+        raise _output_error(cause, path) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        _remove_empty(made)
+
+
+def _made_folders(folder: Path) -> list[Path]:
+    """Make a folder; the folders that did not exist before, the innermost first."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders that are empty, the innermost first."""
+    with suppress(OSError):
+        for each in folders:
+            each.rmdir()
+
+
+def not_written(reason: object, path: Path) -> OutputError:
+    """The error of a library that gives no number of the system's error, as GDAL does."""
+    free = shutil.disk_usage(path.resolve().parent).free
+    full = "disk full" if free < _ALMOST_NONE else "cannot write"
+    said = " ".join(str(reason).split())[:200]
+    return OutputError(f"{full} ({said}); nothing was written: {path}")
+
+
+def _may_be_replaced(path: Path, is_ours: Callable[[Path], bool] | None) -> bool:
+    try:
+        if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+            return True
+        return path.is_dir() and is_ours is not None and is_ours(path)
+    except OSError as error:
+        raise _output_error(error, path) from error
+
+
+def _remove_folder(path: Path) -> None:
+    """Remove a folder, out of sight first, so that a kill leaves no half of it."""
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+    path.replace(aside)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def is_stdout(path: Path) -> bool:
+    """Whether the path of a text file is `-`, stdout."""
+    return str(path) == "-"
+
+
+def write_text(path: Path, text: str) -> None:
+    """As `write_lines`."""
+    write_lines(path, [text])
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write lines with their ends as UTF-8 to `path`, whole or not at all; `-` is stdout."""
+    if is_stdout(path):
+        sys.stdout.writelines(lines)
+        return
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
+        out.writelines(lines)
+
+
+def with_paths(record: object, *names: str) -> None:
+    """Turn fields of a frozen record that are text, or hold texts, into paths; None stays."""
+    for name in names:
+        value = getattr(record, name)
+        if isinstance(value, str):
+            object.__setattr__(record, name, Path(value))
+        elif value is not None and not isinstance(value, Path):
+            object.__setattr__(record, name, tuple(Path(each) for each in value))
+
+
+def require_file(path: Path, what: str) -> Path:
+    """Return `path` if it is an existing file, else raise `MissingFileError` naming `what`.
+
+    A pointer of Git LFS is not the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        kind = "is a folder, not a file" if path.is_dir() else "does not exist"
+        raise MissingFileError(f"{what} {kind}: {path}")
+    try:
+        with path.open("rb") as stream:
+            pointer = lfs_pointer(stream.read(64))
+    except OSError:
+        return path  # the reader says why
+    if pointer:
+        raise MissingFileError(f"{what} {pointer}: {path}")
+    return path
+
+
+def _sync(path: Path) -> None:
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _output_error(error: OSError, path: Path) -> OutputError:
+    if error.errno == errno.ENOSPC:
+        return OutputError(f"disk full; nothing was written: {path}")
+    return OutputError(f"cannot write ({error.strerror or error}): {path}")

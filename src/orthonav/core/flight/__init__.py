@@ -1,0 +1,26 @@
+"""Flight folders: views, telemetry, camera and, where known, truth (docs/reference/formats.md)."""
+
+from orthonav.core.flight.folder import (
+    FlightFolder,
+    FlightView,
+    decode_image,
+    open_flight,
+    read_camera,
+    read_image,
+    read_truth,
+)
+from orthonav.core.flight.recording import Flight, RecordedView
+from orthonav.core.flight.writer import FlightWriter
+
+__all__ = [
+    "Flight",
+    "FlightFolder",
+    "FlightView",
+    "FlightWriter",
+    "RecordedView",
+    "decode_image",
+    "open_flight",
+    "read_camera",
+    "read_image",
+    "read_truth",
+]

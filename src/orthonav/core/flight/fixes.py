@@ -1,0 +1,354 @@
+"""`fixes.jsonl`, written and read: one JSON object per view, in order of the flight.
+
+The keys of a line and their order are those of `KEYS`, then `GROUND_KEYS` where the ground seen is
+known, `POSE_KEYS` where the attitude is, and `TRACK_KEYS` in a track.
+Unknown numbers (NaN, infinite) are written as null and read as NaN. `time_s` is written with up to
+nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seconds cannot hold.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from decimal import Decimal
+from itertools import chain, repeat
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import FlightError
+from orthonav.core.files import require_file, write_lines
+from orthonav.core.flight.identity import Identity
+from orthonav.core.records import Evidence, Fix, NoFix, ViewResult
+
+KEYS = (
+    "frame",  # name of the image in the flight folder
+    "time_s",  # time of exposure
+    "status",  # "fix" or "no_fix"
+    "confident",  # false: the position is the best guess; null for no_fix, like all down to agl_m
+    "lat_deg",  # WGS84
+    "lon_deg",
+    "cov_en_m2",  # [[east-east, east-north], [north-east, north-north]]
+    "confidence",  # probability that the error is below radius_m, 0 to 1
+    "radius_m",
+    "heading_deg",  # clockwise from true north, as estimated
+    "agl_m",  # metres above ground, as estimated
+    "reason",  # short word for programs; null for a fix
+    "detail",  # one sentence for people; null for a fix
+    "evidence",  # names and numbers
+    "latency_ms",
+)
+GROUND_KEYS = (
+    "ground_lat_deg",  # what the middle of the picture shows
+    "ground_lon_deg",
+    "ground_cov_en_m2",  # rows as in cov_en_m2; null where unknown, absent in earlier files
+)
+POSE_KEYS = (
+    "pitch_deg",  # as estimated; 0 looks straight down, positive ahead
+    "roll_deg",  # 0 looks straight down, positive left
+    "pose_cov",  # upper triangle (21) of 6 x 6, row by row: metres east, north, up, degrees of
+)  # heading, pitch, roll; null where they were not estimated together
+TRACK_KEYS = (
+    "tracked",  # true: the position is estimated from all views so far
+    "state",  # one of `STATES`
+)
+STATES = ("searching", "tracking", "coasting", "lost")
+_NULL_IN_FIX = {"reason": None, "detail": None}
+_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:11])
+MAX_LINE_BYTES = 2**20
+"""Limit of a line; the evidence of a view takes about 1000 bytes."""
+MAX_RESULTS = 1_000_000
+"""Limit of lines: as many as a flight folder may have views."""
+_TIME_LIMIT_S = 2**63 / 1e9
+UNKNOWN = Identity()
+"""Of a run whose map and flight are not stated."""
+
+
+def result_to_json(result: ViewResult) -> str:
+    """One line of `fixes.jsonl`, without the line end: strict JSON in ASCII, keys as in `KEYS`."""
+    values: dict[str, Any] = {
+        "frame": result.frame,
+        **_outcome_values(result.outcome),
+        "evidence": {str(k): _or_none(v) for k, v in result.outcome.evidence.items()},
+        "latency_ms": _or_none(result.latency_ms),
+    }
+    if isinstance(result.outcome, Fix):
+        values["confident"] = result.is_confident
+    texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
+    texts["time_s"] = _seconds(result.time_ns)
+    keys: tuple[str, ...] = KEYS
+    for more in (GROUND_KEYS, POSE_KEYS):
+        if more[0] in values:
+            keys += more
+    if result.state is not None:
+        keys += TRACK_KEYS
+        texts |= {"tracked": "true", "state": json.dumps(result.state)}
+    return "{" + ", ".join(f'"{key}": {texts[key]}' for key in keys) + "}"
+
+
+def result_from_json(line: str) -> ViewResult:
+    """The result in one line of `fixes.jsonl`.
+
+    Keys that are not in `KEYS` are ignored, and so are positions of a line without a fix.
+    Raises `FlightError` where the line is not strict JSON, a key is missing or has a wrong type.
+    """
+    try:
+        values = json.loads(line, parse_float=Decimal, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise FlightError(f"not a JSON object, cut off or damaged? ({error})") from error
+    if not isinstance(values, dict):
+        raise FlightError(f"expected a JSON object, got {_kind(values)}")
+    return ViewResult(
+        frame=_text(values, "frame"),
+        time_ns=_time_ns(values),
+        outcome=_outcome(values),
+        latency_ms=_number(values, "latency_ms"),
+        state=_state(values),
+        accepted=_accepted(values),
+    )
+
+
+def write_results(path: Path, results: Iterable[ViewResult], identity: Identity = UNKNOWN) -> None:
+    """Write `results` to `path`, one line each, whole or not at all; `-` is stdout.
+
+    The first line states `identity`, the map and the flight that they were computed from.
+    """
+    stated = chain([identity], repeat(UNKNOWN))
+    lines = map(result_to_json, results)
+    write_lines(path, (own.added_to(line) + "\n" for line, own in zip(lines, stated, strict=False)))
+
+
+def is_health(line: str) -> bool:
+    """Whether a line of `fly --jsonl` is one of health, which is no result."""
+    return line.startswith('{"health"')
+
+
+def read_results(path: Path) -> list[ViewResult]:
+    """All results in `path`, in its order; empty lines and those of health are skipped.
+
+    Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
+    first invalid line.
+    """
+    path = require_file(path, "file of fixes")
+    results = []
+    with path.open("rb") as stream:
+        lines = iter(lambda: stream.readline(MAX_LINE_BYTES + 1), b"")
+        for number, raw in enumerate(lines, start=1):
+            try:
+                if len(raw) > MAX_LINE_BYTES or number > MAX_RESULTS:
+                    raise FlightError(
+                        f"more than {MAX_LINE_BYTES:,} bytes in a line, or {MAX_RESULTS:,} lines"
+                    )
+                line = raw.decode("utf-8").strip()
+                if line and not is_health(line):
+                    results.append(result_from_json(line))
+            except UnicodeDecodeError as error:
+                raise FlightError(f"line {number}: not UTF-8 text: {path}") from error
+            except FlightError as error:
+                raise FlightError(f"line {number}: {error}: {path}") from error
+    return results
+
+
+def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
+    if isinstance(outcome, NoFix):
+        no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
+        return {**no_fix, **_NULL_IN_NO_FIX}
+    return {
+        "status": "fix",
+        "lat_deg": _or_none(outcome.lat_deg),
+        "lon_deg": _or_none(outcome.lon_deg),
+        "cov_en_m2": _rows(outcome.cov_en_m2),
+        "confidence": _or_none(outcome.confidence),
+        "radius_m": _or_none(outcome.radius_m),
+        "heading_deg": _or_none(outcome.heading_deg),
+        "agl_m": _or_none(outcome.agl_m),
+        **_NULL_IN_FIX,
+        **_ground_values(outcome),
+        **_pose_values(outcome),
+    }
+
+
+def _ground_values(fix: Fix) -> dict[str, Any]:
+    if fix.ground_latlon_deg is None:
+        return {}
+    lat, lon = fix.ground_latlon_deg
+    cov = fix.ground_cov_en_m2
+    values = _or_none(lat), _or_none(lon), None if cov is None else _rows(cov)
+    return dict(zip(GROUND_KEYS, values, strict=True))
+
+
+def _pose_values(fix: Fix) -> dict[str, Any]:
+    angles = _or_none(fix.pitch_deg), _or_none(fix.roll_deg)
+    if fix.pose_cov is None and angles == (None, None):
+        return {}
+    upper = None
+    if fix.pose_cov is not None and np.isfinite(fix.pose_cov).all():
+        upper = fix.pose_cov[np.triu_indices(6)].tolist()
+    return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
+
+
+def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
+    return [[_or_none(value) for value in row] for row in cov]
+
+
+def _state(values: Mapping[str, Any]) -> str | None:
+    state = values.get("state")
+    if state is not None and state not in STATES:
+        raise FlightError(f"state: expected one of {', '.join(STATES)}, got {state!r:.40}")
+    return state
+
+
+def _accepted(values: Mapping[str, Any]) -> bool | None:
+    """Whether a fix is marked as confident; None in files of earlier versions, without the mark."""
+    confident = values.get("confident")
+    if confident is not None and not isinstance(confident, bool):
+        raise FlightError(f"confident: expected true or false, got {_kind(confident)}")
+    return confident
+
+
+def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
+    status = _text(values, "status")
+    evidence = _evidence(values)
+    if status == "no_fix":
+        detail = "" if values.get("detail") is None else _text(values, "detail")
+        return NoFix(reason=_text(values, "reason"), detail=detail, evidence=evidence)
+    if status != "fix":
+        raise FlightError(f"status: expected 'fix' or 'no_fix', got {status!r:.40}")
+    confidence = _number(values, "confidence")
+    if not (math.isnan(confidence) or 0.0 <= confidence <= 1.0):
+        raise FlightError(f"confidence: expected 0 to 1, got {confidence:g}")
+    return Fix(
+        lat_deg=_angle(values, "lat_deg", 90.0),
+        lon_deg=_angle(values, "lon_deg", 180.0),
+        cov_en_m2=_covariance(values, "cov_en_m2"),
+        confidence=confidence,
+        radius_m=_number(values, "radius_m"),
+        heading_deg=_number(values, "heading_deg"),
+        agl_m=_number(values, "agl_m"),
+        evidence=evidence,
+        ground_latlon_deg=_ground(values),
+        ground_cov_en_m2=_known_covariance(values, GROUND_KEYS[2]),
+        pitch_deg=_number(values, "pitch_deg") if "pitch_deg" in values else math.nan,
+        roll_deg=_number(values, "roll_deg") if "roll_deg" in values else math.nan,
+        pose_cov=_pose_covariance(values),
+    )
+
+
+def _ground(values: Mapping[str, Any]) -> tuple[float, float] | None:
+    """What the middle of the picture shows; None where a line does not say."""
+    if GROUND_KEYS[0] not in values:
+        return None
+    return _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
+
+
+def _seconds(time_ns: int) -> str:
+    whole, rest = divmod(abs(int(time_ns)), 1_000_000_000)
+    decimals = f"{rest:09d}".rstrip("0") or "0"
+    return f"{'-' if time_ns < 0 else ''}{whole}.{decimals}"
+
+
+def _time_ns(values: Mapping[str, Any]) -> int:
+    seconds = _number(values, "time_s")
+    if not abs(seconds) < _TIME_LIMIT_S:  # NaN too
+        raise FlightError(f"time_s: expected seconds that fit 64 bits of ns, got {seconds:g}")
+    return int(Decimal(values["time_s"]).scaleb(9).to_integral_value())
+
+
+def _or_none(value: float) -> float | None:
+    value = float(value)
+    return value if math.isfinite(value) else None
+
+
+def _value(values: Mapping[str, Any], key: str) -> Any:
+    if key not in values:
+        raise FlightError(f"key {key} is missing")
+    return values[key]
+
+
+def _text(values: Mapping[str, Any], key: str) -> str:
+    value = _value(values, key)
+    if not isinstance(value, str):
+        raise FlightError(f"{key}: expected text, got {_kind(value)}")
+    return value
+
+
+def _number(values: Mapping[str, Any], key: str) -> float:
+    return _as_float(_value(values, key), key)
+
+
+def _as_float(value: Any, name: str) -> float:
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | Decimal):
+        raise FlightError(f"{name}: expected a number or null, got {_kind(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise FlightError(f"{name}: expected a finite number or null, got one beyond float64")
+    return number
+
+
+def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
+    angle = _number(values, key)
+    if not abs(angle) <= limit_deg:  # NaN too: a fix has a position
+        raise FlightError(f"{key}: a fix needs -{limit_deg:g} to {limit_deg:g}, got {angle:g}")
+    return angle
+
+
+def _covariance(values: Mapping[str, Any], key: str) -> NDArray[np.float64]:
+    rows = _value(values, key)
+    if rows is None:
+        rows = [[None, None], [None, None]]
+    if not isinstance(rows, list) or [_length(row) for row in rows] != [2, 2]:
+        raise FlightError(f"{key}: expected two rows of two numbers")
+    cov = np.array([[_as_float(value, key) for value in row] for row in rows])
+    cov.setflags(write=False)
+    return cov
+
+
+def _known_covariance(values: Mapping[str, Any], key: str) -> NDArray[np.float64] | None:
+    """The same; None where a line does not say."""
+    return None if values.get(key) is None else _covariance(values, key)
+
+
+def _pose_covariance(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """The covariance (6, 6) of the camera; None where a line does not say."""
+    key = POSE_KEYS[2]
+    numbers = values.get(key)
+    if numbers is None:
+        return None
+    if _length(numbers) != 21:
+        raise FlightError(f"{key}: expected null or 21 numbers")
+    upper = np.array([_as_float(value, key) for value in numbers])
+    if np.isnan(upper).any():
+        raise FlightError(f"{key}: expected 21 numbers, got null among them")
+    cov = np.zeros((6, 6))
+    cov[np.triu_indices(6)] = upper
+    cov += np.triu(cov, 1).T
+    cov.setflags(write=False)
+    return cov
+
+
+def _length(row: Any) -> int:
+    return len(row) if isinstance(row, list) else -1
+
+
+def _evidence(values: Mapping[str, Any]) -> Evidence:
+    evidence = _value(values, "evidence")
+    if not isinstance(evidence, dict):
+        raise FlightError(f"evidence: expected an object, got {_kind(evidence)}")
+    named = {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
+    return MappingProxyType(named)
+
+
+def _kind(value: Any) -> str:
+    names = {dict: "an object", list: "a list", str: "text", bool: "true or false"}
+    return "null" if value is None else names.get(type(value), "a number")
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON; write null")

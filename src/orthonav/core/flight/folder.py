@@ -1,0 +1,306 @@
+"""Reading a flight folder."""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import CameraError, FlightError, MissingFileError
+from orthonav.core.files import require_file
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.core.records import Prior, Telemetry
+from orthonav.core.tables import TableError, TableRows
+
+TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
+OPTIONAL_COLUMNS = (
+    "yaw_std_deg",
+    "agl_std_m",
+    "prior_lat_deg",
+    "prior_lon_deg",
+    "prior_std_m",
+    "vel_east_mps",
+    "vel_north_mps",
+    "tilt_std_deg",
+    "vel_std_mps",
+    "home_m",
+    "amsl_m",
+    "hae_m",
+)
+MAX_TEXT_BYTES = 500_000_000
+MAX_VIEWS = 1_000_000
+"""Rows of a table of a flight: as many views as `simulate` makes, 55 hours at 5 Hz."""
+# The camera describes the sensor: an orientation tag must not rotate the image.
+_DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_BROKEN_JSON = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
+
+
+@dataclass(frozen=True, slots=True)
+class FlightView:
+    """One view of a flight: its name in the folder `frames`, and its telemetry."""
+
+    frames: Path
+    frame: str
+    telemetry: Telemetry
+
+    @property
+    def path(self) -> Path:
+        """File of the image."""
+        return self.frames / self.frame
+
+    @property
+    def where(self) -> str:
+        """Location of the image, for messages."""
+        return str(self.path)
+
+    def grey(self) -> NDArray[np.uint8]:
+        """Grey levels (H, W) uint8 of the image; raises as `read_image`."""
+        return read_image(self.path)
+
+
+@dataclass(frozen=True)
+class FlightFolder:
+    """A flight as it was recorded: one camera, views in the order of the telemetry."""
+
+    path: Path
+    camera: Camera
+    note: str
+    views: tuple[FlightView, ...]
+
+    @property
+    def expected(self) -> int:
+        """Number of views."""
+        return len(self.views)
+
+
+def open_flight(path: Path, *, images_needed: bool = True) -> FlightFolder:
+    """Open a flight folder and, if `images_needed`, check that every image named is there.
+
+    The camera is scaled to the size of the first image that can be decoded. Raises
+    `MissingFileError`, `FlightError` or `CameraError` with file and line. Values that are not
+    numbers become NaN: a missing heading or height concerns one view only.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        kind = "is a file, not a folder" if path.exists() else "does not exist"
+        raise MissingFileError(f"flight folder {kind}: {path}")
+    camera, note = read_camera(path / "flight.json")
+    telemetry = require_file(path / "telemetry.csv", "telemetry of the flight")
+    views = tuple(_views(telemetry, path / "frames", images_needed))
+    if not views:
+        raise FlightError(f"telemetry has no views: {telemetry}")
+    return FlightFolder(path, _fitted(camera, views), note, views)
+
+
+def _fitted(camera: Camera, views: Iterable[FlightView]) -> Camera:
+    """The camera at the size of the first image that can be decoded."""
+    for view in views:
+        try:
+            height, width = view.grey().shape
+        except (FlightError, MissingFileError):
+            continue
+        try:
+            return camera.fitted(width, height)
+        except CameraError as error:
+            raise CameraError(f"{error}: {view.where}") from error
+    return camera
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Grey levels (H, W) uint8 of an image file; 16-bit images are scaled down.
+
+    Raises `MissingFileError` or, where it cannot be decoded or was cut short, `FlightError`.
+    """
+    path = require_file(path, "image of the flight")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FlightError(
+            f"image of the flight cannot be read ({error.strerror}): {path}"
+        ) from error
+    return decode_image(data, str(path))
+
+
+def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
+    """Grey levels (H, W) uint8 of an encoded image (JPEG, PNG, TIFF); `where` is for errors.
+
+    Raises `FlightError` where it cannot be decoded or was cut short.
+    """
+    if _is_cut_jpeg(data):
+        raise FlightError(f"image of the flight was cut short: {where}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _DECODE) if data else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FlightError(f"image of the flight cannot be decoded: {where}")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _is_cut_jpeg(data: bytes) -> bool:
+    """Whether this is a JPEG that lacks its end-of-image marker.
+
+    OpenCV before 5 fills the missing part of a JPEG with grey without an error; incomplete PNG and
+    TIFF it does not decode. The marker is searched after the header of the first scan: thumbnails
+    before it end with a marker of their own, compressed data never holds one, and previews or
+    padding after it do not matter.
+    """
+    if not data.startswith(_JPEG_START):
+        return False
+    at = len(_JPEG_START)
+    while data[at : at + 1] == b"\xff" and data[at : at + 2] != _JPEG_SCAN:
+        filling = data[at + 1 : at + 2] == b"\xff"
+        at += 1 if filling else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.find(_JPEG_END, at) < 0
+
+
+def read_truth(path: Path) -> dict[str, tuple[float, float]]:
+    """True positions by frame, (lat_deg, lon_deg), from `truth.csv`.
+
+    Raises `MissingFileError` or `FlightError`, naming the line.
+    """
+    path = require_file(path, "truth")
+    truth: dict[str, tuple[float, float]] = {}
+    for line, row in csv_rows(path, ("frame", "lat_deg", "lon_deg")):
+        lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
+        if not (abs(lat) <= 90 and abs(lon) <= 360):
+            hint = swapped_hint(lat, lon)
+            raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
+        if row["frame"] in truth:
+            raise FlightError(f"line {line}: frame {row['frame']} appears twice: {path}")
+        truth[row["frame"]] = (lat, lon)
+    return truth
+
+
+def read_camera(path: Path) -> tuple[Camera, str]:
+    """Camera and note of a `flight.json`.
+
+    Raises `MissingFileError`, `FlightError` or `CameraError`.
+    """
+    path = require_file(path, "camera of the flight")
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8-sig"))
+        raw = plain["camera"]
+        distortion = raw.get("distortion", [])
+        if not isinstance(distortion, list):
+            raise TypeError(f"distortion must be a list, got {distortion!r:.80}")
+        camera = Camera(
+            width_px=int(raw["width_px"]),
+            height_px=int(raw["height_px"]),
+            **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
+            distortion=tuple(float(value) for value in distortion),
+            model=str(raw.get("model", "brown")),
+            focal_std=float(raw.get("focal_std", 0.0)),
+        )
+        return camera, str(plain.get("note", ""))
+    except CameraError as error:
+        raise CameraError(f"{error}: {path}") from error
+    except _BROKEN_JSON as error:
+        raise FlightError(
+            "expected {camera: {width_px, height_px, fx_px, fy_px, cx_px, cy_px}} as JSON "
+            f"({type(error).__name__}: {error}): {path}"
+        ) from error
+
+
+def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[FlightView]:
+    seen: set[str] = set()
+    for line, row in csv_rows(telemetry, TELEMETRY_COLUMNS):
+        frame = row["frame"]
+        pure = PurePosixPath(frame)
+        if not frame or pure.is_absolute() or ".." in pure.parts or "\\" in frame:
+            raise FlightError(f"line {line}: '{frame}' is not a name inside frames/: {telemetry}")
+        if frame in seen:
+            raise FlightError(f"line {line}: frame {frame} appears twice: {telemetry}")
+        seen.add(frame)
+        time_ns = time_ns_of(row["time_s"])
+        if time_ns is None:
+            raise FlightError(f"line {line}: time_s is not a time in seconds: {telemetry}")
+        image = frames / frame
+        if images_needed and not _is_file(image):
+            raise FlightError(
+                f"telemetry line {line} names an image that does not exist (localize "
+                f"--skip-bad-images goes on without it): {image}"
+            )
+        prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
+        if hint := swapped_hint(*prior):
+            raise FlightError(f"line {line}: prior position is out of range{hint}: {telemetry}")
+        yield FlightView(frames, frame, _telemetry(row, time_ns))
+
+
+def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
+    prior = [_optional(row, f"prior_{name}") for name in ("lat_deg", "lon_deg", "std_m")]
+    velocity = [_optional(row, f"vel_{name}_mps") for name in ("east", "north")]
+    usable = prior[0] is not None and prior[1] is not None and prior[2] is not None
+    usable = usable and abs(prior[0] or 0) <= 90 and abs(prior[1] or 0) <= 360
+    return Telemetry(
+        time_ns=time_ns,
+        yaw_deg=number_of(row["yaw_deg"]),
+        pitch_deg=number_of(row["pitch_deg"]),
+        roll_deg=number_of(row["roll_deg"]),
+        agl_m=number_of(row["agl_m"]),
+        yaw_std_deg=_optional(row, "yaw_std_deg"),
+        agl_std_m=_optional(row, "agl_std_m"),
+        tilt_std_deg=_optional(row, "tilt_std_deg"),
+        vel_std_mps=_optional(row, "vel_std_mps"),
+        home_m=_optional(row, "home_m"),
+        amsl_m=_optional(row, "amsl_m"),
+        hae_m=_optional(row, "hae_m"),
+        prior=Prior(prior[0] or 0.0, prior[1] or 0.0, prior[2] or 0.0) if usable else None,
+        vel_en_mps=None if None in velocity else (velocity[0] or 0.0, velocity[1] or 0.0),
+    )
+
+
+def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
+    """Line number and fields of each row of a CSV that must have the columns `needed`."""
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            rows = TableRows(stream, most_rows=MAX_VIEWS)
+            missing = [name for name in needed if name not in rows.columns]
+            if missing:
+                raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
+            for row in rows:
+                if any(row[name] is None for name in needed):
+                    raise FlightError(f"line {rows.line} has too few fields: {path}")
+                yield rows.line, {k: v or "" for k, v in row.items() if isinstance(k, str)}
+    except TableError as error:
+        raise FlightError(f"{error}: {path}") from error
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name longer than the system allows
+        return False
+
+
+def time_ns_of(text: str | None) -> int | None:
+    """Nanoseconds of decimal seconds, None where the text is not a time.
+
+    Decimal, because a float64 of seconds since 1970 does not resolve nanoseconds.
+    """
+    if text is None or not abs(number_of(text)) < 9e9:  # NaN too
+        return None
+    return round(Decimal(text.strip()) * 10**9)
+
+
+def number_of(text: Any) -> float:
+    """The number in a field of a table, NaN where it is not a number."""
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _optional(row: Mapping[str, str], name: str) -> float | None:
+    value = number_of(row.get(name, ""))
+    return value if math.isfinite(value) else None

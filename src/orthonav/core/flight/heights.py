@@ -1,0 +1,229 @@
+"""Heights above ground from the heights that were reported, over the terrain.
+
+Heights above ground (`agl_m`), take-off (`home_m`), mean sea level (`amsl_m`) and the ellipsoid
+(`hae_m`) are different numbers. This module is the only place that turns one into another.
+"""
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.flight.terrain_fit import TerrainFit
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.ground import Ground, TerrainHeights, ground_around, ground_over
+from orthonav.core.records import CONFIDENT, DEFAULT_AGL_STD, Fix, NoFix, Telemetry
+
+Array = NDArray[np.float64]
+Place = tuple[float, float]
+Undulation = Callable[[Array, Array], Array]
+"""Height of the geoid above the ellipsoid (m) at latitudes and longitudes (deg)."""
+USUAL_MPS = 30.0
+"""Speed at which a position ages where none is reported: that of a fast small aircraft."""
+VELOCITY_ERROR = 0.3
+"""Error of a reported velocity as a share of it, turns between two fixes included."""
+MISMATCH_M = 20.0
+"""Heights above sea and above take-off that differ by more over the terrain are named: barometers
+and positions of take-off explain less, a wrong datum more."""
+LARGEST_STD_M = 10_000.0
+"""A position with a larger standard deviation is unknown: a map is at most 50 km across."""
+_LOST = ("searching", "lost")
+"""States of a track that has no position."""
+log = logging.getLogger(__name__)
+
+
+def is_measured(telemetry: Telemetry) -> bool:
+    """Whether the height above ground was measured.
+
+    A height above ground that equals the one above take-off assumes level ground, as imports
+    without a terrain do.
+    """
+    return math.isfinite(telemetry.agl_m) and telemetry.agl_m != telemetry.home_m
+
+
+def assumed_heights(
+    telemetry: Telemetry, terrain: str | None, advice: str = "give --dem"
+) -> str | None:
+    """What is assumed about the height of a view, in words; None where it was measured.
+
+    `terrain`: name of the terrain that is used, None without one. `advice`: what would help then.
+    """
+    if is_measured(telemetry):
+        return None
+    kinds = {"sea level": telemetry.amsl_m, "take-off": telemetry.home_m}
+    known = [name for name, value in kinds.items() if value is not None]
+    known += ["the ellipsoid"] if telemetry.hae_m is not None else []
+    if not known:
+        return None
+    if terrain is not None:
+        plus = " plus the terrain there" if known[0] == "take-off" else ""
+        return f"height above ground is the height above {known[0]}{plus} minus {terrain}"
+    if math.isfinite(telemetry.agl_m):
+        return f"level ground is assumed: height above ground is that above take-off; {advice}"
+    return f"only heights above {' and '.join(known)} are known, none above ground: {advice}"
+
+
+@dataclass(frozen=True, eq=False)
+class GroundHeights:
+    """Heights above ground over a terrain.
+
+    `terrain`: its heights above mean sea level. `take_off`: the ground where the aircraft took off,
+    None where that is unknown. `geoid`: needed for heights above the ellipsoid; None without one.
+    """
+
+    terrain: TerrainHeights
+    take_off: Ground | None = None
+    geoid: Undulation | None = None
+
+    def above(self, telemetry: Telemetry, below: Ground, place: Place) -> Telemetry:
+        """The telemetry with the height above the ground `below`, and its standard deviation.
+
+        `place`: latitude and longitude, roughly. Unchanged where the height above ground was
+        measured, and where no other height is known.
+        """
+        found = None if is_measured(telemetry) else self.above_sea(telemetry, place)
+        if found is None:
+            return telemetry
+        above_sea_m, std_m = found
+        agl_m = above_sea_m - below.height_m
+        spread_m = math.hypot(std_m, below.std_m)
+        agl_std_m = telemetry.agl_std_m
+        if spread_m > 0:
+            own_m = DEFAULT_AGL_STD * abs(agl_m) if agl_std_m is None else agl_std_m
+            agl_std_m = math.hypot(own_m, spread_m)
+        return replace(telemetry, agl_m=agl_m, agl_std_m=agl_std_m, below=below)
+
+    def mismatch_m(self, telemetry: Telemetry) -> float:
+        """Height above sea by take-off and terrain, minus the reported one; NaN where unknown."""
+        if self.take_off is None or telemetry.home_m is None or telemetry.amsl_m is None:
+            return math.nan
+        return telemetry.home_m + self.take_off.height_m - telemetry.amsl_m
+
+    def above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
+        """Height above sea level and its standard deviation by the terrain; None where unknown."""
+        if telemetry.amsl_m is not None:
+            return telemetry.amsl_m, 0.0
+        if telemetry.home_m is not None and self.take_off is not None:
+            return telemetry.home_m + self.take_off.height_m, self.take_off.std_m
+        if telemetry.hae_m is not None and self.geoid is not None:
+            lat, lon = np.array([place[0]]), np.array([place[1]])
+            return telemetry.hae_m - float(self.geoid(lat, lon)[0]), 0.0
+        return None
+
+
+class FlownHeights:
+    """Heights above ground along a flight whose position is what its fixes say. Mutable.
+
+    The ground below is that around the prior or the last confident fix, whichever is known better;
+    without either it is that of the whole area searched, whose spread widens the standard deviation
+    of the height.
+    """
+
+    def __init__(
+        self,
+        terrain: TerrainHeights,
+        area_deg: tuple[Array, Array],
+        *,
+        take_off: tuple[float, float, float] | None = None,
+        geoid: Undulation | None = None,
+        use_prior: bool = True,
+    ) -> None:
+        """`area_deg`: latitudes and longitudes spread over the area searched. `take_off`: latitude,
+        longitude and standard deviation (m) of the place of take-off."""
+        self._terrain, self._area_deg = terrain, area_deg
+        self._use_prior = use_prior
+        known = None
+        if take_off is not None:
+            known = ground_around(terrain, take_off[:2], take_off[2])
+        self._heights = GroundHeights(terrain, known or self._whole, geoid)
+        self._checked = known is None
+        self._last: tuple[int, Place, float] | None = None
+        self._fit, self._newest = TerrainFit(terrain), Telemetry(-1, 0.0, 0.0, 0.0, math.nan)
+
+    def corrected(self, telemetry: Telemetry) -> Telemetry:
+        """The telemetry with its height above ground; unchanged where that was measured, NaN where
+        the terrain does not give it: level ground is not assumed."""
+        if is_measured(telemetry):
+            return telemetry
+        self._check(telemetry)
+        self._newest = telemetry
+        place, std_m = self._place(telemetry)
+        below = None if place is None else ground_around(self._terrain, place, std_m)
+        below = below or self._whole
+        made = telemetry
+        if below is not None:
+            made = self._heights.above(telemetry, below, place or self._middle)
+        return replace(telemetry, agl_m=math.nan) if made is telemetry else made
+
+    def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
+        """Take note of the outcome of a view: a confident fix says where the aircraft is.
+
+        A track that is lost does not know it any more, wherever its last fix was.
+        """
+        if state in _LOST:
+            self._last = None
+        if not isinstance(outcome, Fix) or not outcome.confidence >= CONFIDENT:
+            return
+        if state in (None, "tracking"):
+            std_m = math.sqrt(float(np.trace(outcome.cov_en_m2)) / 2)
+            self._last = time_ns, (outcome.lat_deg, outcome.lon_deg), std_m
+            reported = self._heights.above_sea(self._newest, self._last[1])
+            if self._newest.time_ns == time_ns and reported is not None:
+                self._fit.take(outcome, reported[0])
+
+    def ground_m(self, fix: Fix) -> float:
+        """Height of the terrain above sea level at a fix; NaN where the terrain has none."""
+        std_m = math.sqrt(float(np.trace(fix.cov_en_m2)) / 2)
+        below = ground_around(self._terrain, (fix.lat_deg, fix.lon_deg), std_m)
+        return math.nan if below is None else below.height_m
+
+    def _place(self, telemetry: Telemetry) -> tuple[Place | None, float]:
+        """Expected position and its standard deviation per axis."""
+        found: list[tuple[float, Place | None]] = []
+        prior = telemetry.prior if self._use_prior else None
+        if prior is not None:
+            found.append((prior.std_m, (prior.lat_deg, prior.lon_deg)))
+        if self._last is not None:
+            found.append(_aged(*self._last, telemetry))
+        std_m, place = min(found, default=(math.inf, None))
+        return (place, std_m) if std_m <= LARGEST_STD_M else (None, math.inf)
+
+    def _check(self, telemetry: Telemetry) -> None:
+        """Warn once where heights above sea and above take-off disagree over the terrain."""
+        off_m = math.nan if self._checked else self._heights.mismatch_m(telemetry)
+        if math.isfinite(off_m):
+            self._checked = True
+            warn_of_mismatch(off_m)
+
+    @cached_property
+    def _whole(self) -> Ground | None:
+        return ground_over(self._terrain, *self._area_deg)
+
+    @property
+    def _middle(self) -> Place:
+        lat, lon = self._area_deg
+        return float(lat.mean()), float(lon.mean())
+
+
+def _aged(time_ns: int, place: Place, std_m: float, telemetry: Telemetry) -> tuple[float, Place]:
+    """Standard deviation and place at a view, of a place known at an earlier time."""
+    seconds = (telemetry.time_ns - time_ns) / 1e9
+    if telemetry.vel_en_mps is None:
+        return std_m + USUAL_MPS * abs(seconds), place
+    moved_m = np.array(telemetry.vel_en_mps) * seconds
+    lat, lon = LocalFrame(*place).latlon_from_en(moved_m)
+    return std_m + VELOCITY_ERROR * float(np.hypot(*moved_m)), (float(lat), float(lon))
+
+
+def warn_of_mismatch(off_m: float) -> None:
+    """Log a warning where heights above sea and above take-off differ by a large `off_m`."""
+    if abs(off_m) > MISMATCH_M:
+        log.warning(
+            "heights above take-off and above sea level differ by %.0f m over this terrain: check "
+            "its vertical datum, the place of take-off and the altitude of the autopilot",
+            off_m,
+        )

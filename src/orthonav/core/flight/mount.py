@@ -1,0 +1,122 @@
+"""Constant errors of a flight's telemetry: mounting of the camera, compass, height, focal length.
+
+`orthonav calibrate` estimates them from a flight and writes a small JSON file for later flights.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from orthonav.core.errors import FlightError, described
+from orthonav.core.flight.calibrated import BROKEN, read_record, write_record
+from orthonav.core.flight.recording import Flight, WithTelemetry
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Telemetry
+
+_LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
+
+
+@dataclass(frozen=True)
+class Bias:
+    """A constant error: `value` is added to the reported value, `std` is the standard deviation of
+    the estimate, `scatter` that of the residuals from view to view."""
+
+    value: float
+    std: float
+    scatter: float
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Constant errors of telemetry."""
+
+    heading_deg: Bias
+    """Degrees, clockwise."""
+    log_scale: Bias
+    """Natural logarithm of true over reported height; includes errors of the focal length."""
+    pitch_deg: Bias
+    """Degrees, positive ahead."""
+    roll_deg: Bias
+    """Degrees, positive to the left."""
+    views: int
+    """Number of views that the estimate is based on."""
+
+    def corrected(self, telemetry: Telemetry) -> Telemetry:
+        """Telemetry without these errors; unknown values stay unknown.
+
+        What is not known of the mount adds to the stated deviation of pitch and roll.
+        """
+        tilt = telemetry.tilt_std_deg
+        mount = max(self.pitch_deg.std, self.roll_deg.std)
+        return replace(
+            telemetry,
+            yaw_deg=telemetry.yaw_deg + self.heading_deg.value,
+            agl_m=telemetry.agl_m * math.exp(self.log_scale.value),
+            pitch_deg=telemetry.pitch_deg + self.pitch_deg.value,
+            roll_deg=telemetry.roll_deg + self.roll_deg.value,
+            tilt_std_deg=None if tilt is None else math.hypot(tilt, mount),
+        )
+
+
+@dataclass(frozen=True)
+class MountedFlight:
+    """A recorded flight without the errors of its mount."""
+
+    flight: Flight
+    mount: Mount
+
+    @property
+    def camera(self) -> Camera:
+        """See `Flight.camera`."""
+        return self.flight.camera
+
+    @property
+    def note(self) -> str:
+        """See `Flight.note`."""
+        return self.flight.note
+
+    @property
+    def views(self) -> Iterator[WithTelemetry]:
+        """See `Flight.views`."""
+        for view in self.flight.views:
+            yield WithTelemetry(view, self.mount.corrected(view.telemetry))
+
+    @property
+    def expected(self) -> int:
+        """See `Flight.expected`."""
+        return self.flight.expected
+
+
+def write_mount(path: Path, mount: Mount) -> None:
+    """Write a mount as JSON, whole or not at all."""
+    write_record(path, "mount", asdict(mount))
+
+
+def read_mount(path: Path) -> Mount:
+    """Read what `write_mount` wrote. Raises `MissingFileError` or `FlightError`."""
+    return read_record(path, "mount", "orthonav calibrate", mount_from_plain)
+
+
+def mount_from_plain(plain: Any) -> Mount:
+    """Inverse of `asdict`, checked; raises one of `calibrated.BROKEN` for an invalid mount."""
+    biases = {name: _bias(plain[name], name) for name in _LIMITS}
+    return Mount(**biases, views=int(plain["views"]))
+
+
+def logged_mount(options: Mapping[str, Any]) -> Mount | None:
+    """The mount among the options of a flight log, None for none. Raises `FlightError`."""
+    plain = options.get("mount")
+    try:
+        return None if plain is None else mount_from_plain(plain)
+    except BROKEN as error:
+        raise FlightError(f"flight log: invalid mount ({described(error)})") from error
+
+
+def _bias(plain: dict[str, Any], name: str) -> Bias:
+    bias = Bias(*(float(plain[each.name]) for each in fields(Bias)))
+    limit = _LIMITS[name]
+    if not (abs(bias.value) <= limit and 0 <= bias.std <= limit and 0 <= bias.scatter <= limit):
+        raise ValueError(f"{name} out of range")
+    return bias

@@ -1,0 +1,294 @@
+"""Measurements along a flight as time series, and telemetry interpolated at any time."""
+
+import math
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from orthonav.core.geo.attitude import AUTOPILOT_TILT_STD_DEG
+from orthonav.core.geo.camera import attitude_of
+from orthonav.core.records import Prior, Telemetry
+
+Array = NDArray[np.float64]
+DAY_NS = 86_400 * 10**9
+"""Samples farther than this from the median time are damaged, or of a clock that was not set."""
+LATEST_NS = 2**62
+"""Latest valid time (the year 2116): leaves room for offsets in 64 bits."""
+GAP_NS = 2_000_000_000
+"""Longest gap that is interpolated: an aircraft may turn and climb meanwhile."""
+
+
+@dataclass(frozen=True, eq=False)
+class TimeSeries:
+    """Values (N, D) at increasing times (N,) in integer ns."""
+
+    time_ns: NDArray[np.int64]
+    values: Array
+
+    def around(self, time_ns: int) -> tuple[int, int, float] | None:
+        """The samples before and after a time and the weight of the later one.
+
+        None outside the series and within gaps of more than `GAP_NS`.
+        """
+        after = int(np.searchsorted(self.time_ns, time_ns))
+        if after < len(self.time_ns) and self.time_ns[after] == time_ns:
+            return after, after, 0.0
+        if after in (0, len(self.time_ns)):
+            return None
+        start, end = int(self.time_ns[after - 1]), int(self.time_ns[after])
+        if end - start > GAP_NS:
+            return None
+        return after - 1, after, (time_ns - start) / (end - start)
+
+    def at(self, time_ns: int) -> Array:
+        """Values (D,) at a time, linear between samples; NaN where they are unknown."""
+        found = self.around(time_ns)
+        if found is None:
+            return np.full(self.values.shape[1], np.nan)
+        before, after, weight = found
+        return np.asarray((1 - weight) * self.values[before] + weight * self.values[after])
+
+    def mean(self, start_ns: int, end_ns: int) -> Array:
+        """Mean values (D,) from a time to a later one; NaN where they are unknown in between."""
+        inner = (self.time_ns > start_ns) & (self.time_ns < end_ns)
+        times = np.array([start_ns, *self.time_ns[inner].tolist(), end_ns])
+        steps = np.diff(times)
+        if steps.max() > GAP_NS:
+            return np.full(self.values.shape[1], np.nan)
+        values = np.stack([self.at(start_ns), *self.values[inner], self.at(end_ns)])
+        return np.average((values[1:] + values[:-1]) / 2, axis=0, weights=steps)
+
+
+class Samples:
+    """Collects samples in any order; `series` sorts them and drops those that are not finite."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._times = array("q")
+        self._values = array("d")
+
+    def add(self, time_ns: int, *values: float) -> None:
+        """One sample; an impossible time (a damaged message) is dropped."""
+        if abs(time_ns) > LATEST_NS:
+            return
+        self._times.append(time_ns)
+        self._values.extend(values)
+
+    def arrays(self) -> tuple[NDArray[np.int64], Array]:
+        """Times (N,) and values (N, D), in the order of `add`."""
+        return np.array(self._times, dtype=np.int64), np.array(self._values).reshape(
+            -1, self._width
+        )
+
+    def series(self) -> TimeSeries | None:
+        """The series, or None where there is no sample. The first of equal times counts."""
+        return series_of(*self.arrays())
+
+    def positions(self) -> TimeSeries | None:
+        """The same of (lat_deg, lon_deg, alt_m): see `position_series`."""
+        return position_series(*self.arrays())
+
+
+def series_of(time_ns: NDArray[np.int64], values: Array) -> TimeSeries | None:
+    """A series from times (N,) and values (N, D) in any order; None where none is finite."""
+    return _sorted(time_ns, values, np.asarray(np.isfinite(values).all(axis=1)))
+
+
+def attitude_series(
+    time_ns: NDArray[np.int64], rotations: Array, known: NDArray[np.bool_] | None = None
+) -> TimeSeries | None:
+    """An attitude series from `enu_from_camera` (N, 3, 3) and whether its heading is known (N,)."""
+    if len(time_ns) == 0:
+        return None
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    flags = np.ones(len(time_ns)) if known is None else known.astype(np.float64)
+    return series_of(time_ns, np.column_stack([quaternions, flags]))
+
+
+def attitude_of_angles(
+    samples: Samples, enu_from_angles: Callable[[Array], Array]
+) -> TimeSeries | None:
+    """An attitude series from samples of yaw, pitch, roll in degrees and their convention.
+
+    A heading of NaN is marked as unknown; samples without pitch and roll are dropped.
+    """
+    times, angles = samples.arrays()
+    sound = np.isfinite(angles[:, 1:]).all(axis=1)
+    known = np.isfinite(angles[sound, 0])
+    turns = np.where(np.isfinite(angles[sound]), angles[sound], 0.0)
+    return attitude_series(times[sound], enu_from_angles(turns), known) if sound.any() else None
+
+
+def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> TimeSeries | None:
+    """A series of (lat_deg, lon_deg, alt_m) that crosses the 180th meridian on the shorter side.
+
+    Altitudes may be NaN. Samples at 0, 0 are dropped: recorders write that for "no position".
+    """
+    sound = np.isfinite(latlonalt[:, :2]).all(axis=1) & latlonalt[:, :2].any(axis=1)
+    series = _sorted(time_ns, latlonalt, np.asarray(sound))
+    if series is not None:
+        series.values[:, 1] = np.unwrap(series.values[:, 1], period=360)
+    return series
+
+
+def altitude_series(position: TimeSeries | None) -> TimeSeries | None:
+    """The altitudes (N, 1) of a series of positions where they are known."""
+    return None if position is None else series_of(position.time_ns, position.values[:, 2:3])
+
+
+def _sorted(
+    time_ns: NDArray[np.int64], values: Array, sound: NDArray[np.bool_]
+) -> TimeSeries | None:
+    """A series of the valid samples within a day of their median time."""
+    if not sound.any():
+        return None
+    near = np.abs(time_ns - np.median(time_ns[sound])) < DAY_NS
+    times, first = np.unique(time_ns[sound & near], return_index=True)
+    return TimeSeries(times, values[sound & near][first])
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedTrack:
+    """Measurements along a flight; a series that is None was not recorded."""
+
+    attitude: TimeSeries | None
+    """Quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known."""
+    heights: tuple[TimeSeries, ...] = ()
+    """Metres above ground, as measured; of several series the more accurate first."""
+    home: TimeSeries | None = None
+    """Metres above the place of take-off."""
+    amsl: TimeSeries | None = None
+    """Metres above mean sea level."""
+    hae: TimeSeries | None = None
+    """Metres above the ellipsoid of WGS 84."""
+    position: TimeSeries | None = None
+    """Latitude and longitude in degrees, and the altitude in metres, whose reference differs."""
+    velocity: TimeSeries | None = None
+    """East and north, m/s."""
+    yaw_std: TimeSeries | None = None
+    """Reported standard deviation of the heading, degrees."""
+    agl_std: TimeSeries | None = None
+    """Reported standard deviation of the height, metres."""
+    tilt_std: TimeSeries | None = None
+    """Reported standard deviation of pitch and roll, degrees."""
+    tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
+    """The same by the kind of the source, where none was reported."""
+    prior: TimeSeries | None = None
+    """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
+    origin_ns: int = 0
+    """Time at which a recording without a clock begins."""
+    warnings: tuple[str, ...] = ()
+    """Doubts about the log, for people."""
+
+    @cached_property
+    def altitude(self) -> TimeSeries | None:
+        """Altitudes of one reference: as recorded with positions, else above mean sea level."""
+        recorded = altitude_series(self.position)
+        return self.amsl if recorded is None else recorded
+
+    @property
+    def take_off_latlon_deg(self) -> tuple[float, float] | None:
+        """The first position, taken as that of take-off; None without positions."""
+        return None if self.position is None else self.latlon_deg(int(self.position.time_ns[0]))
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """First and last time of its attitude or, without any, of heights or positions."""
+        recorded = (self.attitude, *self.heights, self.home, self.position)
+        series = next((one for one in recorded if one is not None), None)
+        return None if series is None else (int(series.time_ns[0]), int(series.time_ns[-1]))
+
+    def telemetry(self, time_ns: int, ground_alt_m: float | None = None) -> Telemetry:
+        """Telemetry at a time; `ground_alt_m` gives a height where only the altitude is known.
+
+        Where no height above ground was measured, it is the one above take-off.
+        """
+        yaw, pitch, roll = angles_at(self.attitude, time_ns)
+        tilt_std = _number(_at(self.tilt_std, time_ns, 1)[0])
+        if tilt_std is None and math.isfinite(pitch + roll):
+            tilt_std = self.tilt_std_deg
+        prior = _at(self.prior, time_ns, 3)
+        velocity = _at(self.velocity, time_ns, 2)
+        return Telemetry(
+            time_ns=time_ns,
+            yaw_deg=yaw,
+            pitch_deg=pitch,
+            roll_deg=roll,
+            agl_m=self._agl_m(time_ns, ground_alt_m),
+            yaw_std_deg=_number(_at(self.yaw_std, time_ns, 1)[0]),
+            agl_std_m=_number(_at(self.agl_std, time_ns, 1)[0]),
+            tilt_std_deg=tilt_std,
+            prior=Prior(*map(float, prior)) if np.isfinite(prior).all() else None,
+            vel_en_mps=(float(velocity[0]), float(velocity[1]))
+            if np.isfinite(velocity).all()
+            else None,
+            home_m=_number(_at(self.home, time_ns, 1)[0]),
+            amsl_m=_number(_at(self.amsl, time_ns, 1)[0]),
+            hae_m=_number(_at(self.hae, time_ns, 1)[0]),
+        )
+
+    def mean_velocity_en_mps(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
+        """Mean velocity from a time to a later one; None where it is unknown in between.
+
+        Without a sample in between it is the one at the end: a log with a row for each view.
+        """
+        series = self.velocity
+        if series is None:
+            return None
+        between = (series.time_ns > start_ns) & (series.time_ns < end_ns)
+        mean = series.mean(start_ns, end_ns) if between.any() else series.at(end_ns)
+        east, north = mean.tolist()
+        return (east, north) if math.isfinite(east + north) else None
+
+    def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
+        """Position by the aircraft's own GNSS receiver, or None."""
+        lat, lon, _ = _at(self.position, time_ns, 3)
+        if not math.isfinite(lat + lon):
+            return None
+        return float(lat), float((lon + 180) % 360 - 180)
+
+    def _agl_m(self, time_ns: int, ground_alt_m: float | None) -> float:
+        for series in (*self.heights, self.home):
+            height = measured(float(_at(series, time_ns, 1)[0]))
+            if math.isfinite(height):
+                return height
+        altitude = float(_at(self.altitude, time_ns, 1)[0])
+        if ground_alt_m is None or not math.isfinite(altitude):
+            return math.nan
+        return altitude - ground_alt_m
+
+
+def angles_at(attitude: TimeSeries | None, time_ns: int) -> tuple[float, float, float]:
+    """Heading, pitch and roll of the camera at a time, by spherical interpolation.
+
+    Where a neighbouring sample has no heading, the nearer sample is used and the heading is NaN.
+    """
+    found = None if attitude is None else attitude.around(time_ns)
+    if attitude is None or found is None:
+        return math.nan, math.nan, math.nan
+    before, after, weight = found
+    ends = attitude.values[[before, after]]
+    known = bool(ends[:, 4].all())
+    if before == after or not known:
+        rotation = Rotation.from_quat(ends[int(weight > 0.5), :4])
+    else:
+        rotation = Slerp([0.0, 1.0], Rotation.from_quat(ends[:, :4]))(weight)
+    yaw, pitch, roll = attitude_of(rotation.as_matrix())
+    return yaw if known else math.nan, pitch, roll
+
+
+def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
+    return np.full(width, np.nan) if series is None else series.at(time_ns)
+
+
+def measured(height_m: float) -> float:
+    """A height, NaN for 0, which recorders write where they measured none."""
+    return math.nan if height_m == 0 else height_m
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,321 @@
+"""The camera: lens (`orthonav.core.geo.lens`), attitude, and where it looks on flat ground.
+
+Camera axes: x to the right of the image, y down the image, z along the optical axis.
+Attitude: with heading, pitch and roll 0 the optical axis points straight down and the top of the
+image to the north. Heading turns clockwise from above; then, as for an aircraft (yaw, pitch, roll,
+Tait-Bryan Z-Y-X in the forward-right-down body), positive pitch makes the camera look ahead and
+positive roll makes it look left.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import CameraError
+from orthonav.core.geo import lens
+
+Array = NDArray[np.float64]
+MAX_DIMENSION_PX = 65_535
+MAX_FOCAL_STD = 0.5
+FOV_STD = 0.05
+"""Of a focal length by a stated field of view, as a share of it."""
+_BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
+_HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+_BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera: pinhole with Brown distortion, or fisheye.
+
+    Focal lengths and principal point in pixels, measured from the outer corner of the first pixel
+    (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
+    k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
+    OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
+    for a calibrated camera. Raises `CameraError` on values no camera has.
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+    model: str = "brown"
+    focal_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.distortion and not any(self.distortion):
+            object.__setattr__(self, "distortion", ())  # none at all, and faster
+        for name in ("width_px", "height_px"):
+            if not 1 <= getattr(self, name) <= MAX_DIMENSION_PX:
+                raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}: {self}")
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
+        if not all(math.isfinite(number) for number in numbers):
+            raise CameraError(f"camera has a value that is not finite: {self}")
+        if self.fx_px <= 0 or self.fy_px <= 0:
+            raise CameraError(f"camera focal length must be above 0 px: {self}")
+        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
+            raise CameraError(
+                f"camera focal_std must be a share of 0 to {MAX_FOCAL_STD}, got {self.focal_std}"
+            )
+        if self.model not in ("brown", "fisheye"):
+            raise CameraError(f"camera model must be brown or fisheye, got '{self.model}'")
+        allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN
+        if len(self.distortion) not in allowed:
+            raise CameraError(
+                f"camera distortion of a {self.model} lens must be empty or {names}, "
+                f"got {self.distortion}"
+            )
+
+    @classmethod
+    def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
+        """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
+
+        Stated fields of view are often those of the lens or of another mode: good to 5 %.
+        """
+        if not 0 < fov_deg < 180:
+            raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
+        focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
+        middle_px = width_px / 2, height_px / 2
+        return cls(width_px, height_px, focal_px, focal_px, *middle_px, focal_std=FOV_STD)
+
+    @classmethod
+    def from_matrix(
+        cls,
+        matrix: Array,
+        distortion: Sequence[float] | None,
+        size_px: tuple[int, int],
+        model: str = "brown",
+    ) -> "Camera":
+        """A camera by the matrix (3, 3) and the distortion of OpenCV's calibration.
+
+        `size_px`: width and height of the images that it was calibrated with.
+        """
+        k = np.asarray(matrix, np.float64)
+        if k.shape != (3, 3):
+            raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
+        # OpenCV counts from the centre of the first pixel.
+        numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
+        more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64)).tolist()
+        return cls(*size_px, *numbers, tuple(more), model)
+
+    @classmethod
+    def from_file(cls, path: Path | str) -> "Camera":
+        """The camera of a `flight.json`, or of a calibration of OpenCV, ROS or Kalibr.
+
+        Raises `MissingFileError`, `CameraError` or `MissingExtraError`.
+        """
+        from orthonav.core.geo.camera_files import read_camera_file  # the readers make cameras
+
+        return read_camera_file(Path(path))
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether straight lines stay straight, so that one homography does it."""
+        return self.model == "brown" and not self.distortion
+
+    @property
+    def matrix(self) -> Array:
+        """`px_from_camera`, (3, 3): pixel-is-area coordinates from camera axes, no distortion."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of what it sees straight ahead, in metres for each metre away."""
+        return self.width_px / self.fx_px, self.height_px / self.fy_px
+
+    def gsd_m(self, agl_m: float) -> float:
+        """Ground resolution in metres per pixel of a vertical view from `agl_m`."""
+        return agl_m / math.sqrt(self.fx_px * self.fy_px)
+
+    def fitted(self, width_px: int, height_px: int) -> "Camera":
+        """The camera for images of this size.
+
+        Raises `CameraError` where the aspect ratio differs: then the image is an unknown crop, not
+        a scaled version of the same view.
+        """
+        if (self.width_px, self.height_px) == (width_px, height_px):
+            return self
+        apart = abs(self.height_px * width_px - height_px * self.width_px)
+        if apart > max(self.width_px, width_px):
+            raise CameraError(
+                f"camera is {self.width_px} x {self.height_px} px, the image is {width_px} x "
+                f"{height_px} px, a size with another aspect ratio; calibrate in that mode"
+            )
+        return self.resized(width_px, height_px)
+
+    def resized(self, width_px: int, height_px: int) -> "Camera":
+        """The camera of the same picture resampled to another size."""
+        sx, sy = width_px / self.width_px, height_px / self.height_px
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            fx_px=self.fx_px * sx,
+            fy_px=self.fy_px * sy,
+            cx_px=self.cx_px * sx,
+            cy_px=self.cy_px * sy,
+        )
+
+
+@lru_cache(maxsize=64)
+def enu_from_camera(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+    """Rotation (3, 3) from camera axes to east, north, up; not to be written to."""
+    yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
+    ned_from_body = _rotation(2, yaw) @ _rotation(1, pitch) @ _rotation(0, roll)
+    rotation = np.asarray(_ENU_FROM_NED @ ned_from_body @ _BODY_FROM_CAMERA)
+    rotation.flags.writeable = False
+    return rotation
+
+
+def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
+    """Heading (0..360), pitch and roll in degrees of a rotation (3, 3) from camera axes.
+
+    The inverse of `enu_from_camera`. At a pitch of 90 or -90 only the sum or the difference of
+    heading and roll is determined; the roll is then 0.
+    """
+    ned_from_body = _ENU_FROM_NED.T @ enu_from_camera @ _BODY_FROM_CAMERA.T
+    pitch = math.asin(min(1.0, max(-1.0, -ned_from_body[2, 0])))
+    if math.hypot(ned_from_body[0, 0], ned_from_body[1, 0]) < 1e-9:
+        yaw, roll = math.atan2(-ned_from_body[0, 1], ned_from_body[1, 1]), 0.0
+    else:
+        yaw = math.atan2(ned_from_body[1, 0], ned_from_body[0, 0])
+        roll = math.atan2(ned_from_body[2, 1], ned_from_body[2, 2])
+    return math.degrees(yaw) % 360 % 360, math.degrees(pitch), math.degrees(roll)
+
+
+def _rotation(axis: int, angle_rad: float) -> Array:
+    """Right-handed rotation (3, 3) about coordinate axis 0, 1 or 2."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    first, second = [i for i in range(3) if i != axis]
+    rotation = np.eye(3)
+    rotation[first, first] = rotation[second, second] = cos
+    sign = -1.0 if axis == 1 else 1.0
+    rotation[first, second], rotation[second, first] = -sign * sin, sign * sin
+    return rotation
+
+
+def camera_from_en(yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float) -> Array:
+    """Homography (3, 3) from flat ground to camera axes.
+
+    Takes ground points (east, north, 1) in metres from the point below the camera; gives camera
+    axes up to scale, the third positive in front of the camera.
+    """
+    ground = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -agl_m]])
+    return np.asarray(enu_from_camera(yaw_deg, pitch_deg, roll_deg).T @ ground)
+
+
+def counted_from_centres(homography: Array) -> Array:
+    """A homography (3, 3) between pixel-is-area pictures, as OpenCV wants it.
+
+    Ours counts from the outer corner of the first pixel, OpenCV from its centre.
+    """
+    return np.asarray(np.linalg.inv(_HALF_PIXEL) @ homography @ _HALF_PIXEL)
+
+
+def axis_on_ground_en_m(
+    yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
+) -> tuple[float, float]:
+    """Where the optical axis meets flat ground, metres east and north of the camera.
+
+    Infinite where the axis points at or above the horizon.
+    """
+    axis = enu_from_camera(yaw_deg, pitch_deg, roll_deg)[:, 2]
+    if axis[2] >= -1e-9:
+        return math.inf, math.inf
+    reach = agl_m / -axis[2]
+    return float(axis[0] * reach), float(axis[1] * reach)
+
+
+def distort(camera: Camera, xy: Array) -> Array:
+    """Distorted camera-plane coordinates `(..., 2)` of ideal ones, as OpenCV's models give them.
+
+    Points beyond the radius where the model stops growing (it folds back there) become NaN.
+    """
+    if camera.is_pinhole:
+        return xy
+    if camera.model == "fisheye":
+        return lens.fisheye_distort(camera.distortion, xy)
+    return lens.brown_distort(camera.distortion, xy)
+
+
+def undistort(camera: Camera, xy: Array) -> Array:
+    """Ideal camera-plane coordinates `(..., 2)` of distorted ones: the inverse of `distort`.
+
+    Points that no ideal point is distorted to become NaN.
+    """
+    if camera.is_pinhole:
+        return xy
+    if camera.model == "fisheye":
+        return lens.fisheye_undistort(camera.distortion, xy)
+    return lens.brown_undistort(camera.distortion, xy)
+
+
+def seen_px(camera: Camera, rays: Array) -> Array:
+    """Image points (..., 2) of rays (..., 3) in camera axes; NaN behind the camera or the lens."""
+    ahead = rays[..., 2] > 1e-9
+    plane = rays[..., :2] / np.where(ahead, rays[..., 2], np.nan)[..., None]
+    seen = distort(camera, plane) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+    return np.asarray(seen)
+
+
+def footprint_en_m(
+    camera: Camera, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
+) -> Array:
+    """Ground positions (4, 2) of the image corners, metres from the point below the camera.
+
+    Order: top left, top right, bottom right, bottom left; distortion is left out. Raises
+    `CameraError` where a corner looks at or above the horizon.
+    """
+    corners = np.array(
+        [
+            [0, 0, 1.0],
+            [camera.width_px, 0, 1],
+            [camera.width_px, camera.height_px, 1],
+            [0, camera.height_px, 1],
+        ]
+    )
+    rays = corners @ np.linalg.inv(camera.matrix).T
+    enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
+    if (enu[:, 2] >= -1e-9).any():
+        raise CameraError("the horizon is in the view: it has no footprint on flat ground")
+    return np.asarray(enu[:, :2] * (agl_m / -enu[:, 2:3]))
+
+
+def ground_en_m(
+    camera: Camera, px: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
+) -> Array:
+    """Where image points (N, 2) lie on flat ground (N, 2), metres from the point below the camera.
+
+    NaN where a point looks at or above the horizon, or where the lens cannot be undone.
+    """
+    return met_by_rays_en_m(camera_rays(camera, px), yaw_deg, pitch_deg, roll_deg, agl_m)
+
+
+def camera_rays(camera: Camera, px: Array) -> Array:
+    """Rays (N, 3) in camera axes, 1 along the optical axis, through image points (N, 2).
+
+    NaN where the lens cannot be undone.
+    """
+    plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
+
+
+def met_by_rays_en_m(
+    rays: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
+) -> Array:
+    """Where rays (N, 3) in camera axes meet flat ground (N, 2), metres from the point below.
+
+    NaN where a ray points at or above the horizon.
+    """
+    enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
+    down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
+    return np.asarray(enu[:, :2] * (agl_m / down))

@@ -1,0 +1,121 @@
+"""The tile grid of a sheet: positions and spacing of reference tiles of `tile_px` pixels."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import AreaError
+
+MAX_TILE_PX = 4096
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Overlapping square tiles on the pixel raster of a sheet, north up.
+
+    The raster's outer north-west corner lies at `west_m, north_m` in the sheet; the tile of grid
+    row i and column j covers pixel rows `i * stride_px` to `i * stride_px + tile_px` (columns
+    alike). Every point of the extent it was made for lies within half a stride, per axis, of a
+    tile centre.
+    """
+
+    west_m: float
+    north_m: float
+    gsd_m: float
+    tile_px: int
+    stride_px: int
+    rows: int
+    cols: int
+
+    @classmethod
+    def covering(
+        cls,
+        extent_en_m: tuple[float, float, float, float],
+        *,
+        gsd_m: float,
+        tile_px: int,
+        overlap: float,
+    ) -> "TileGrid":
+        """Grid whose tile centres cover `extent_en_m` (west, south, east, north, metres).
+
+        `overlap` is the share of its width that a tile has in common with its neighbour.
+        Raises `AreaError` for impossible numbers or an empty extent.
+        """
+        west, south, east, north = extent_en_m
+        if not (np.isfinite(gsd_m) and gsd_m > 0):
+            raise AreaError(f"ground resolution must be above 0 m per pixel, got {gsd_m}")
+        if not 16 <= tile_px <= MAX_TILE_PX:
+            raise AreaError(f"tiles must be 16 to {MAX_TILE_PX} px across, got {tile_px}")
+        if not 0 <= overlap < 1:
+            raise AreaError(f"overlap must be at least 0 and below 1, got {overlap}")
+        if not (np.isfinite(extent_en_m).all() and east >= west and north >= south):
+            raise AreaError(
+                f"area is empty or not finite: west, south, east, north {extent_en_m} m"
+            )
+        stride_px = max(1, round(tile_px * (1 - overlap)))
+        stride_m = stride_px * gsd_m
+        cols = max(1, int(np.ceil((east - west) / stride_m - 1e-9)))
+        rows = max(1, int(np.ceil((north - south) / stride_m - 1e-9)))
+        half_m = tile_px * gsd_m / 2
+        return cls(
+            west_m=(west + east) / 2 - (cols - 1) * stride_m / 2 - half_m,
+            north_m=(south + north) / 2 + (rows - 1) * stride_m / 2 + half_m,
+            gsd_m=gsd_m,
+            tile_px=tile_px,
+            stride_px=stride_px,
+            rows=rows,
+            cols=cols,
+        )
+
+    @property
+    def stride_m(self) -> float:
+        """Distance between neighbouring tile centres in metres."""
+        return self.stride_px * self.gsd_m
+
+    @property
+    def tile_m(self) -> float:
+        """Width of a tile in metres."""
+        return self.tile_px * self.gsd_m
+
+    @property
+    def width_px(self) -> int:
+        """Columns of the raster that all tiles together cover."""
+        return (self.cols - 1) * self.stride_px + self.tile_px
+
+    @property
+    def height_px(self) -> int:
+        """Rows of the raster that all tiles together cover."""
+        return (self.rows - 1) * self.stride_px + self.tile_px
+
+    @property
+    def extent_en_m(self) -> tuple[float, float, float, float]:
+        """West, south, east and north of that raster, metres in the sheet."""
+        return (
+            self.west_m,
+            self.north_m - self.height_px * self.gsd_m,
+            self.west_m + self.width_px * self.gsd_m,
+            self.north_m,
+        )
+
+    def tiles_rc(self, centres_en_m: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
+        """Grid rows and columns (N, 2) of tile centres (N, 2): inverse of `centres_en_m`."""
+        centres = np.asarray(centres_en_m, dtype=np.float64)
+        half_m = self.tile_m / 2
+        rows = (self.north_m - half_m - centres[:, 1]) / self.stride_m
+        cols = (centres[:, 0] - self.west_m - half_m) / self.stride_m
+        with np.errstate(invalid="ignore"):  # NaN becomes a row far outside
+            return np.rint(np.stack([rows, cols], axis=1)).astype(np.intp)
+
+    def centres_en_m(self, tiles_rc: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Local `(N, 2)` centres in metres of tiles given as `(N, 2)` grid rows and columns."""
+        tiles = np.asarray(tiles_rc, dtype=np.float64)
+        half_m = self.tile_m / 2
+        return np.stack(
+            [
+                self.west_m + tiles[:, 1] * self.stride_m + half_m,
+                self.north_m - tiles[:, 0] * self.stride_m - half_m,
+            ],
+            axis=1,
+        )

@@ -1,0 +1,109 @@
+"""Heights of the ground as a function of positions, and their mean and spread over an area."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.geo.frames import LocalFrame
+
+Array = NDArray[np.float64]
+TerrainHeights = Callable[[Array, Array], Array]
+"""Function of latitudes and longitudes (deg) of one shape: heights above mean sea level (m), NaN
+where they are unknown."""
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Heights of the ground above mean sea level: the Dead Sea is at -430 m, Mount Everest at 8,849."""
+SIGHT_STEPS = 512
+"""Points along a line of sight at which it is compared with the ground."""
+DEEPEST_M = 1000.0
+_RINGS = 5
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground below a position that is known to some metres.
+
+    `height_m`: its mean height above mean sea level. `std_m`: standard deviation of that height
+    over the possible positions. `known`: share of them whose height is known, above 0.
+    """
+
+    height_m: float
+    std_m: float
+    known: float
+
+
+def ground_over(terrain: TerrainHeights, lat_deg: Array, lon_deg: Array) -> Ground | None:
+    """The ground at equally probable positions; None where no height is known."""
+    heights = terrain(lat_deg, lon_deg)
+    known = heights[np.isfinite(heights)]
+    if not known.size:
+        return None
+    share = known.size / heights.size
+    return Ground(float(known.mean()), float(known.std()), share)
+
+
+def ground_around(
+    terrain: TerrainHeights, place_deg: tuple[float, float], std_m: float
+) -> Ground | None:
+    """The ground at a position (latitude, longitude) with a standard deviation per axis.
+
+    The position is spread evenly over a disc of that standard deviation. None where no height is
+    known.
+    """
+    if std_m <= 0:
+        return ground_over(terrain, np.array([place_deg[0]]), np.array([place_deg[1]]))
+    lat, lon = LocalFrame(*place_deg).latlon_from_en(2 * std_m * _DISC)
+    return ground_over(terrain, lat, lon)
+
+
+def bilinear(heights: Array, col: Array, row: Array) -> Array:
+    """Heights at fractional samples (0, 0 is the first); NaN beyond half a sample outside.
+
+    A position between samples of which one is unknown is unknown.
+    """
+    rows, cols = heights.shape
+    beyond = ~((col >= -0.5) & (col <= cols - 0.5) & (row >= -0.5) & (row <= rows - 0.5))
+    col = np.clip(np.where(beyond, 0, col), 0, cols - 1)
+    row = np.clip(np.where(beyond, 0, row), 0, rows - 1)
+    left, top = np.floor(col).astype(np.intp), np.floor(row).astype(np.intp)
+    right, bottom = np.minimum(left + 1, cols - 1), np.minimum(top + 1, rows - 1)
+    x, y = col - left, row - top
+    found = (1 - y) * ((1 - x) * heights[top, left] + x * heights[top, right]) + y * (
+        (1 - x) * heights[bottom, left] + x * heights[bottom, right]
+    )
+    return np.where(beyond, np.nan, found)
+
+
+def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:
+    """Metres east and north of a camera (2,) where a line of sight first meets the ground.
+
+    `slope_en` (2,): how far it goes for each metre that it descends. `height_m`: of the camera,
+    `ground_m`: of the ground at metres east and north of the camera (N, 2), over the same level.
+    The ground is sought down to `DEEPEST_M` below that under the camera. NaN where it is not met,
+    or behind unknown ground.
+    """
+    below_m = float(ground_m(np.zeros((1, 2)))[0])
+    drops = np.linspace(0.0, height_m - below_m + DEEPEST_M, SIGHT_STEPS)
+    above = height_m - drops - ground_m(drops[:, None] * slope_en)
+    reached = np.flatnonzero(above <= 0)
+    if not reached.size or reached[0] == 0 or not np.isfinite(above[: reached[0]]).all():
+        return np.full(2, np.nan)
+    last, first = above[reached[0] - 1], above[reached[0]]
+    drop = drops[reached[0] - 1] + (drops[1] - drops[0]) * last / (last - first)
+    return np.asarray(slope_en * drop)
+
+
+def _disc() -> Array:
+    """Points (N, 2) spread evenly over the unit disc, its centre first."""
+    points = [(0.0, 0.0)]
+    for ring in range(1, _RINGS + 1):
+        # Rings of equal area per point: the radius is that of the middle of each ring.
+        radius = ring / (_RINGS + 0.5)
+        turns = np.arange(6 * ring) * (2 * math.pi / (6 * ring)) + ring
+        points += list(zip(radius * np.cos(turns), radius * np.sin(turns), strict=True))
+    return np.array(points)
+
+
+_DISC = _disc()

@@ -1,0 +1,359 @@
+"""The plan of the search: which candidates to collect for a view, in which order, at what cost.
+
+A view is judged at one level of the map, where it is some 72 px across (`Levels.look`). There are
+three sources of candidates:
+
+- the *judged level* by FFT: the only one that misses nothing, and the slowest on a large area;
+- the *coarse level*, one above it, by FFT: a quarter of the pixels; or, on large areas, the level
+  above that one, whose candidates are compared at the coarse level near by;
+- the *tiles* whose embeddings are most similar to the view.
+
+Where the judged level is cheap (a prior, a small sheet) only that one is searched. Elsewhere the
+cheaper of the other two comes first; the next one follows only while the best place does not stand
+out, and only if its estimated cost is acceptable. With an unknown heading both try the likely
+scales first. At the judged level headings and scales come in stages, the most likely first, so that
+an ordinary view ends after the first stage. Where position, heading and scale are known so well
+that the *final level*, one below, is cheap too, it comes last, unless a place is proven before:
+weak texture, such as that of bare ground, is only seen there.
+
+This file decides; `view_search` executes.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+from orthonav.core.register.registrar import Levels, PosePrior
+from orthonav.core.register.search import bank
+
+
+class ClearMargin(NamedTuple):
+    """How far a place must stand out for the search to end with it.
+
+    `strength`: score over that of chance. `look_ratio`, `peak_ratio`: score over that of the
+    strongest rival, at the judged level and after finishing.
+    """
+
+    strength: float
+    look_ratio: float
+    peak_ratio: float
+
+
+CLEAR = ClearMargin(2.2, 1.9, 1.9)
+CLEAR_AT_JUDGED = ClearMargin(1.8, 1.5, 1.5)
+CLEAR_AFTER_TRIAL = ClearMargin(1.8, 1.25, 1.25)
+
+Pose = tuple[float, float]
+"""Heading (rad, clockwise from north) and natural logarithm of the scale."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """One search to run.
+
+    `level`: level of the map at which candidates are found (those of tiles: refined first).
+    `poses`: headings and log scales to try. `from_tiles`: by embeddings of tiles, else by FFT.
+    `candidates`: at most so many are taken. `cost_ms`: its estimated cost.
+    """
+
+    level: int
+    poses: list[Pose]
+    from_tiles: bool
+    candidates: int
+    cost_ms: float
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """Parameters of the search.
+
+    Costs are rough estimates for one core of a desktop and only choose between searches. Where no
+    other source is named, a value was chosen on the scenes of `python -m benchmarks.real_imagery`
+    (docs/benchmarks.md).
+    """
+
+    turn_step_rad: float = math.radians(8.0)
+    """Spacing of headings at the coarse level and for tiles, whose candidates are refined there
+    first; docs/decisions/registration.md, 6."""
+    scale_step: float = 0.13
+    """Spacing of log scales there; docs/decisions/registration.md, 6."""
+    judged_turn_step_rad: float = math.radians(6.0)
+    """Spacing of headings at the judged level: 8 deg lose 2 to 6 points of views there;
+    docs/decisions/registration.md, 6."""
+    judged_scale_step: float = 0.09
+    """Spacing of log scales at the judged level; docs/decisions/registration.md, 6."""
+    final_turn_step_rad: float = math.radians(3.0)
+    """Spacing of headings at the final level, half of that at the judged one."""
+    final_scale_step: float = 0.045
+    """Spacing of log scales there, half of that at the judged level."""
+    bank_sigmas: float = 3.0
+    """Headings and scales reach so many standard deviations of the telemetry."""
+    max_nats: float = 5.5
+    """Poses less likely than this (negative log density, 0 at the peak) are not tried: it rounds
+    off the corners of the bank, where heading and scale are both far off."""
+    stages_nats: tuple[float, ...] = (-1.0, 0.4, 2.0, math.inf)
+    """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
+    likely_nats: float = 1.0
+    """With an unknown heading, poses within so many nats come first at the coarse level and for
+    tiles: their scales are those of nine views in ten; docs/decisions/registration.md, 19."""
+    last_stage_ms: float = 60.0
+    """The last stage, poses that one view in seven has, is left out where it would cost more and
+    the coarse level has tried them; docs/decisions/registration.md, 18."""
+    candidates: int = 24
+    """Candidates of a search by FFT at the coarse level."""
+    far_candidates: int = 400
+    """Candidates of a search by FFT one level above the coarse one;
+    docs/decisions/registration.md, 15."""
+    far_reach_px: float = 1.5
+    """Their place is sought within so many pixels of that level."""
+    stage_candidates: int = 24
+    """Candidates of one stage at the judged level; docs/decisions/registration.md, 13."""
+    final_candidates: int = 2
+    """Candidates of a search at the final level: each is finished."""
+    tile_candidates: tuple[int, int] = (20, 400)
+    """Least and largest number of candidates from tiles; docs/decisions/registration.md, 15."""
+    tiles_per_candidate: int = 200
+    """Between these, one candidate for so many tiles: the right one ranks lower among more."""
+    tile_share_per_nat: float = 0.03
+    """Share of its similarity that a tile loses with every nat by which the telemetry contradicts
+    its pose; docs/decisions/registration.md, 14."""
+    tile_reach_strides: float = 1.1
+    """The place of a candidate from tiles is sought within so many strides of the tile grid."""
+    nearby_log_scales: tuple[float, ...] = (-0.13, 0.0, 0.13)
+    """Candidates from tiles and from above the coarse level are compared there under their log
+    scale plus each of these, the best of which counts: their scale is hardly known;
+    docs/decisions/registration.md, 15."""
+    view_tiles: tuple[float, float] = (0.6, 2.5)
+    """Least and largest side of a view, in tiles, for which tiles are asked: below, most of a tile
+    is missing; above, most of the view is unused."""
+    min_candidates: int = 6
+    """So many candidates are always kept, for the evidence needs rivals."""
+    candidate_share: float = 0.5
+    """Weaker candidates than this share of the best are dropped."""
+    clear: ClearMargin = CLEAR
+    """The search ends with a place that stands out so far. Views of other places reach a ratio of
+    1.4, rarely 1.6; docs/decisions/registration.md, 10."""
+    clear_at_judged: ClearMargin = CLEAR_AT_JUDGED
+    """The same once the judged level was searched, if only in part: it misses least. Also after
+    tiles, where the place is confident as well: there can be more of them than places at the judged
+    level that could be searched."""
+    doubt: float = 0.01
+    """A place with a confidence above one minus this is proven."""
+    finer: tuple[tuple[int, float], ...] = ((3, 25.0), (48, 90.0))
+    """Until it is, so many candidates are finished and the best of them compared one level finer,
+    with the estimated cost (ms): matches by chance lose more in detail, so that the right place may
+    be far down the list of the judged level; docs/decisions/registration.md, 13."""
+    cheap_ms: float = 14.0
+    """Up to this cost the judged level is searched at once, and nothing else."""
+    last_ms: float = 900.0
+    """A second search is left out where it would cost more: the limit of about a second for a view
+    on a large area (README)."""
+    max_search_px: int = 8_000_000
+    """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
+    tiles, or with a prior."""
+    terrain_candidates: int = 48
+    """At most so many candidates are placed on the terrain, the best that lie apart."""
+    trials: int = 3
+    """Before a search that costs more than a trial, so many of the best candidates are placed on
+    the terrain and finished, and compared one level finer where that proves none. The search ends
+    if one is proven; docs/decisions/registration.md, 14 and 18."""
+    trial_doubt: float = 0.002
+    """A trial proves a place with a confidence above one minus this: its rivals were not all
+    searched. Before the final level they were, and `doubt` counts."""
+    trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
+    """Where a trial compares only a part of all places, or only a few on the terrain, the place
+    must also stand out so far; docs/decisions/registration.md, 14."""
+    trial_ms: float = 25.0
+    terrain_trial_ms: float = 60.0
+    """Estimated cost of a trial, on level ground and on a terrain."""
+    budget_ms: float = math.inf
+    """No search after the first one is begun that would end later than this after the first one
+    began, ms; the best place so far is the answer."""
+    threads: int = 1
+    """Threads that share the poses of a search and the candidates."""
+    fft_pose_ms: float = 0.01
+    """Estimated cost of one pose of an FFT search, whatever its size."""
+    fft_pixel_ms: float = 2.2e-7
+    """Estimated cost of one pixel of the window under one pose, times the logarithm (base 2) of
+    the number of pixels."""
+    tile_view_ms: float = 4.0
+    """Estimated cost of representing a view for its embeddings."""
+    tile_pose_ms: float = 0.06
+    """Estimated cost of embedding the view under one pose."""
+    tile_score_ms: float = 5e-8
+    """Estimated cost of one number of one tile's embedding under one pose."""
+    nearby_ms: float = 0.2
+    """Estimated cost of the place of one candidate from tiles or from above the coarse level."""
+
+    def fft_ms(self, poses: int, rows: int, cols: int) -> float:
+        """Estimated cost of an FFT search of a window; infinite where it is too large."""
+        pixels = float(rows * cols)
+        if pixels > self.max_search_px:
+            return math.inf
+        return poses * (self.fft_pose_ms + self.fft_pixel_ms * pixels * math.log2(pixels))
+
+    def tiles_ms(self, poses: int, tiles: int, dims: int) -> float:
+        """Estimated cost of the most similar of so many tiles with embeddings of `dims` numbers."""
+        return self.tile_view_ms + poses * (self.tile_pose_ms + self.tile_score_ms * tiles * dims)
+
+    def candidates_from(self, tiles: int) -> int:
+        """Number of candidates to take from so many tiles."""
+        least, most = self.tile_candidates
+        return max(least, min(most, round(tiles / self.tiles_per_candidate)))
+
+    def doubt_passes(self, levels: Levels) -> tuple[tuple[int, float], ...]:
+        """The passes of `finer` for a view: without a finer level only that of most candidates,
+        which are finished; none where candidates are finished at the level they are judged at."""
+        if levels.final == levels.look:
+            return ()
+        return self.finer if levels.final > 0 else self.finer[-1:]
+
+    def enough(self, run: Search, levels: Levels) -> ClearMargin:
+        """The margin that ends the search after `run`."""
+        fine = run.from_tiles or run.level == levels.look
+        return self.clear_at_judged if fine else self.clear
+
+    def searches(
+        self,
+        levels: Levels,
+        prior: PosePrior,
+        fft_ms: Callable[[int, int], float],
+        tiles: Callable[[], tuple[int, int]],
+    ) -> Iterator[Search]:
+        """The searches for a view, to be run in this order until its place stands out.
+
+        `fft_ms(level, poses)` is an estimated cost, infinite where a search is impossible.
+        `tiles()`: how many to compare with the view, and how many numbers their embeddings have.
+        """
+        rated = self._poses(prior, self.turn_step_rad, self.scale_step)
+        rough = [pose for pose, _ in rated]
+        likely = self._likely(prior, rated)
+        fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)
+        judged_ms = fft_ms(levels.look, len(fine))
+        tried_all = False
+        if judged_ms > self.cheap_ms:
+            both = [self._coarse(levels, rough, fft_ms)]
+            near, dims = tiles()
+            if near:
+                count = self.candidates_from(near)
+                cost_ms = self.tiles_ms(len(rough), near, dims) + self.nearby_ms * count
+                both.append(Search(levels.coarse, rough, True, count, cost_ms))
+            # The cheaper one wherever it is possible; the other only where it can be afforded.
+            affordable = 0.0 if judged_ms <= self.last_ms else self.last_ms
+            for number, each in enumerate(sorted(both, key=lambda each: each.cost_ms)):
+                if math.isinf(each.cost_ms) or (number and each.cost_ms > affordable):
+                    break
+                # Over relief the expected scale is another one at every place.
+                tried_all |= not each.from_tiles and prior.scale_map is None
+                yield from self._in_stages(each, likely)
+        if judged_ms <= max(self.last_ms, self.cheap_ms):
+            for least, most in pairwise(self.stages_nats):
+                stage = [pose for pose, nats in fine if least < nats <= most]
+                cost_ms = fft_ms(levels.look, len(stage))
+                is_last = most == self.stages_nats[-1]
+                if is_last and tried_all and cost_ms > self.last_stage_ms:
+                    break
+                if stage:
+                    yield Search(levels.look, stage, False, self.stage_candidates, cost_ms)
+        final = self._poses(prior, self.final_turn_step_rad, self.final_scale_step)
+        final_ms = fft_ms(levels.final, len(final))
+        if levels.final < levels.look and final_ms <= self.cheap_ms:
+            poses = [pose for pose, _ in final]
+            yield Search(levels.final, poses, False, self.final_candidates, final_ms)
+
+    def _likely(self, prior: PosePrior, rated: list[tuple[Pose, float]]) -> int:
+        """Number of poses, most likely first, that come first: all with a known heading."""
+        if prior.turn_rad is not None:
+            return len(rated)
+        return sum(nats <= self.likely_nats for _, nats in rated)
+
+    @staticmethod
+    def _in_stages(run: Search, likely: int) -> Iterator[Search]:
+        """A search under its first `likely` poses, then under the others."""
+        for poses in (run.poses[:likely], run.poses[likely:]):
+            if poses:
+                share = len(poses) / len(run.poses)
+                yield replace(run, poses=poses, cost_ms=run.cost_ms * share)
+
+    def _coarse(
+        self, levels: Levels, poses: list[Pose], fft_ms: Callable[[int, int], float]
+    ) -> Search:
+        """The search of the coarse level; one level above it where that takes too long."""
+        cost_ms = fft_ms(levels.coarse, len(poses))
+        if cost_ms <= self.last_ms:
+            return Search(levels.coarse, poses, False, self.candidates, cost_ms)
+        far, count = levels.coarse + 1, self.far_candidates
+        far_ms = fft_ms(far, len(poses)) + self.nearby_ms * count
+        if math.isinf(far_ms):  # there is no such level
+            return Search(levels.coarse, poses, False, self.candidates, cost_ms)
+        return Search(far, poses, False, count, far_ms)
+
+    def _poses(
+        self, prior: PosePrior, turn_step_rad: float, scale_step: float
+    ) -> list[tuple[Pose, float]]:
+        """Poses to try, each with its negative log density in nats, the most likely first."""
+        turn_std_rad = None if prior.turn_rad is None else prior.turn_std_rad
+        steps = turn_step_rad, scale_step, self.bank_sigmas
+        reported = prior.turn_rad or 0.0
+        return [
+            ((reported + turn, log_scale), nats)
+            for turn, log_scale, nats in _likely_poses(turn_std_rad, prior.log_scale_std, *steps)
+            if nats <= self.max_nats
+        ]
+
+
+@lru_cache(64)
+def _likely_poses(
+    turn_std_rad: float | None,
+    log_scale_std: float,
+    turn_step_rad: float,
+    scale_step: float,
+    sigmas: float,
+) -> list[tuple[float, float, float]]:
+    """Turns from the reported heading and log scales, each with its negative log density in nats,
+    the most likely first. Cached: the standard deviations are mostly those of the view before."""
+    made = bank(
+        turn_std_rad,
+        log_scale_std,
+        turn_step_rad=turn_step_rad,
+        scale_step=scale_step,
+        sigmas=sigmas,
+    )
+    known = turn_std_rad is not None
+    prior = PosePrior(0.0 if known else None, turn_std_rad or 0.0, log_scale_std)
+    cell = turn_step_rad / 2, scale_step / 2
+    rated = [(*pose, prior.nats(*pose, within=cell)) for pose in made.poses]
+    return sorted(rated, key=lambda each: each[2])
+
+
+class Budget:
+    """Time that the searches of a view may take. Estimates are corrected by what they took."""
+
+    def __init__(self, budget_ms: float) -> None:
+        self._budget_ms, self._begun_s = budget_ms, time.monotonic()
+        self._estimated_ms: float | None = None
+        self.cut_short = False
+
+    def fits(self, cost_ms: float) -> bool:
+        """Whether what has an estimated cost would end in time; what comes first always does."""
+        if self._estimated_ms is None:
+            return True
+        spent_ms = 1e3 * (time.monotonic() - self._begun_s)
+        pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
+        return not spent_ms + pace * cost_ms > self._budget_ms  # NaN where nothing took time yet
+
+    def allows(self, cost_ms: float) -> bool:
+        """Whether to begin a search of an estimated cost; without it, the search is cut short."""
+        if not self.fits(cost_ms):
+            self.cut_short = True
+            return False
+        self._estimated_ms = (self._estimated_ms or 0.0) + cost_ms
+        return True
+
+
+DEFAULT_PLAN = SearchPlan()
+"""What flies."""

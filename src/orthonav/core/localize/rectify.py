@@ -1,0 +1,266 @@
+"""Rectifying a view: as if the camera had looked straight down, north up, at the map's resolution.
+
+The ground is taken as flat. Rolling shutter is ignored.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import CameraError
+from orthonav.core.geo.camera import (
+    Camera,
+    axis_on_ground_en_m,
+    camera_from_en,
+    counted_from_centres,
+    enu_from_camera,
+    footprint_en_m,
+    ground_en_m,
+    seen_px,
+)
+from orthonav.core.localize.orthorectify import MAX_COARSER, Orientation, node_px, orthorectified
+from orthonav.core.records import Telemetry, View
+
+MAX_REACH = 2.0
+MAX_NEAR_NADIR_DEG = 45.0
+"""Views farther off nadir are used in part."""
+NEAR_CELLS = 32
+"""Cells along both sides of a picture in which it is found out how finely it sees the ground."""
+EDGE_PX = 1e-6
+NODE_PX, NODE_ERROR_PX = 4, 0.02
+"""The lens is computed at every so many pixels where that makes no more difference than this."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedView:
+    """A view as a vertical, north-up or heading-up picture at one ground resolution.
+
+    `grey` (H, W) uint8 and `valid` (H, W) bool, grey 0 where not valid; `offset_en_m` where the
+    centre of the window lies, metres east and north of the camera.
+    """
+
+    grey: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    offset_en_m: Array
+
+
+def is_oblique(view: View) -> bool:
+    """Whether a view is far off nadir, or its picture does not hold its principal point: its part
+    near enough is then rectified (`near_part`)."""
+    camera = view.camera
+    inside = 0 <= camera.cx_px <= camera.width_px and 0 <= camera.cy_px <= camera.height_px
+    return not inside or off_nadir_deg(view.telemetry) > MAX_NEAR_NADIR_DEG
+
+
+def off_nadir_deg(telemetry: Telemetry) -> float:
+    """Angle between the optical axis and straight down, degrees."""
+    up = enu_from_camera(0.0, telemetry.pitch_deg, telemetry.roll_deg)[2, 2]
+    return math.degrees(math.acos(max(-1.0, min(1.0, -float(up)))))
+
+
+@dataclass(frozen=True)
+class NearPart:
+    """The part of a view that is seen finely enough, on flat ground, for a heading of 0.
+
+    `low_m`, `high_m`: its box, metres east and north of the camera. `area_m2`: what of the box is
+    seen. `finest_m`: side of the finest pixel on the ground.
+    """
+
+    low_m: Array
+    high_m: Array
+    area_m2: float
+    finest_m: float
+
+
+def near_part(view: View, gsd_m: float) -> NearPart | None:
+    """The part of a view that is not much coarser than its finest one and than `gsd_m`; None where
+    it sees no ground."""
+    camera, telemetry = view.camera, view.telemetry
+    cells = [np.linspace(0, side, NEAR_CELLS + 1) for side in (camera.width_px, camera.height_px)]
+    px = np.stack(np.meshgrid(*cells), axis=-1).reshape(-1, 2)
+    angles = 0.0, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    ground = ground_en_m(camera, px, *angles).reshape(NEAR_CELLS + 1, NEAR_CELLS + 1, 2)
+    along, down = ground[1:, 1:] - ground[:-1, :-1], ground[1:, :-1] - ground[:-1, 1:]
+    with np.errstate(invalid="ignore"):
+        # Half the product of the diagonals of each cell.
+        area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]) / 2
+        pixel_m = np.sqrt(area * (NEAR_CELLS**2 / (camera.width_px * camera.height_px)))
+        finest_m = float(np.nanmin(pixel_m, initial=math.inf))
+        used = pixel_m <= MAX_COARSER * max(finest_m, gsd_m)
+    if not used.any():
+        return None
+    corners = np.stack([ground[:-1, :-1][used], ground[1:, 1:][used], ground[:-1, 1:][used]])
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    return NearPart(low, high, float(area[used].sum()), finest_m)
+
+
+def downsampled(view: View, gsd_m: float) -> View:
+    """The view averaged down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
+    camera, agl_m = view.camera, view.telemetry.agl_m
+    pixel_m = camera.gsd_m(agl_m)
+    if is_oblique(view) and (near := near_part(view, gsd_m)) is not None:
+        pixel_m = near.finest_m
+    factor = int(gsd_m / max(pixel_m, 1e-9))  # heights may be absurd, not yet refused
+    width, height = camera.width_px // max(1, factor), camera.height_px // max(1, factor)
+    if factor < 2 or width < 8 or height < 8:
+        return view
+    # Whole multiples only: what is left over at the right and below is not worth a slower path.
+    whole = replace(camera, width_px=width * factor, height_px=height * factor)
+    used = view.grey[: whole.height_px, : whole.width_px]
+    thinned = cv2.resize(used, (width, height), interpolation=cv2.INTER_AREA)
+    grey = np.asarray(thinned, dtype=np.uint8)
+    return replace(view, grey=grey, camera=whole.resized(width, height))
+
+
+def rectify(view: View, *, gsd_m: float, size_px: int) -> RectifiedView:
+    """A square of `size_px` pixels, north up, around the point where the optical axis meets ground.
+
+    The axis must point below the horizon. Pixels that the camera did not see are not valid.
+    """
+    telemetry = view.telemetry
+    attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    offset = np.array(axis_on_ground_en_m(*attitude))
+    grey, valid = _window(view, attitude, offset, gsd_m, (size_px, size_px))
+    return RectifiedView(grey, valid, offset)
+
+
+def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> RectifiedView:
+    """Rectify what the camera sees, its own heading up, sides whole multiples of `multiple_px`.
+
+    What is left over of the sides is cut off, so that a vertical view has no pixels not seen.
+    Where the view reaches far out to one side (it tilts), no more than `MAX_REACH` times the half
+    sides of a vertical view are kept on either side of the optical axis. The `offset_en_m` is that
+    of a heading of 0.
+    """
+    camera, telemetry = view.camera, view.telemetry
+    pitch_deg, roll_deg, agl_m = telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    if is_oblique(view):
+        return _rectify_near(view, gsd_m, multiple_px)
+    axis = np.array(axis_on_ground_en_m(0.0, pitch_deg, roll_deg, agl_m))
+    half_m = np.array(camera.extent) * agl_m / 2
+    low, high = axis - MAX_REACH * half_m, axis + MAX_REACH * half_m
+    try:
+        corners = footprint_en_m(camera, 0.0, pitch_deg, roll_deg, agl_m)
+        low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0))
+    except CameraError:
+        pass  # the horizon is in the view: as far as it may reach
+    width, height = (
+        max(1, int(side / gsd_m / multiple_px + 1e-6)) * multiple_px for side in high - low
+    )
+    middle = (low + high) / 2
+    attitude = 0.0, pitch_deg, roll_deg, agl_m
+    grey, valid = _window(view, attitude, middle, gsd_m, (height, width))
+    return RectifiedView(grey, valid, middle)
+
+
+def _rectify_near(view: View, gsd_m: float, multiple_px: int) -> RectifiedView:
+    """The part of a view that is seen finely enough, its own heading up."""
+    telemetry, near = view.telemetry, near_part(view, gsd_m)
+    if near is None:
+        empty = np.zeros((multiple_px, multiple_px), np.uint8)
+        return RectifiedView(empty, empty > 0, np.zeros(2))
+    middle = (near.low_m + near.high_m) / 2
+    width, height = (
+        max(1, int(side / gsd_m / multiple_px)) * multiple_px for side in near.high_m - near.low_m
+    )
+    px = node_px((height, width)) - [width / 2, height / 2]
+    nodes = np.dstack([middle + px * [gsd_m, -gsd_m], np.zeros(px.shape[:2])])
+    position = np.array([0.0, 0.0, telemetry.agl_m])
+    attitude = np.array([0.0, telemetry.pitch_deg, telemetry.roll_deg])
+    made = orthorectified(view, Orientation(position, attitude), nodes, (height, width))
+    return RectifiedView(*made, middle)
+
+
+def _window(
+    view: View,
+    attitude: tuple[float, float, float, float],
+    middle_en_m: Array,
+    gsd_m: float,
+    shape: tuple[int, int],
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Grey and valid of the window of ground about `middle_en_m`, metres from the camera."""
+    height, width = shape
+    west, north = middle_en_m + np.array([-width, height]) * gsd_m / 2
+    en_from_window = np.array([[gsd_m, 0, west], [0, -gsd_m, north], [0, 0, 1]])
+    camera_from_window = camera_from_en(*attitude) @ en_from_window
+    corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1.0]])
+    depth = corners @ camera_from_window[2]
+    if not view.camera.is_pinhole or depth.min() <= 0:
+        return _remapped(view, camera_from_window, shape)
+    return _warped(view, camera_from_window, shape, corners)
+
+
+def _warped(
+    view: View, camera_from_window: Array, shape: tuple[int, int], corners: Array
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The fast path: no distortion, no horizon, so one homography does it."""
+    size = shape[1], shape[0]
+    px_from_window = view.camera.matrix @ camera_from_window
+    matrix = counted_from_centres(px_from_window)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    grey = cv2.warpPerspective(
+        view.grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    projected = corners @ px_from_window.T
+    seen = projected[:, :2] / projected[:, 2:]
+    height, width = view.grey.shape
+    if (seen >= -EDGE_PX).all() and (seen <= np.array([width, height]) + EDGE_PX).all():
+        valid = np.ones(shape, dtype=np.bool_)
+    else:
+        inside = np.full(view.grey.shape, 255, dtype=np.uint8)
+        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        valid = cv2.warpPerspective(inside, matrix, size, flags=flags) > 0
+        grey = np.where(valid, grey, 0)
+    return np.asarray(grey, dtype=np.uint8), np.asarray(valid, dtype=np.bool_)
+
+
+def _remapped(
+    view: View, camera_from_window: Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The general path: every pixel through lens and horizon."""
+    camera = view.camera
+    height, width = shape
+    # Seldom needed for every pixel: between nodes straight lines are exact enough.
+    sides = [np.arange(0.5, side + 3 * NODE_PX, NODE_PX, dtype=np.float64) for side in shape]
+    nodes = _seen_px(camera, camera_from_window, *sides) - 0.5
+    if _is_smooth(nodes, view.grey.shape):
+        part = np.array([[1 / NODE_PX, 0, 0], [0, 1 / NODE_PX, 0]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        index = cv2.warpAffine(nodes.astype(np.float32), part, (width, height), flags=flags)
+    else:  # the view tilts far, or the horizon or the end of the lens lies within
+        sides = [np.arange(0.5, side, dtype=np.float64) for side in shape]
+        index = (_seen_px(camera, camera_from_window, *sides) - 0.5).astype(np.float32)
+    x, y = cv2.split(np.asarray(index, np.float32))
+    high, wide = view.grey.shape
+    with np.errstate(invalid="ignore"):
+        valid = (x >= -0.5) & (y >= -0.5) & (x <= wide - 0.5) & (y <= high - 0.5)
+    x[~valid] = -10
+    grey = cv2.remap(view.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey[~valid] = 0
+    return np.asarray(grey, np.uint8), np.asarray(valid, np.bool_)
+
+
+def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
+    """Whether straight lines between nodes (H, W, 2) miss by less than `NODE_ERROR_PX` in the view.
+
+    Between every other node they miss by four times as much, which the skipped nodes show.
+    """
+    odd = [side // 2 * 2 - 1 for side in index.shape[:2]]
+    even = index[: odd[0] : 2, : odd[1] : 2]
+    middle = (even[:-1, :-1] + even[1:, :-1] + even[:-1, 1:] + even[1:, 1:]) / 4
+    exact = index[1 : odd[0] : 2, 1 : odd[1] : 2]
+    size = np.array(shape[::-1])
+    near = (np.abs(exact - size / 2) < 0.6 * size + NODE_PX).all(axis=-1)
+    missed = np.abs(middle - exact)[near].max(initial=0.0) / 4
+    return bool(np.isfinite(index).all() and missed < NODE_ERROR_PX)
+
+
+def _seen_px(camera: Camera, camera_from_window: Array, rows: Array, cols: Array) -> Array:
+    """Where the camera saw a grid of the window (H, W, 2), NaN where it saw nothing."""
+    x, y = np.meshgrid(cols, rows)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera_from_window.T
+    return seen_px(camera, rays)

@@ -1,0 +1,262 @@
+"""The registration layer of a map: a grey pyramid of a sheet, read by windows.
+
+Each level is divided into square chunks, each a grey JPEG with its own mask, see
+`docs/map-format.md`. Only the chunks that a window touches are decoded. Maps are untrusted files,
+so every length, size and offset is checked before it is used.
+"""
+
+import zlib
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.caches import ByteCache
+from orthonav.core.errors import MapFileError
+from orthonav.core.mapfile.blobs import Blobs
+from orthonav.core.mapfile.manifest import GreyInfo
+from orthonav.core.mapfile.reader import MapFile
+
+CACHE_BYTES = 64 * 2**20
+"""Decoded chunks cached: 64 km2 at 1 m where no chunk has a mask."""
+MAX_PREVIEW_PX = 384
+"""Limit of the format (`docs/map-format.md`)."""
+MAX_CHUNK_BYTES_PER_PX = 4
+"""Sanity limit: an uncompressed chunk has 1."""
+_CHUNK_HEADER_BYTES = 4096
+_SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
+_START_OF_FRAME = 0xC0
+"""Baseline JPEG: decoding takes one pass over the pixels."""
+_BEFORE_FRAME = (0xE0, 0xDB, 0xC4)
+"""Segments allowed before the frame: APP0, quantization tables, Huffman tables."""
+_DECODE = int(cv2.IMREAD_GRAYSCALE) | int(cv2.IMREAD_IGNORE_ORIENTATION)
+
+Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
+"""Grey (H, W), 0 where not valid, and valid (H, W) or None where all of it is; read-only."""
+
+
+def part_names(sheet: int) -> dict[str, str]:
+    """Names of the parts of a sheet's layer, by kind of content."""
+    kinds = ("bytes", "offsets", "mask_bytes", "mask_offsets")
+    return {kind: f"sheet{sheet}/grey/{kind}" for kind in kinds}
+
+
+def level_shape(height_px: int, width_px: int, level: int) -> tuple[int, int]:
+    """Rows and columns of a level of a sheet of `height_px` x `width_px`."""
+    return -(-height_px >> level), -(-width_px >> level)
+
+
+class ChunkTable:
+    """Division of the levels of a sheet into chunks, numbered level by level and row by row."""
+
+    def __init__(self, height_px: int, width_px: int, levels: int, chunk_px: int) -> None:
+        self.chunk_px = chunk_px
+        self.shapes = [level_shape(height_px, width_px, level) for level in range(levels)]
+        self._cols = [-(-cols // chunk_px) for _, cols in self.shapes]
+        self._first = [0]
+        for (rows, _), across in zip(self.shapes, self._cols, strict=True):
+            self._first.append(self._first[-1] + -(-rows // chunk_px) * across)
+
+    @property
+    def count(self) -> int:
+        """Chunks of all levels together."""
+        return self._first[-1]
+
+    def number(self, level: int, chunk_row: int, chunk_col: int) -> int:
+        """Number of a chunk."""
+        return self._first[level] + chunk_row * self._cols[level] + chunk_col
+
+    def shape(self, level: int, chunk_row: int, chunk_col: int) -> tuple[int, int]:
+        """Rows and columns of a chunk; less than `chunk_px` at the end of the level."""
+        rows, cols = self.shapes[level]
+        side = self.chunk_px
+        return min(side, rows - chunk_row * side), min(side, cols - chunk_col * side)
+
+
+class GreyLayer:
+    """Grey pyramid of one sheet.
+
+    Pixel (0, 0) of level 0 lies at the north-west corner of the sheet's grid, at its `gsd_m`; a
+    pixel of level L covers 2**L x 2**L of them. `levels` is the number of levels. May be shared
+    between threads.
+    """
+
+    def __init__(
+        self, opened: MapFile, sheet: int, info: GreyInfo, cache_bytes: int = CACHE_BYTES
+    ) -> None:
+        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
+        grid = opened.manifest.sheets[sheet].grid
+        self.levels = info.levels
+        self._path = opened.path
+        self._table = ChunkTable(grid.height_px, grid.width_px, info.levels, info.chunk_px)
+        names = part_names(sheet)
+        self._jpegs = Blobs(opened, names["bytes"], names["offsets"], self._table.count)
+        self._masks = Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
+        self._cache = ByteCache[int, Chunk](cache_bytes, _bytes_of)
+
+    @classmethod
+    def of(
+        cls, opened: MapFile, sheet: int = 0, *, cache_bytes: int = CACHE_BYTES
+    ) -> "GreyLayer | None":
+        """The layer of a sheet; None if the map has none.
+
+        Decoded chunks are cached up to `cache_bytes`. Raises `MapFileError` if it is damaged.
+        """
+        sheets = opened.manifest.sheets
+        if not 0 <= sheet < len(sheets):
+            raise MapFileError(f"map has {len(sheets)} sheets, not sheet {sheet}: {opened.path}")
+        info = sheets[sheet].grey
+        return None if info is None else cls(opened, sheet, info, cache_bytes)
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        if not 0 <= level < self.levels:
+            raise IndexError(f"level must be 0 to {self.levels - 1}, got {level}")
+        return self._table.shapes[level]
+
+    def read(
+        self, level: int, row: int, col: int, height: int, width: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Grey and valid (height, width) of the window that begins at (row, col) of a level.
+
+        It may reach beyond the sheet or lie outside it: pixels there, and pixels without imagery,
+        are 0 and not valid. Raises `MapFileError` if a chunk is damaged.
+        """
+        rows, cols = self.shape(level)
+        if height < 0 or width < 0:
+            raise ValueError(f"window must have 0 or more rows and columns, got {height} x {width}")
+        grey = np.zeros((height, width), dtype=np.uint8)
+        valid = np.zeros((height, width), dtype=bool)
+        side = self._table.chunk_px
+        for top, bottom in _cuts(row, row + height, rows, side):
+            for left, right in _cuts(col, col + width, cols, side):
+                chunk = self._chunk(level, top // side, left // side)
+                if chunk is None:
+                    continue
+                inside = np.s_[
+                    top % side : top % side + bottom - top,
+                    left % side : left % side + right - left,
+                ]
+                target = np.s_[top - row : bottom - row, left - col : right - col]
+                grey[target] = chunk[0][inside]
+                valid[target] = True if chunk[1] is None else chunk[1][inside]
+        return grey, valid
+
+    def jpeg(self, level: int, chunk_row: int, chunk_col: int) -> bytes | None:
+        """The stored JPEG of a chunk, checked; None unless all of the chunk is valid.
+
+        Raises `IndexError` if there is no such chunk, `MapFileError` if it is damaged.
+        """
+        rows, cols = self.shape(level)
+        side = self._table.chunk_px
+        if not (0 <= chunk_row * side < rows and 0 <= chunk_col * side < cols):
+            raise IndexError(f"level {level} has no chunk {chunk_row}, {chunk_col}")
+        chunk = self._chunk(level, chunk_row, chunk_col)
+        if chunk is None or chunk[1] is not None:
+            return None
+        return self._jpegs.blob(self._table.number(level, chunk_row, chunk_col)).tobytes()
+
+    def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
+        """A chunk, from the cache or decoded; None if none of its pixels is valid."""
+        number = self._table.number(level, chunk_row, chunk_col)
+        if self._jpegs.is_empty(number) and self._masks.is_empty(number):
+            return None
+        chunk = self._cache.get(number)
+        if chunk is None:
+            jpeg, mask = self._jpegs.blob(number), self._masks.blob(number)
+            try:
+                chunk = decode_chunk(jpeg, mask, self._table.shape(level, chunk_row, chunk_col))
+            except MapFileError as error:
+                where = f"level {level}, chunk {chunk_row}, {chunk_col}"
+                raise MapFileError(
+                    f"map's registration layer is damaged ({where}: {error}): {self._path}"
+                ) from error
+            self._cache.put(number, chunk)
+        return chunk
+
+
+def _cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
+    """[first, last) within [0, size), divided at multiples of `side`."""
+    first, last = max(first, 0), min(last, size)
+    edges = [first, *range((first // side + 1) * side, last, side), last]
+    return list(pairwise(edges)) if first < last else []
+
+
+def decode_chunk(jpeg: NDArray[np.uint8], mask: NDArray[np.uint8], shape: tuple[int, int]) -> Chunk:
+    """A chunk of `shape` from the bytes of its JPEG and of its mask (empty if all is valid).
+
+    Raises `MapFileError` if they are invalid.
+    """
+    grey = _decode_grey(jpeg, shape)
+    valid = _decode_mask(mask, shape) if mask.size else None
+    if valid is not None:
+        grey[~valid] = 0
+        valid.flags.writeable = False
+    grey.flags.writeable = False
+    return grey, valid
+
+
+def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    height, width = shape
+    limit = MAX_CHUNK_BYTES_PER_PX * height * width + _CHUNK_HEADER_BYTES
+    if jpeg.size > limit:
+        raise MapFileError(f"{jpeg.size} bytes for {height} x {width} px")
+    found = jpeg_frame(jpeg.tobytes())
+    if found != (8, height, width, 1):
+        got = (
+            "something else" if found is None else "{} bits, {} x {} px, {} channels".format(*found)
+        )
+        raise MapFileError(f"a grey JPEG of {height} x {width} px was expected, got {got}")
+    try:
+        grey = cv2.imdecode(jpeg, _DECODE)
+    except cv2.error as error:
+        raise MapFileError(f"JPEG cannot be decoded ({error.err})") from error
+    if grey is None or grey.shape != shape or grey.dtype != np.uint8:
+        raise MapFileError("JPEG cannot be decoded")
+    return np.asarray(grey, dtype=np.uint8)
+
+
+def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
+    """Bits, rows, columns and channels declared by a baseline JPEG; None for other data."""
+    if not (data.startswith(_SOI) and data.endswith(_EOI)):
+        return None
+    at = len(_SOI)
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if marker == _START_OF_FRAME and at + 10 <= len(data):
+            rows, cols = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
+            return data[at + 4], rows, cols, data[at + 9]
+        if marker not in _BEFORE_FRAME or length < 2:
+            return None
+        at += 2 + length
+    return None
+
+
+def preview(opened: MapFile) -> NDArray[np.uint8]:
+    """The grey preview (rows, cols) of the first sheet. Raises `MapFileError` if it is invalid."""
+    data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
+    found = jpeg_frame(data.tobytes())
+    small = found is not None and max(found[1:3]) <= MAX_PREVIEW_PX
+    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if small else None
+    if grey is None:
+        raise MapFileError(f"map's preview cannot be decoded: {opened.path}")
+    return np.asarray(grey, dtype=np.uint8)
+
+
+def _decode_mask(mask: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    size = shape[0] * shape[1]
+    expected = -(-size // 8)
+    stream = zlib.decompressobj()
+    try:
+        packed = stream.decompress(mask.tobytes(), expected + 1)
+    except zlib.error as error:
+        raise MapFileError(f"mask cannot be decompressed ({error})") from error
+    if len(packed) != expected or not stream.eof or stream.unused_data:
+        raise MapFileError(f"mask must have {expected} bytes")
+    bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8), count=size)
+    return bits.reshape(shape).astype(np.bool_)
+
+
+def _bytes_of(chunk: Chunk) -> int:
+    return chunk[0].nbytes + (0 if chunk[1] is None else chunk[1].nbytes)

@@ -1,0 +1,343 @@
+"""The manifest of a map: its sources, its recipe and a description of its parts.
+
+Version 1, see `docs/map-format.md`. Every value is checked on reading, because a map is an
+untrusted file.
+"""
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from orthonav.core.errors import AreaError, MapFileError, MapVersionError
+from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
+from orthonav.core.geo.grid import MAX_TILE_PX, TileGrid
+from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M
+
+FORMAT = "orthonav-map"
+SCHEMA = 1
+MAX_MANIFEST_BYTES = 8 * 2**20
+MAX_SHEETS = 10_000
+MAX_LEVELS = 10
+MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
+MAX_TOP_PX = 8192
+"""Longer side of the coarsest level, which is read as a whole: that of ten levels of the largest
+sheet at 5 cm. Programs write at most 64 px."""
+CODEC = "jpeg"
+TERRAIN_CODEC = "delta-zlib"
+MAX_CODE = 65_535
+"""Greatest step of a height above the lowest one of its layer."""
+MAX_POSTING_M = 1000.0
+MAX_NAME = 200
+MAX_DIGITS = 20
+"""More digits than any number in a map needs, and few enough to fit a float."""
+MIN_HEADING_STEP_DEG = 0.5
+"""Finer than any method needs; every heading tried takes an image in memory."""
+
+
+@dataclass(frozen=True)
+class GreyInfo:
+    """The registration layer of a sheet: a grey pyramid in square chunks of `chunk_px`.
+
+    `chunk_px`: even, 16 to 1024. `levels`: 1 to 10. `quality`: JPEG quality, 1 to 100; chunks of
+    noise have less. `valid_px`: number of pixels of the finest level with imagery.
+    """
+
+    chunk_px: int
+    levels: int
+    quality: int
+    valid_px: int
+
+    @property
+    def raw_bytes(self) -> int:
+        """Size of the imagery as uncompressed RGB at the working resolution."""
+        return 3 * self.valid_px
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        return {"codec": CODEC, **vars(self)}
+
+    @classmethod
+    def from_plain(cls, plain: Any, grid: TileGrid) -> "GreyInfo":
+        """Inverse of `to_plain` for a sheet with `grid`; raises `MapFileError`."""
+        codec = _get(plain, "codec", str)
+        names = ("chunk_px", "levels", "quality", "valid_px")
+        info = cls(**{name: _get(plain, name, int) for name in names})
+        sane = (
+            codec == CODEC
+            and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
+            and info.chunk_px % 2 == 0
+            and 1 <= info.levels <= MAX_LEVELS
+            and 1 <= info.quality <= 100
+            and max(grid.height_px, grid.width_px) <= MAX_TOP_PX << (info.levels - 1)
+            and 0 <= info.valid_px <= grid.height_px * grid.width_px
+        )
+        if not sane:
+            raise MapFileError(f"map has an impossible registration layer: {plain!r:.200}")
+        return info
+
+
+@dataclass(frozen=True)
+class TerrainInfo:
+    """The terrain layer of a sheet: heights of the ground at samples in the sheet's plane.
+
+    `west_m`, `north_m`: outer north-west corner; sample (0, 0) lies half a posting to its
+    south-east. `posting_m`: distance of samples, 1 to 1000 m. `rows`, `cols`: their number.
+    `chunk_px`: samples along a side of a chunk, 16 to 1024. `low_m`, `high_m`: least and greatest
+    height above mean sea level, -500 to 9000. `unit_m`: metres per step, 0.01 to 10. `known`:
+    number of samples with a height. `name`: file it was made of. `datum`: what heights counted from
+    there.
+    """
+
+    west_m: float
+    north_m: float
+    posting_m: float
+    rows: int
+    cols: int
+    chunk_px: int
+    low_m: float
+    high_m: float
+    unit_m: float
+    known: int
+    name: str
+    datum: str
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        return {"codec": TERRAIN_CODEC, **vars(self)}
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "TerrainInfo":
+        """Inverse of `to_plain`; raises `MapFileError`."""
+        codec = _get(plain, "codec", str)
+        numbers = ("west_m", "north_m", "posting_m", "low_m", "high_m", "unit_m")
+        values: dict[str, Any] = {name: _number(plain, name) for name in numbers}
+        for name in ("rows", "cols", "chunk_px", "known"):
+            values[name] = _get(plain, name, int)
+        for name in ("name", "datum"):
+            values[name] = _get(plain, name, str)[:MAX_NAME]
+        info = cls(**values)
+        most = 4 * MAX_SHEET_M
+        sane = (
+            codec == TERRAIN_CODEC
+            and 1 <= info.posting_m <= MAX_POSTING_M
+            and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
+            and min(info.rows, info.cols) >= 1
+            and max(info.rows, info.cols) * info.posting_m <= most
+            and max(abs(info.west_m), abs(info.north_m)) <= most
+            and LOWEST_M <= info.low_m <= info.high_m <= HIGHEST_M
+            and 0.01 <= info.unit_m <= 10
+            and (info.high_m - info.low_m) / info.unit_m <= MAX_CODE + 0.5
+            and 0 <= info.known <= info.rows * info.cols
+        )
+        if not sane:
+            raise MapFileError(f"map has an impossible terrain layer: {plain!r:.300}")
+        return info
+
+
+@dataclass(frozen=True)
+class SheetInfo:
+    """One sheet of a map.
+
+    `frame`: its local plane. `grid`: its tile grid. `tiles`: number of tiles. `area_km2`: number of
+    tiles times stride squared. `grey`: its registration layer, None if it has none. `terrain`: its
+    terrain layer, None if it has none.
+    """
+
+    frame: LocalFrame
+    grid: TileGrid
+    tiles: int
+    area_km2: float
+    grey: GreyInfo | None = None
+    terrain: TerrainInfo | None = None
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for the manifest; maps without terrain do not name it."""
+        grid = self.grid
+        terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}
+        return {
+            **terrain,
+            "origin_lat_deg": self.frame.lat_deg,
+            "origin_lon_deg": self.frame.lon_deg,
+            "grid": {
+                "west_m": grid.west_m,
+                "north_m": grid.north_m,
+                "gsd_m": grid.gsd_m,
+                "tile_px": grid.tile_px,
+                "stride_px": grid.stride_px,
+                "rows": grid.rows,
+                "cols": grid.cols,
+            },
+            "tiles": self.tiles,
+            "area_km2": self.area_km2,
+            "grey": None if self.grey is None else self.grey.to_plain(),
+        }
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "SheetInfo":
+        """Inverse of `to_plain`; raises `MapFileError` on impossible values."""
+        raw = _get(plain, "grid", dict)
+        grid = TileGrid(
+            west_m=_number(raw, "west_m"),
+            north_m=_number(raw, "north_m"),
+            gsd_m=_number(raw, "gsd_m"),
+            **{name: _get(raw, name, int) for name in ("tile_px", "stride_px", "rows", "cols")},
+        )
+        tiles = _get(plain, "tiles", int)
+        sane = (
+            grid.gsd_m > 0
+            and 16 <= grid.tile_px <= MAX_TILE_PX
+            and 1 <= grid.stride_px <= grid.tile_px
+            and grid.rows >= 1
+            and grid.cols >= 1
+            and 1 <= tiles <= grid.rows * grid.cols
+            and max(grid.width_px, grid.height_px) * grid.gsd_m <= 4 * MAX_SHEET_M
+        )
+        if not sane:
+            raise MapFileError(f"map has an impossible tile grid: {raw}")
+        try:
+            frame = LocalFrame(_number(plain, "origin_lat_deg"), _number(plain, "origin_lon_deg"))
+        except AreaError as error:
+            raise MapFileError(f"map has an impossible sheet origin: {error}") from error
+        layer = plain.get("grey")
+        grey = None if layer is None else GreyInfo.from_plain(layer, grid)
+        layer = plain.get("terrain")
+        terrain = None if layer is None else TerrainInfo.from_plain(layer)
+        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey, terrain)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything in a map except its arrays.
+
+    - `recipe`: method, representation and embedding with their parameters.
+    - `sheets`: one for maps that fly.
+    - `imagery`: source files with dates and resolutions.
+    - `view`: requirements on a view and errors of a fix (`heading_step_deg`, `min_valid_share`,
+      `position_std_m`).
+    - `confidence`: logistic regression of the probability of a correct fix, None if not fitted.
+    - `radius_m`: error below which a fix is correct.
+    - `created_by`: program and version.
+    - `registration`: the same for registered views (`confidence`, `radius_m`, `position_floor_px`),
+      None without a registration layer.
+    - `parts`: array name to {dtype, shape, sha256}; filled in by `write_map`.
+    - `sha256`: digest of the manifest that was read, hexadecimal; empty for one that was not read.
+    """
+
+    recipe: dict[str, Any]
+    sheets: tuple[SheetInfo, ...]
+    imagery: tuple[dict[str, Any], ...]
+    view: dict[str, Any]
+    confidence: dict[str, Any] | None
+    radius_m: float
+    created_by: str
+    registration: dict[str, Any] | None = None
+    parts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    sha256: str = field(default="", init=False, compare=False)
+
+    @property
+    def area_km2(self) -> float:
+        """Area of all sheets."""
+        return sum(sheet.area_km2 for sheet in self.sheets)
+
+    def to_json(self) -> str:
+        """Canonical JSON, with the SHA-256 of everything else in `manifest_sha256`."""
+        plain = {
+            "format": FORMAT,
+            "schema": SCHEMA,
+            "created_by": self.created_by,
+            "recipe": self.recipe,
+            "sheets": [sheet.to_plain() for sheet in self.sheets],
+            "imagery": list(self.imagery),
+            "view": self.view,
+            "confidence": self.confidence,
+            "radius_m": self.radius_m,
+            "registration": self.registration,
+            "parts": self.parts,
+        }
+        return _canonical({**plain, "manifest_sha256": _digest(plain)})
+
+    @classmethod
+    def from_json(cls, text: str) -> "Manifest":
+        """Inverse of `to_json`; raises `MapFileError` or `MapVersionError`."""
+        if len(text) > MAX_MANIFEST_BYTES:
+            raise MapFileError(f"manifest of the map is larger than {MAX_MANIFEST_BYTES} bytes")
+        try:
+            plain = json.loads(text, parse_int=_integer)
+        except (ValueError, RecursionError) as error:
+            raise MapFileError(f"manifest of the map is not JSON ({error})") from error
+        if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+            raise MapFileError("not an orthonav map")
+        schema = _get(plain, "schema", int)
+        if schema > SCHEMA:
+            raise MapVersionError(
+                f"map has schema {schema}, this program reads up to {SCHEMA}; update orthonav"
+            )
+        stated = plain.pop("manifest_sha256", None)
+        try:
+            altered = stated != _digest(plain)
+        except ValueError:  # a number that is not finite
+            altered = True
+        if schema < 1 or altered:
+            raise MapFileError("manifest of the map was altered (checksum does not match)")
+        sheets = _get(plain, "sheets", list)
+        if not 1 <= len(sheets) <= MAX_SHEETS:
+            raise MapFileError(f"map must have 1 to {MAX_SHEETS} sheets, has {len(sheets)}")
+        confidence, registration = plain.get("confidence"), plain.get("registration")
+        manifest = cls(
+            recipe=_get(plain, "recipe", dict),
+            sheets=tuple(SheetInfo.from_plain(sheet) for sheet in sheets),
+            imagery=tuple(item for item in _get(plain, "imagery", list) if isinstance(item, dict)),
+            view=_view(plain),
+            confidence=confidence if isinstance(confidence, dict) else None,
+            radius_m=_number(plain, "radius_m"),
+            created_by=str(plain.get("created_by", "")),
+            registration=registration if isinstance(registration, dict) else None,
+            parts=_get(plain, "parts", dict),
+        )
+        object.__setattr__(manifest, "sha256", stated)  # no argument: `replace` must not copy it
+        return manifest
+
+
+def _view(plain: Any) -> dict[str, Any]:
+    """The validated `view` record; a fine heading step would exhaust memory."""
+    view: dict[str, Any] = _get(plain, "view", dict)
+    if not MIN_HEADING_STEP_DEG <= _number(view, "heading_step_deg") <= 360:
+        raise MapFileError(
+            f"manifest of the map: heading_step_deg must be {MIN_HEADING_STEP_DEG} to 360, "
+            f"got {view['heading_step_deg']!r:.80}"
+        )
+    return view
+
+
+def _integer(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise ValueError(f"a number has {len(text)} digits")
+    return int(text)
+
+
+def _canonical(plain: Any) -> str:
+    return json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _digest(plain: dict[str, Any]) -> str:
+    return hashlib.sha256(_canonical(plain).encode()).hexdigest()
+
+
+def _get(plain: Any, name: str, kind: type) -> Any:
+    value = plain.get(name) if isinstance(plain, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise MapFileError(
+            f"manifest of the map: {name} must be {kind.__name__}, got {value!r:.80}"
+        )
+    return value
+
+
+def _number(plain: Any, name: str) -> float:
+    value = plain.get(name) if isinstance(plain, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise MapFileError(
+            f"manifest of the map: {name} must be a finite number, got {value!r:.80}"
+        )
+    return float(value)

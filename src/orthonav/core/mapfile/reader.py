@@ -1,0 +1,346 @@
+"""Opening a map: every byte is checked at the opening, and again whenever it is read later.
+
+The file stays open and is not memory-mapped: reading a mapping beyond the end of a file that was
+truncated ends the process (SIGBUS), as does a read error of a memory card. Parts are read with
+`pread` and compared with a digest of what the opening found, so a map that is truncated,
+rewritten or unreadable in flight raises `MapChangedError`.
+"""
+
+import hashlib
+import json
+import os
+import re
+import weakref
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import MapChangedError, MapFileError, MissingFileError
+from orthonav.core.files import require_file
+from orthonav.core.mapfile.manifest import Manifest
+from orthonav.core.mapfile.writer import METADATA_KEY
+
+MAX_HEADER_BYTES = 16 * 2**20
+MIN_FILE_BYTES = 10
+BLOCK_BYTES = 16 * 2**10
+"""Unit of verification of parts that are read in ranges: about one chunk of the registration
+layer (docs/map-format.md)."""
+_BLOCK_DIGEST_BYTES = 16
+_PIECE_BYTES = 64 * BLOCK_BYTES
+_IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|terrain/)bytes")
+"""Parts that are read in ranges: the largest of a map."""
+_DTYPES: dict[str, type[np.generic]] = {
+    "F16": np.float16,
+    "F32": np.float32,
+    "U8": np.uint8,
+    "I32": np.int32,
+    "I64": np.int64,
+}
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Type and position of a part.
+
+    `first`, `nbytes`: position and size in the file. `sha256`: of the whole part, hexadecimal.
+    `blocks`: digests of its blocks, concatenated; empty for parts that are read whole.
+    """
+
+    dtype: type[np.generic]
+    shape: tuple[int, ...]
+    first: int
+    nbytes: int
+    sha256: str
+    blocks: bytes = b""
+
+
+class MapParts(Mapping[str, NDArray[Any]]):
+    """The parts of an open map by name; read from the file when asked for, read-only.
+
+    Reading raises `MapChangedError` if the bytes are not those of the opening.
+    """
+
+    def __init__(self, path: Path, opened: "_OpenFile", parts: dict[str, _Part]) -> None:
+        self._path, self._file, self._parts = path, opened, parts
+        self._change: str | None = None
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        part = self._parts[name]
+        data = self._read(part.first, part.nbytes)
+        if hashlib.sha256(data).hexdigest() != part.sha256:
+            raise self._changed(f"part {name} was rewritten")
+        return np.frombuffer(data, dtype=part.dtype).reshape(part.shape)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def described(self, name: str) -> _Part | None:
+        """Type and position of a part without reading it; None if there is none."""
+        return self._parts.get(name)
+
+    def range(self, name: str, first: int, last: int) -> bytes:
+        """Bytes `first` to `last` (excluded) of a part that is read in ranges."""
+        if first >= last:
+            return b""
+        part = self._parts[name]
+        begin = first // BLOCK_BYTES
+        end = -(-last // BLOCK_BYTES)
+        start = begin * BLOCK_BYTES
+        data = self._read(part.first + start, min(end * BLOCK_BYTES, part.nbytes) - start)
+        size = _BLOCK_DIGEST_BYTES
+        if _block_digests(data) != part.blocks[begin * size : end * size]:
+            raise self._changed(f"part {name} was rewritten")
+        return data[first - start : last - start]
+
+    def change(self) -> str | None:
+        """How the open file differs from the one that was opened; None as far as is known.
+
+        The size is compared now. Other changes are known once they were read, and remain.
+        """
+        if self._change is None:
+            size = self._file.size_now()
+            if size != self._file.size:
+                self._change = f"{size} bytes instead of {self._file.size}"
+        return self._change
+
+    def _read(self, first: int, length: int) -> bytes:
+        if self._change is not None:
+            raise self._changed(self._change)
+        try:
+            data = self._file.read(first, length)
+        except OSError as error:
+            raise self._changed(f"read error: {error.strerror}") from error
+        if len(data) != length:
+            raise self._changed(self.change() or "it was truncated")
+        return data
+
+    def _changed(self, how: str) -> MapChangedError:
+        self._change = self._change or how
+        return MapChangedError(
+            f"map file changed since it was opened ({how}); write maps to a new file and rename "
+            f"it: {self._path}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MapFile:
+    """An opened map, or one that was built and not yet written.
+
+    `arrays`: its parts, read-only; those of an opened map are read when asked for.
+    """
+
+    path: Path
+    size_bytes: int
+    manifest: Manifest
+    arrays: Mapping[str, NDArray[Any]]
+
+    def __repr__(self) -> str:
+        area_km2, gsd_m = self.manifest.area_km2, self.manifest.sheets[0].grid.gsd_m
+        return f"MapFile({self.path}, {area_km2:.2f} km2, {gsd_m:g} m per pixel)"
+
+    @property
+    def bounds_deg(self) -> tuple[float, float, float, float]:
+        """South, west, north and east of the first sheet, degrees."""
+        sheet = self.manifest.sheets[0]
+        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        corners_en_m = [(x, y) for x in (west_m, east_m) for y in (south_m, north_m)]
+        lat, lon = sheet.frame.latlon_from_en(corners_en_m)
+        return float(lat.min()), float(lon.min()), float(lat.max()), float(lon.max())
+
+    def contains(self, lat_deg: float, lon_deg: float) -> bool:
+        """Whether a position is on the first sheet."""
+        sheet = self.manifest.sheets[0]
+        x_m, y_m = sheet.frame.en_from_latlon(lat_deg, lon_deg).tolist()
+        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        return bool(west_m <= x_m <= east_m and south_m <= y_m <= north_m)
+
+    def array(self, name: str, dtype: type[np.generic], ndim: int) -> NDArray[Any]:
+        """The part `name`; raises `MapFileError` if it is missing or has another type or shape."""
+        self.size_of(name, dtype, ndim)
+        return self.arrays[name]
+
+    def size_of(self, name: str, dtype: type[np.generic], ndim: int) -> int:
+        """Bytes of the part `name`, without reading it; raises as `array`."""
+        arrays = self.arrays
+        found: _Part | NDArray[Any] | None
+        found = arrays.described(name) if isinstance(arrays, MapParts) else arrays.get(name)
+        if found is None or found.dtype != dtype or len(found.shape) != ndim:
+            got = "nothing"
+            if found is not None:
+                got = f"{np.dtype(found.dtype)} of {len(found.shape)} dimensions"
+            raise MapFileError(
+                f"map part {name} must be {np.dtype(dtype)} of {ndim} dimensions, got {got}: "
+                f"{self.path}"
+            )
+        return found.nbytes
+
+    def range(self, name: str, first: int, last: int) -> bytes:
+        """Bytes `first` to `last` (excluded) of a part that is read in ranges.
+
+        Raises `MapChangedError` if they are not those of the opening.
+        """
+        if isinstance(self.arrays, MapParts):
+            return self.arrays.range(name, first, last)
+        return self.arrays[name][first:last].tobytes()
+
+    def change(self) -> str | None:
+        """How the open file was changed in place, as far as is known; see `MapParts.change`."""
+        return self.arrays.change() if isinstance(self.arrays, MapParts) else None
+
+
+class _OpenFile:
+    """A file kept open for reading; closed when the object is collected."""
+
+    def __init__(self, path: Path) -> None:
+        self._number = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        weakref.finalize(self, os.close, self._number)
+        self.size = self.size_now()
+
+    def size_now(self) -> int:
+        """Size of the file now, bytes."""
+        return os.fstat(self._number).st_size
+
+    def read(self, first: int, length: int) -> bytes:
+        """`length` bytes from `first`; fewer where the file ends. Raises `OSError`."""
+        data = os.pread(self._number, length, first)
+        if len(data) in (0, length):
+            return data
+        pieces, count = [data], len(data)
+        while count < length and data:  # the system returns at most 2 GiB at once
+            data = os.pread(self._number, length - count, first + count)
+            pieces.append(data)
+            count += len(data)
+        return b"".join(pieces)
+
+
+def open_map(path: Path, manifest_sha256: str | None = None) -> MapFile:
+    """Open a map and verify every checksum in it.
+
+    `manifest_sha256` is that of a signature: another map is refused, also one that took the place
+    of the signed one after the signature was checked.
+
+    The container is safetensors: eight bytes with the length of a JSON header, the header, raw
+    arrays. It is parsed here, not with the library, because the arrays are read on demand, and
+    because every length is checked against the file before it is used.
+    Raises `MissingFileError`, `MapFileError`, or `MapVersionError`.
+    """
+    path = require_file(path, "map")
+    try:
+        opened = _OpenFile(path)
+        if opened.size < MIN_FILE_BYTES:
+            raise MapFileError(f"not an orthonav map, only {opened.size} bytes")
+        header, start = _header(opened)
+        metadata = header.pop("__metadata__", None)
+        if not isinstance(metadata, dict) or not isinstance(metadata.get(METADATA_KEY), str):
+            raise MapFileError("not an orthonav map")
+        manifest = Manifest.from_json(metadata[METADATA_KEY])
+        if manifest_sha256 not in (None, manifest.sha256):
+            raise MapFileError("map was replaced after its signature was checked; try again")
+        parts = _parts(opened, start, header, manifest)
+    except MapFileError as error:
+        raise type(error)(f"{error}: {path}") from error
+    except OSError as error:
+        raise MissingFileError(f"map cannot be read ({error.strerror}): {path}") from error
+    except (OverflowError, RecursionError) as error:  # crafted: excessive numbers or nesting
+        raise MapFileError(f"map is damaged ({error}): {path}") from error
+    return MapFile(path, opened.size, manifest, MapParts(path, opened, parts))
+
+
+def _header(opened: _OpenFile) -> tuple[dict[str, Any], int]:
+    head = opened.read(0, 9)
+    length = int.from_bytes(head[:8], "little")
+    if length > MAX_HEADER_BYTES or head[8:] != b"{":
+        raise MapFileError("not an orthonav map; `orthonav build` makes one from orthophotos")
+    data = opened.read(8, length)
+    if len(data) != length:
+        raise MapFileError("map is truncated (header)")
+    try:
+        header = json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise MapFileError("map is damaged (header is not JSON)") from error
+    if not isinstance(header, dict):
+        raise MapFileError("map is damaged (header)")
+    return header, 8 + length
+
+
+def _parts(
+    opened: _OpenFile, start: int, header: dict[str, Any], manifest: Manifest
+) -> dict[str, _Part]:
+    if set(header) != set(manifest.parts):
+        raise MapFileError("map was altered (its parts differ from the manifest)")
+    parts: dict[str, _Part] = {}
+    size, covered = opened.size, start
+    for name, entry in sorted(header.items(), key=lambda item: _offsets(item[1])):
+        first, last = _offsets(entry)
+        if start + first != covered:
+            raise MapFileError(f"map is damaged (part {name} has a wrong offset)")
+        if start + last > size:
+            raise MapFileError(f"map is truncated ({size} of {start + last} bytes or more)")
+        parts[name] = _part(opened, start + first, last - first, name, entry, manifest)
+        covered = start + last
+    if covered != size:
+        raise MapFileError(f"map was altered ({size - covered} bytes too many)")
+    return parts
+
+
+def _offsets(entry: Any) -> tuple[int, int]:
+    offsets = entry.get("data_offsets") if isinstance(entry, dict) else None
+    if not _is_integers(offsets) or len(offsets) != 2 or not 0 <= offsets[0] <= offsets[1]:
+        raise MapFileError("map is damaged (header)")
+    return offsets[0], offsets[1]
+
+
+def _is_integers(value: Any) -> TypeGuard[list[int]]:
+    return isinstance(value, list) and all(type(item) is int for item in value)
+
+
+def _part(
+    opened: _OpenFile, first: int, length: int, name: str, entry: dict[str, Any], manifest: Manifest
+) -> _Part:
+    described = manifest.parts[name]
+    dtype = _DTYPES.get(str(entry.get("dtype")))
+    shape: Any = entry.get("shape")
+    if dtype is None or not _is_integers(shape):
+        raise MapFileError(f"map is damaged (part {name})")
+    count = 1
+    for extent in shape:
+        count *= extent
+    same = isinstance(described, dict) and described.get("dtype") == np.dtype(dtype).name
+    same = same and described.get("shape") == shape
+    if not same or min(shape, default=0) < 0 or count * np.dtype(dtype).itemsize != length:
+        raise MapFileError(f"map was altered (part {name} differs from the manifest)")
+    try:
+        np.broadcast_to(np.zeros((), dtype=dtype), shape)
+    except ValueError as error:  # an empty part can claim any shape
+        raise MapFileError(f"map is damaged (part {name}: {error})") from error
+    digest, blocks = _digests(opened, first, length, blocks=bool(_IN_RANGES.fullmatch(name)))
+    if digest != described.get("sha256"):
+        raise MapFileError(f"map was altered (checksum of part {name} does not match)")
+    return _Part(dtype, tuple(shape), first, length, digest, blocks)
+
+
+def _digests(opened: _OpenFile, first: int, length: int, *, blocks: bool) -> tuple[str, bytes]:
+    """SHA-256 (hexadecimal) of a part, and the digests of its blocks where asked for."""
+    whole, of_blocks = hashlib.sha256(), bytearray()
+    for at in range(first, first + length, _PIECE_BYTES):
+        piece = opened.read(at, min(_PIECE_BYTES, first + length - at))
+        whole.update(piece)
+        if blocks:
+            of_blocks += _block_digests(piece)
+    return whole.hexdigest(), bytes(of_blocks)
+
+
+def _block_digests(data: bytes) -> bytes:
+    """Digests of the blocks of `data`, concatenated; BLAKE2b is fast without SHA instructions."""
+    view = memoryview(data)
+    return b"".join(
+        hashlib.blake2b(view[at : at + BLOCK_BYTES], digest_size=_BLOCK_DIGEST_BYTES).digest()
+        for at in range(0, len(data), BLOCK_BYTES)
+    )

@@ -1,0 +1,320 @@
+"""Signatures of maps: authenticity and integrity.
+
+A detached Ed25519 signature, `MAP.onav.sig`, of the digest of the manifest, which holds the
+SHA-256 of every part. `open_map` checks all of them whenever it opens a map, so signing the
+manifest's digest covers every byte that is used, and verifying reads the header of the file only.
+A serial number and the time of signing are signed too, so that older maps can be refused.
+See `docs/map-format.md`.
+"""
+
+import base64
+import binascii
+import contextlib
+import hashlib
+import json
+import os
+import re
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthonav.core.errors import (
+    MapFileError,
+    MissingFileError,
+    OutputError,
+    VariantError,
+    described,
+)
+from orthonav.core.extras import missing_extra
+from orthonav.core.files import replacing, require_file, write_text
+from orthonav.core.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
+from orthonav.core.mapfile.reader import MAX_HEADER_BYTES, MIN_FILE_BYTES, open_map
+from orthonav.core.mapfile.writer import METADATA_KEY
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import (
+        Ed25519PrivateKey,
+        Ed25519PublicKey,
+    )
+
+SCHEMA = 2
+"""Schema 1 has neither serial number nor time."""
+FORMAT = "orthonav-signature"
+ALGORITHM = "ed25519"
+MAX_SIGNATURE_BYTES = 4096
+MAX_KEY_BYTES = 4096
+PRIVATE_NAME, PUBLIC_NAME = "private.pem", "public.pem"
+MAX_SERIAL = 2**53 - 1
+"""Largest integer that every JSON reader keeps exact."""
+_TIME = "%Y-%m-%dT%H:%M:%SZ"
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Signature:
+    """A verified signature.
+
+    `key_id`: of the key. `manifest_sha256`: digest of the map's manifest, hexadecimal. `serial`:
+    serial number, at least 0. `signed_utc`: time of signing by the clock of the signer. The last
+    two are None in signatures of schema 1.
+    """
+
+    key_id: str
+    manifest_sha256: str
+    serial: int | None = None
+    signed_utc: str | None = None
+
+    @property
+    def message(self) -> bytes:
+        """The signed bytes; their beginning separates them from other uses of the key."""
+        digest = f"manifest sha256 {self.manifest_sha256}"
+        if self.serial is None:
+            return f"orthonav map, schema 1, {digest}".encode("ascii")
+        named = f"serial {self.serial}, signed {self.signed_utc}"
+        return f"orthonav map, schema 2, {named}, {digest}".encode("ascii")
+
+
+def signature_path(path: Path) -> Path:
+    """Path of the signature of a map: the same folder, with `.sig` appended."""
+    return Path(path).with_name(Path(path).name + ".sig")
+
+
+def map_digest(path: Path) -> str:
+    """SHA-256 (hex) of the manifest of a map; identifies a map by reading its header only.
+
+    Raises `MissingFileError`, `MapFileError` or `MapVersionError`.
+    """
+    path = require_file(path, "map")
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(8)
+            length = int.from_bytes(head, "little")
+            if len(head) < 8 or length > MAX_HEADER_BYTES or length + 8 < MIN_FILE_BYTES:
+                raise MapFileError(f"not an orthonav map: {path}")
+            text = json.loads(stream.read(length))["__metadata__"][METADATA_KEY]
+            if not isinstance(text, str) or len(text) > MAX_MANIFEST_BYTES:
+                raise ValueError("manifest")
+            return Manifest.from_json(text).sha256
+    except MapFileError as error:
+        raise type(error)(str(error) if str(path) in str(error) else f"{error}: {path}") from error
+    except OSError as error:
+        raise MissingFileError(f"map cannot be read ({error.strerror}): {path}") from error
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
+        raise MapFileError(f"not an orthonav map, or damaged: {path}") from error
+
+
+def new_key(folder: Path) -> str:
+    """Write a new key pair, `private.pem` (mode 0600) and `public.pem`; returns its id.
+
+    Raises `OutputError` if either file exists, and `MissingExtraError`.
+    """
+    _, serialization, ed25519 = _crypto()
+    folder = Path(folder)
+    private_path, public_path = folder / PRIVATE_NAME, folder / PUBLIC_NAME
+    if private_path.exists() or public_path.exists():
+        raise OutputError(f"folder holds a key already; name another folder: {folder}")
+    private = ed25519.Ed25519PrivateKey.generate()
+    pem = private.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    public = private.public_key()
+    public_pem = public.public_bytes(
+        serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(private_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(handle, "wb") as out:
+            out.write(pem)
+            out.flush()
+            os.fsync(out.fileno())
+        write_text(public_path, public_pem.decode("ascii"))
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            private_path.unlink()
+        raise OutputError(f"key cannot be written ({error.strerror or error}): {folder}") from error
+    return key_id(public)
+
+
+def key_id(public: "Ed25519PublicKey") -> str:
+    """Short id of a key: the first 16 hexadecimal digits of the SHA-256 of its 32 bytes."""
+    return hashlib.sha256(public.public_bytes_raw()).hexdigest()[:16]
+
+
+def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
+    """Sign a map with a private key (PEM); returns the path of the signature.
+
+    `serial` is 0 to `MAX_SERIAL`; by default the time in seconds since 1970, which increases. The
+    map is fully checked first. Raises `MissingFileError`, `MapFileError`, `OutputError`,
+    `VariantError` or `MissingExtraError`.
+    """
+    now = datetime.now(UTC)
+    serial = int(now.timestamp()) if serial is None else serial
+    if not 0 <= serial <= MAX_SERIAL:
+        raise VariantError(f"serial number must be 0 to {MAX_SERIAL}, got {serial}")
+    private = _private_key(key)
+    digest = open_map(path).manifest.sha256
+    made = Signature(key_id(private.public_key()), digest, serial, now.strftime(_TIME))
+    plain = {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "algorithm": ALGORITHM,
+        **asdict(made),
+        "signature": base64.b64encode(private.sign(made.message)).decode(),
+    }
+    out = signature_path(path)
+    with replacing(out) as temporary:
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="ascii")
+    return out
+
+
+def require_signature(path: Path, public_key: Path, not_before: str | None = None) -> Signature:
+    """The signature of a map, checked with a key (PEM).
+
+    `not_before` is a serial number, or a date or time in UTC; older maps are refused. `open_map`,
+    given the digest of the signature, then compares the parts with the manifest. Raises
+    `MapFileError` if the signature is missing, broken, by another key, of another map or too old,
+    `MissingFileError` if the map or the key is missing, `VariantError` if `not_before` is invalid,
+    and `MissingExtraError`.
+    """
+    invalid, _, _ = _crypto()
+    least = None if not_before is None else _least(not_before)
+    public = _public_key(public_key)
+    digest = map_digest(path)
+    found, encoded = _signature(path)
+    known = key_id(public)
+    if found.key_id != known:
+        raise MapFileError(f"map is signed with key {found.key_id}, expected key {known}: {path}")
+    if found.manifest_sha256 != digest:
+        raise MapFileError(f"signature is of another map, or the map was altered: {path}")
+    try:
+        public.verify(base64.b64decode(encoded, validate=True), found.message)
+    except (invalid, binascii.Error, ValueError) as error:
+        raise MapFileError(f"signature of the map does not verify: {path}") from error
+    if least is not None:
+        _require_not_older(found, least, str(not_before), path)
+    return found
+
+
+def _least(text: str) -> int | datetime:
+    """The serial number, or the time in UTC, in an option."""
+    if re.fullmatch(r"[0-9]{1,16}", text):
+        return int(text)
+    if re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}(T[0-9]{2}:[0-9]{2}(:[0-9]{2})?Z?)?", text):
+        with contextlib.suppress(ValueError):
+            return datetime.fromisoformat(text.removesuffix("Z")).replace(tzinfo=UTC)
+    raise VariantError(
+        "--not-before must be a serial number, or a date or time in UTC as 2026-05-31 or "
+        f"2026-05-31T12:00:00Z, got {text!r:.60}"
+    )
+
+
+def _require_not_older(found: Signature, least: int | datetime, text: str, path: Path) -> None:
+    if found.serial is None or found.signed_utc is None:
+        raise MapFileError(
+            f"signature has no serial number and no date, which --not-before needs; sign the map "
+            f"again: {path}"
+        )
+    if isinstance(least, int):
+        if found.serial < least:
+            raise MapFileError(
+                f"map is too old: serial number {found.serial}, --not-before {text}: {path}"
+            )
+    elif datetime.strptime(found.signed_utc, _TIME).replace(tzinfo=UTC) < least:
+        raise MapFileError(
+            f"map is too old: signed {found.signed_utc}, --not-before {text}: {path}"
+        )
+
+
+def _signature(path: Path) -> tuple[Signature, str]:
+    """The validated fields of a signature file, not yet verified, and the encoded signature."""
+    file = signature_path(path)
+    if not file.is_file():
+        raise MapFileError(f"map is not signed, there is no {file.name}: {path}")
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(MAX_SIGNATURE_BYTES + 1)
+        if len(data) > MAX_SIGNATURE_BYTES:
+            raise ValueError(f"it is larger than {MAX_SIGNATURE_BYTES} bytes")
+        plain = json.loads(data)
+        schema = plain["schema"]
+        if plain["format"] != FORMAT or type(schema) is not int or schema < 1:
+            raise ValueError("not an orthonav signature")
+        if schema > SCHEMA or plain["algorithm"] != ALGORITHM:
+            raise ValueError(
+                f"schema {schema}, algorithm {plain['algorithm']!r:.20}; update orthonav"
+            )
+        found = {name: plain[name] for name in ("key_id", "manifest_sha256", "signature")}
+        texts = all(isinstance(value, str) and value.isascii() for value in found.values())
+        if not texts or not re.fullmatch(r"[0-9a-f]{16}", found["key_id"]):
+            raise ValueError("a field is invalid")
+        if not _DIGEST.fullmatch(found["manifest_sha256"]):
+            raise ValueError("its digest is invalid")
+        encoded = found.pop("signature")
+        signature = Signature(**found) if schema == 1 else Signature(**found, **_age(plain))
+    except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
+        raise MapFileError(
+            f"signature of the map is broken ({described(error)}): {file}"
+        ) from error
+    return signature, encoded
+
+
+def _age(plain: dict[str, Any]) -> dict[str, Any]:
+    """Serial number and time of signing of a signature file; raises `ValueError`."""
+    serial, signed_utc = plain["serial"], plain["signed_utc"]
+    if type(serial) is not int or not 0 <= serial <= MAX_SERIAL:
+        raise ValueError("its serial number is invalid")
+    if datetime.strptime(signed_utc, _TIME).strftime(_TIME) != signed_utc:
+        raise ValueError("its time is invalid")
+    return {"serial": serial, "signed_utc": signed_utc}
+
+
+def _private_key(path: Path) -> "Ed25519PrivateKey":
+    _, serialization, ed25519 = _crypto()
+    data = _key_bytes(path, "private key")
+    try:
+        key = serialization.load_pem_private_key(data, password=None)
+    except TypeError as error:  # raised for a key with a passphrase
+        raise MapFileError(f"private key has a passphrase; give one without: {path}") from error
+    except Exception as error:
+        raise MapFileError(f"not a private key in PEM: {path}") from error
+    if not isinstance(key, ed25519.Ed25519PrivateKey):
+        raise MapFileError(f"expected an Ed25519 private key, got another kind: {path}")
+    found: Ed25519PrivateKey = key
+    return found
+
+
+def _public_key(path: Path) -> "Ed25519PublicKey":
+    _, serialization, ed25519 = _crypto()
+    data = _key_bytes(path, "public key")
+    try:
+        key = serialization.load_pem_public_key(data)
+    except Exception as error:
+        raise MapFileError(f"not a public key in PEM: {path}") from error
+    if not isinstance(key, ed25519.Ed25519PublicKey):
+        raise MapFileError(f"expected an Ed25519 public key, got another kind: {path}")
+    found: Ed25519PublicKey = key
+    return found
+
+
+def _key_bytes(path: Path, what: str) -> bytes:
+    path = require_file(path, what)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(MAX_KEY_BYTES)
+    except OSError as error:
+        raise MissingFileError(f"{what} cannot be read ({error.strerror}): {path}") from error
+
+
+def _crypto() -> tuple[Any, Any, Any]:
+    """`InvalidSignature`, `serialization` and `ed25519` of the library."""
+    try:
+        from cryptography.exceptions import InvalidSignature
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric import ed25519
+    except ImportError as error:
+        raise missing_extra("a signature", "signing", "cryptography", error) from error
+    return InvalidSignature, serialization, ed25519

@@ -1,0 +1,162 @@
+"""The terrain layer of a map: heights of the ground, read chunk by chunk without GDAL.
+
+See `docs/map-format.md`. Maps are untrusted files, so every length and size is checked before it
+is used.
+"""
+
+import zlib
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthonav.core.caches import ByteCache
+from orthonav.core.errors import MapFileError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.mapfile.blobs import Blobs
+from orthonav.core.mapfile.layer import ChunkTable
+from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
+from orthonav.core.mapfile.reader import MapFile
+
+CACHE_BYTES = 16 * 2**20
+"""Decoded chunks cached: 400 km2 at 10 m."""
+_MAX_BYTES_PER_SAMPLE = 4
+"""Sanity limit: an uncompressed sample has 2 bytes."""
+_CHUNK_HEADER_BYTES = 1024
+Array = NDArray[np.float64]
+Heights = NDArray[np.float32]
+
+
+def terrain_part_names(sheet: int) -> tuple[str, str]:
+    """Names of the parts of a sheet's terrain: the chunks' bytes and their offsets."""
+    return f"sheet{sheet}/terrain/bytes", f"sheet{sheet}/terrain/offsets"
+
+
+class TerrainLayer:
+    """Heights of the ground under one sheet, above mean sea level; NaN where unknown.
+
+    Calling it with latitudes and longitudes gives heights
+    (`orthonav.core.geo.ground.TerrainHeights`). May be shared between threads.
+    """
+
+    def __init__(self, opened: MapFile, sheet: int, info: TerrainInfo) -> None:
+        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
+        self.info = info
+        self.frame: LocalFrame = opened.manifest.sheets[sheet].frame
+        self._path = opened.path
+        self._table = ChunkTable(info.rows, info.cols, 1, info.chunk_px)
+        self._blobs = Blobs(opened, *terrain_part_names(sheet), self._table.count)
+        self._cache = ByteCache[int, Heights](CACHE_BYTES, _bytes_of)
+
+    @classmethod
+    def of(cls, opened: MapFile, sheet: int = 0) -> "TerrainLayer | None":
+        """The layer of a sheet; None if the map has none. Raises `MapFileError`."""
+        info = opened.manifest.sheets[sheet].terrain
+        return None if info is None else cls(opened, sheet, info)
+
+    def __call__(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
+        """Heights (...) at positions (...), see `at_en_m`."""
+        return self.at_en_m(self.frame.en_from_latlon(lat_deg, lon_deg))
+
+    def at_en_m(self, points_en_m: ArrayLike) -> Array:
+        """Heights (...) at points (..., 2) of the sheet's plane, bilinear between samples.
+
+        NaN outside the layer and beside samples without a height. Raises `MapFileError` if a chunk
+        is damaged, `MapChangedError`.
+        """
+        info, points = self.info, np.asarray(points_en_m, np.float64)
+        col = (points[..., 0] - info.west_m) / info.posting_m - 0.5
+        row = (info.north_m - points[..., 1]) / info.posting_m - 0.5
+        with np.errstate(invalid="ignore"):
+            inside = (col >= -0.5) & (col <= info.cols - 0.5)
+            inside &= (row >= -0.5) & (row <= info.rows - 0.5)
+        col = np.clip(np.where(inside, col, 0), 0, info.cols - 1)
+        row = np.clip(np.where(inside, row, 0), 0, info.rows - 1)
+        left, top = np.floor(col).astype(np.intp), np.floor(row).astype(np.intp)
+        right, bottom = np.minimum(left + 1, info.cols - 1), np.minimum(top + 1, info.rows - 1)
+        x, y = col - left, row - top
+        upper = (1 - x) * self._samples(top, left) + x * self._samples(top, right)
+        lower = (1 - x) * self._samples(bottom, left) + x * self._samples(bottom, right)
+        return np.where(inside, (1 - y) * upper + y * lower, np.nan)
+
+    def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
+        """Heights of samples (...) by row and column."""
+        side = self.info.chunk_px
+        chunk_rows, chunk_cols = rows // side, cols // side
+        found = np.full(rows.shape, np.nan)
+        across = int(chunk_cols.max(initial=0)) + 1
+        for key in np.unique(chunk_rows * across + chunk_cols).tolist():
+            chunk_row, chunk_col = divmod(key, across)
+            heights = self._chunk(chunk_row, chunk_col)
+            if heights is not None:
+                here = (chunk_rows == chunk_row) & (chunk_cols == chunk_col)
+                found[here] = heights[rows[here] % side, cols[here] % side]
+        return found
+
+    def _chunk(self, chunk_row: int, chunk_col: int) -> Heights | None:
+        """A chunk, from the cache or decoded; None if it has no height."""
+        number = self._table.number(0, chunk_row, chunk_col)
+        if self._blobs.is_empty(number):
+            return None
+        found = self._cache.get(number)
+        if found is None:
+            shape = self._table.shape(0, chunk_row, chunk_col)
+            try:
+                found = decode_terrain(self._blobs.blob(number), shape, self.info)
+            except MapFileError as error:
+                raise MapFileError(
+                    f"map's terrain layer is damaged (chunk {chunk_row}, {chunk_col}: {error}): "
+                    f"{self._path}"
+                ) from error
+            self._cache.put(number, found)
+        return found
+
+
+def decode_terrain(data: NDArray[np.uint8], shape: tuple[int, int], info: TerrainInfo) -> Heights:
+    """Heights of a chunk of `shape`, NaN where unknown. Raises `MapFileError` if it is invalid."""
+    size = shape[0] * shape[1]
+    if data.size > _MAX_BYTES_PER_SAMPLE * size + _CHUNK_HEADER_BYTES:
+        raise MapFileError(f"{data.size} bytes for {shape[0]} x {shape[1]} samples")
+    whole, masked = 2 * size, 2 * size + -(-size // 8)
+    stream = zlib.decompressobj()
+    try:
+        plain = stream.decompress(data.tobytes(), masked + 1)
+    except zlib.error as error:
+        raise MapFileError(f"it cannot be decompressed ({error})") from error
+    if len(plain) not in (whole, masked) or not stream.eof or stream.unused_data:
+        raise MapFileError(f"it must have {whole} or {masked} bytes")
+    planes = np.frombuffer(plain, np.uint8)
+    folded = planes[:size].astype(np.uint16) | planes[size:whole].astype(np.uint16) << 8
+    steps = (folded >> 1) ^ -(folded & 1)
+    codes = np.cumsum(steps.reshape(shape), axis=0, dtype=np.uint16)
+    codes = np.cumsum(codes, axis=1, dtype=np.uint16)
+    known = np.ones(shape, np.bool_)
+    if len(plain) == masked:
+        bits = np.unpackbits(planes[whole:], count=size)
+        known = bits.reshape(shape).astype(np.bool_)
+    heights = info.low_m + info.unit_m * codes.astype(np.float64)
+    if (heights[known] > info.high_m + info.unit_m).any():
+        raise MapFileError(f"it has heights above {info.high_m:g} m")
+    found = np.where(known, heights, np.nan).astype(np.float32)
+    found.flags.writeable = False
+    return found
+
+
+def encode_terrain(heights: Heights, info: TerrainInfo) -> bytes:
+    """Bytes of a chunk (H, W) of heights, NaN where unknown; empty where all are."""
+    known = np.isfinite(heights)
+    if not known.any():
+        return b""
+    filled = np.where(known, heights, heights[known].mean()).astype(np.float64)
+    codes = np.rint((filled - info.low_m) / info.unit_m).clip(0, MAX_CODE).astype(np.uint16)
+    down = np.diff(codes, axis=0, prepend=np.uint16(0))
+    steps = np.diff(down, axis=1, prepend=np.uint16(0))
+    folded = (steps << 1) ^ (0 - (steps >> 15)).astype(np.uint16)
+    planes = [(folded & 255).astype(np.uint8), (folded >> 8).astype(np.uint8)]
+    plain = b"".join(plane.tobytes() for plane in planes)
+    if not known.all():
+        plain += np.packbits(known).tobytes()
+    return zlib.compress(plain, 9)
+
+
+def _bytes_of(heights: Heights) -> int:
+    return heights.nbytes

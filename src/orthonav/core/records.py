@@ -1,0 +1,283 @@
+"""The records that packages exchange: telemetry, view, prior, fix, no fix."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.geo.ground import Ground
+from orthonav.core.grey import grey_levels
+
+CONFIDENT = 0.9
+"""A fix of at least this confidence counts as confident: the default of publishing and reports."""
+
+PRIOR_SIGMAS = 3.0
+"""A prior position limits the search to so many of its standard deviations: 1.1 % of a round
+Gaussian lies outside."""
+DEFAULT_YAW_STD_DEG = 7.0
+"""Standard deviation of a reported heading that comes without one: magnetic compasses of the
+recorded flights are off by several degrees (docs/tracking.md)."""
+MIN_YAW_STD_DEG = 2.0
+"""Least deviation of a reported heading that searches allow for."""
+TILE_YAW_STD_DEG = 5.0
+"""The same default where views are placed by their tiles alone. It differs on purpose: 5 deg make
+three headings 6 deg apart, which is what docs/decisions/embedding.md measured; 7 deg would make
+five, and change every figure of the embedding alone."""
+DEFAULT_AGL_STD = 0.08
+"""Standard deviation of a reported height that comes without one, over the height."""
+DEFAULT_TILT_STD_DEG = 3.0
+"""Standard deviation of reported pitch and of roll that come without one, degrees: mounts lean by 1
+to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
+RADIUS_SHARE = 0.025
+"""Least radius of the confidence over the height above ground: what an error of 1.4 deg of tilt
+makes."""
+
+MAP_STD_M = 3.0
+"""Standard deviation, per axis, of a displacement of the map as a whole: it never averages out."""
+
+Evidence = Mapping[str, float]
+"""Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The position expected before a search: a round Gaussian.
+
+    `lat_deg`, `lon_deg`: its mean, WGS 84. `std_m`: standard deviation per axis, m, 0 or more; the
+    search ends at `PRIOR_SIGMAS` of them.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    std_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
+
+    time_ns: int
+    """Time of exposure, ns."""
+    yaw_deg: float
+    """Heading of the top of the picture, clockwise from true north."""
+    pitch_deg: float
+    """0 where the optical axis points straight down; positive looks ahead."""
+    roll_deg: float
+    """0 where the optical axis points straight down; positive looks left."""
+    agl_m: float
+    """Height above ground, above 0."""
+    yaw_std_deg: float | None = None
+    """Standard deviation of the heading from view to view; `DEFAULT_YAW_STD_DEG` where None."""
+    agl_std_m: float | None = None
+    """The same of the height; `DEFAULT_AGL_STD` of the height where None."""
+    prior: Prior | None = None
+    """Expected position."""
+    vel_en_mps: tuple[float, float] | None = None
+    """Velocity over ground since the view before, true east and north."""
+    tilt_std_deg: float | None = None
+    """Standard deviation of the error of pitch and of roll, mount included; 0: they are exact.
+    `DEFAULT_TILT_STD_DEG` where None."""
+    vel_std_mps: float | None = None
+    """Standard deviation of the velocity per axis; see `orthonav.core.track.tracker`."""
+    home_m: float | None = None
+    """Height above the place of take-off, as recorded; it is not used in place of `agl_m`."""
+    amsl_m: float | None = None
+    """Height above mean sea level, as recorded."""
+    hae_m: float | None = None
+    """Height above the ellipsoid of WGS 84, as recorded."""
+    below: Ground | None = None
+    """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
+    Its deviation is part of `agl_std_m`."""
+
+    def missing(self) -> list[str]:
+        """Names of the fields without which a view cannot be rectified, empty if all are there."""
+        named = {
+            "yaw_deg": self.yaw_deg,
+            "pitch_deg": self.pitch_deg,
+            "roll_deg": self.roll_deg,
+            "agl_m": self.agl_m,
+        }
+        return [name for name, value in named.items() if not math.isfinite(value)]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the camera saw at one exposure, and the telemetry of that time.
+
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified. Images of other
+    kinds are converted by `orthonav.core.grey.grey_levels`.
+    `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
+    `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
+
+    Raises `FlightError` for what is no image, `CameraError` where the aspect ratios differ.
+    """
+
+    grey: NDArray[np.uint8]
+    camera: Camera
+    telemetry: Telemetry
+
+    def __post_init__(self) -> None:
+        grey = grey_levels(self.grey)
+        object.__setattr__(self, "grey", grey)
+        object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
+
+    @classmethod
+    def of(
+        cls,
+        image: NDArray[Any],
+        camera: Camera,
+        *,
+        agl_m: float,
+        heading_deg: float | None = None,
+        pitch_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        time_s: float = 0.0,
+        prior: Prior | None = None,
+        heading_std_deg: float | None = None,
+        agl_std_m: float | None = None,
+        tilt_std_deg: float | None = None,
+        vel_en_mps: tuple[float, float] | None = None,
+    ) -> "View":
+        """A view of an image (H, W), (H, W, 3) BGR or (H, W, 4), see
+        `orthonav.core.grey.grey_levels`.
+
+        `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
+        north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
+        `time_s`: of the exposure. The standard deviations are those of `Telemetry`.
+        """
+        heading = math.nan if heading_deg is None else float(heading_deg)
+        return cls(
+            image,
+            camera,
+            Telemetry(
+                round(time_s * 1e9),
+                heading,
+                float(pitch_deg),
+                float(roll_deg),
+                float(agl_m),
+                yaw_std_deg=heading_std_deg,
+                agl_std_m=agl_std_m,
+                prior=prior,
+                vel_en_mps=vel_en_mps,
+                tilt_std_deg=tilt_std_deg,
+            ),
+        )
+
+    def __repr__(self) -> str:
+        reported = self.telemetry
+        return (
+            f"View({self.camera.width_px} x {self.camera.height_px} px, heading "
+            f"{reported.yaw_deg:.1f} deg, {reported.agl_m:.1f} m above ground)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """The position from which a view was taken, with its uncertainty.
+
+    `lat_deg`, `lon_deg`: WGS 84. `cov_en_m2` (2, 2): covariance of east and north, m2, of a correct
+    fix. `confidence`: probability that the error is below `radius_m`, 0..1, NaN where the map was
+    not calibrated. `heading_deg` (0..360) and `agl_m`: estimated, or as reported where the method
+    does not estimate them. `evidence`: the numbers behind the confidence.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    cov_en_m2: NDArray[np.float64]
+    confidence: float
+    radius_m: float
+    heading_deg: float
+    agl_m: float
+    evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+    ground_latlon_deg: tuple[float, float] | None = None
+    """Ground that the middle of the picture shows."""
+    ground_cov_en_m2: NDArray[np.float64] | None = None
+    """Covariance (2, 2) of its east and north, m2."""
+    pitch_deg: float = math.nan
+    """Pitch and roll of the camera, estimated; as reported where `pose_cov` is None."""
+    roll_deg: float = math.nan
+    pose_cov: NDArray[np.float64] | None = None
+    """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None
+    where the six were not estimated together."""
+
+    @property
+    def is_confident(self) -> bool:
+        """Whether the position may be relied on: a confidence of `CONFIDENT` or more."""
+        return self.confidence >= CONFIDENT
+
+    @property
+    def std_m(self) -> float:
+        """Standard deviation of the position along the worst direction, m; NaN where unknown."""
+        return error_ellipse(self.cov_en_m2)[0]
+
+    def __repr__(self) -> str:
+        return (
+            f"Fix({self.lat_deg:.6f}, {self.lon_deg:.6f}, std {self.std_m:.1f} m, confidence "
+            f"{self.confidence:.2f}, heading {self.heading_deg:.1f} deg)"
+        )
+
+    def tilt_deg(self, telemetry: Telemetry) -> tuple[float, float]:
+        """Pitch and roll of the camera of a view with this telemetry: those of the fix, else the
+        reported ones with the biases that the fix states."""
+        pitch, roll = (
+            stated if math.isfinite(stated) else reported + _finite(self.evidence.get(bias))
+            for stated, reported, bias in (
+                (self.pitch_deg, telemetry.pitch_deg, "pitch_bias_deg"),
+                (self.roll_deg, telemetry.roll_deg, "roll_bias_deg"),
+            )
+        )
+        return pitch, roll
+
+
+def _finite(value: float | None) -> float:
+    """The value; 0 where it is unknown."""
+    return value if value is not None and math.isfinite(value) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class NoFix:
+    """No position, and why. A value, not an exception.
+
+    `reason` is a short stable word for programs (such as `blank`, `too_dark`, `outside_map`),
+    `detail` one sentence for people.
+    """
+
+    reason: str
+    detail: str
+    evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+
+    is_confident = False
+
+    def __repr__(self) -> str:
+        return f"NoFix({self.reason}: {self.detail})"
+
+
+@dataclass(frozen=True, eq=False)
+class ViewResult:
+    """The result for one view of a flight: a line of `fixes.jsonl`.
+
+    `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
+    `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
+    track (`searching`, `tracking`, `coasting`, `lost`), None where views are placed one by one.
+    `accepted`: whether a fix met the criterion of `--accept`, None where none was given.
+    """
+
+    frame: str
+    time_ns: int
+    outcome: Fix | NoFix
+    latency_ms: float
+    state: str | None = None
+    accepted: bool | None = None
+
+    @property
+    def is_confident(self) -> bool:
+        """Whether the position may be relied on; any other fix is the best guess."""
+        if not isinstance(self.outcome, Fix):
+            return False
+        return self.outcome.is_confident if self.accepted is None else self.accepted

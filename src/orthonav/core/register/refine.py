@@ -1,0 +1,356 @@
+"""Moving a candidate to its best position, heading and scale, and judging it there.
+
+Gauss-Newton on the sum of squared differences between a view's evidence and the map's, each kind
+of evidence with its own gain, so that correlation is what is maximized; the step is found on the
+view's side, whose derivatives are made once (inverse compositional alignment, Baker and Matthews,
+IJCV 2004). The covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang
+and Zeger 1986): residuals of neighbouring pixels are not independent, so their scores are summed
+by blocks of the view, and the spread of those sums is what moves the peak.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.register.evidence import GROUPS
+from orthonav.core.register.kernel import KERNEL
+from orthonav.core.register.map_window import MapWindow
+from orthonav.core.register.pose import Pose, even_scale
+from orthonav.core.register.reference import Reference
+from orthonav.core.register.sums import FULLY_VALID, Sums, compared, sampled_planes
+from orthonav.core.register.template import BLOCKS, Template, by_steps, from_middle, gradients
+
+Array = NDArray[np.float32]
+STEPS = 6
+"""Gauss-Newton steps at most. Like the other values here without a source of their own, chosen on
+the scenes of `python -m benchmarks.real_imagery`."""
+SLACK_PX = 6
+"""Margin of the map window around the first pose: two steps of `MAX_STEP_PX`."""
+SMALL_STEP_PX = 0.03
+"""A step that moves no part of the view by more than this ends the refinement."""
+MAX_STEP_PX = 3.0
+"""Longest step: about the basin of convergence (docs/decisions/registration.md, 6)."""
+DAMPING = 1e-3
+"""Relative damping of the Gauss-Newton matrix (Levenberg and Marquardt)."""
+MIN_CORRELATION = 0.08
+"""Correlations below count as this in the gain, so that steps do not vanish."""
+WHOLE_OVERLAP = 0.97
+"""Above this overlap the Gauss-Newton matrix of the whole view is used."""
+BLOCK_SUMS = 7
+"""Numbers of each block in `SpreadSums.blocks`."""
+MIN_CURVATURE = 0.05
+"""Least curvature of a direction in the covariance, as a share of the Gauss-Newton matrix."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A view placed on the map.
+
+    `score`: weighted sum of correlations times the square root of the pixels of the level that
+    it rests on; `correlations` of the kinds of evidence, `weighted` their weighted mean;
+    `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
+    `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
+    standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
+    pixels), turn (rad) and log scale, where they were asked for; `window`: over relief, the pose
+    whose height is counted from the mean ground of the window, that of `pose` from the ground below
+    the camera.
+    """
+
+    pose: Pose
+    level: int
+    score: float
+    correlations: tuple[float, ...]
+    weighted: float
+    overlap: float
+    converged: bool
+    agreement: float = math.nan
+    blocks_t: float = math.nan
+    covariance: NDArray[np.float64] | None = None
+    window: Pose | None = None
+
+    @classmethod
+    def unjudged(cls, pose: Pose, level: int) -> "Placed":
+        """A proposed pose that was not judged yet."""
+        return cls(pose, level, math.nan, (), math.nan, math.nan, False)
+
+
+class Refiner:
+    """Refines candidates of one view at one level."""
+
+    def __init__(self, template: Template, reference: Reference) -> None:
+        self.template, self.reference = template, reference
+        self._reach_px = math.hypot(*template.mask.shape) / 2
+
+    def prepare(self) -> None:
+        """Make what threads share, so that none makes it again."""
+        if KERNEL is None:
+            _ = self.template.self_slopes, self.template.hessians
+        else:
+            _ = self.template.numbers
+
+    def place(
+        self,
+        pose: Pose,
+        steps: int = STEPS,
+        small_step_px: float = SMALL_STEP_PX,
+        *,
+        with_covariance: bool = False,
+    ) -> Placed:
+        """The view at the best pose near `pose`, within a few pixels of the level.
+
+        It ends where a step moves no part of the view by more than `small_step_px`.
+        """
+        window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
+        placed, step = self._refined(window, pose, steps, small_step_px)
+        if not with_covariance:
+            return placed
+        sums = self._spread(window, placed.pose)
+        to_map = self._to_map(placed.pose)
+        covariance = np.asarray(to_map @ sums.covariance() @ to_map.T)
+        if not placed.converged:
+            # Still moving: its last step is an error of its own.
+            covariance += np.outer(move := to_map @ step, move)
+        return replace(
+            placed, covariance=covariance, agreement=sums.agreement(), blocks_t=sums.blocks_t()
+        )
+
+    def _refined(
+        self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
+    ) -> tuple[Placed, Sequence[float]]:
+        """The best pose of so many steps at most, and the last step (4,)."""
+        if KERNEL is None:
+            return self._refined_by_numpy(window, pose, steps, small_step_px)
+        found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
+            *self._for_kernel(window, pose, steps, small_step_px)
+        )
+        numbers = score, correlations, weighted, overlap, bool(converged)
+        return Placed(Pose(*found), self.template.level, *numbers), step
+
+    def _for_kernel(
+        self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
+    ) -> tuple[object, ...]:
+        """The view beside the map at a pose, and the limits of steps."""
+        template = self.template
+        limits = (
+            *(window.row, window.col, window.unit, steps, small_step_px),
+            *(MAX_STEP_PX, DAMPING, MIN_CORRELATION, WHOLE_OVERLAP),
+        )
+        at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
+        return window.made, template.values, template.slopes, template.numbers, at, limits
+
+    def _refined_by_numpy(
+        self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
+    ) -> tuple[Placed, Sequence[float]]:
+        """`_refined` without the kernel."""
+        unit = 2.0**self.template.level
+        converged, step = False, [0.0] * 4
+        seen = best = self._compared(window, pose)
+        for _ in range(steps):
+            step = self._step(seen)
+            moves_px = self._moves_px(step)
+            share = min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
+            step = [share * each for each in step]
+            moved = seen.pose.stepped([unit * step[0], unit * step[1], *step[2:]])
+            seen = self._compared(window, moved)
+            if seen.score > best.score:
+                best = seen
+            converged = moves_px < small_step_px
+            if converged:
+                break
+        return best.placed(converged), step
+
+    def _compared(self, window: MapWindow, pose: Pose) -> "Comparison":
+        """The view beside the map under a pose."""
+        planes = sampled_planes(self.template, window, pose)
+        return Comparison(self.template, pose, compared(self.template, *planes))
+
+    def _hessian(self, seen: "Comparison") -> NDArray[np.float64]:
+        """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
+        first, second = seen.squares
+        hessians = self.template.hessians
+        if seen.overlap <= WHOLE_OVERLAP:
+            # Block by block: derivatives weigh alike within one.
+            hessians = np.tensordot(seen.shares(), self.template.block_hessians, axes=1)
+        return np.asarray(first * hessians[0] + second * hessians[1])
+
+    def _spread(self, window: MapWindow, pose: Pose) -> "SpreadSums":
+        """What the covariance at a pose is made of."""
+        if KERNEL is None:
+            pixels = _Pixels(self.template, window, pose)
+            return SpreadSums(pixels.observed(), self._hessian(pixels.seen), pixels.sums_by_block())
+        out = np.empty(2 * 16 + BLOCKS**2 * BLOCK_SUMS)
+        KERNEL.spread(*self._for_kernel(window, pose, 0, 0.0), out)
+        observed, hessian = out[:32].reshape(2, 4, 4)
+        return SpreadSums(observed, hessian, out[32:].reshape(-1, BLOCK_SUMS))
+
+    def _step(self, seen: "Comparison") -> list[float]:
+        """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
+        hessian = self._hessian(seen)
+        hessian.flat[::5] *= 1 + DAMPING
+        hessian.flat[::5] += 1e-12
+        found: list[float] = np.linalg.solve(hessian, seen.slope()).tolist()
+        return found
+
+    def _moves_px(self, step: Sequence[float]) -> float:
+        return math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3])
+
+    def _to_map(self, pose: Pose) -> NDArray[np.float64]:
+        """From steps of the window to position (level-0 px), turn and log scale: (4, 4)."""
+        to_map = np.eye(4)
+        to_map[:2, :2] = pose.linear * 2.0**self.template.level
+        return to_map
+
+
+class SpreadSums(NamedTuple):
+    """What a covariance is made of.
+
+    - `observed` (4, 4): products of the view's derivatives by the steps and the map's.
+    - `hessian` (4, 4): the Gauss-Newton matrix.
+    - `blocks` (B * B, 7): by block of the view, the derivatives (4) of the score by the steps, the
+      products of view and map of both kinds of evidence, and the pixels that count.
+    """
+
+    observed: NDArray[np.float64]
+    hessian: NDArray[np.float64]
+    blocks: NDArray[np.float64]
+
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance (4, 4) of the steps.
+
+        Noise and change have derivatives too: counted as if they held the view in place, they
+        would make the position appear known along ground that runs in one direction. So the
+        curvature is that of the view's derivatives times the map's.
+        """
+        terms = self.blocks[:, :4]
+        spread = terms.T @ terms * (BLOCKS**2 / (BLOCKS**2 - 4))
+        inverse = _bounded_inverse((self.observed + self.observed.T) / 2, self.hessian)
+        return np.asarray(inverse @ spread @ inverse.T)
+
+    def agreement(self) -> float:
+        """Share of the blocks of a view whose evidence correlates positively."""
+        sums, counts = self.blocks[:, 4] + self.blocks[:, 5], self.blocks[:, 6]
+        used = counts > 0.25 * counts.max()
+        return float((sums[used] > 0).mean()) if used.any() else 0.0
+
+    def blocks_t(self) -> float:
+        """Sum of the gradients' products over the blocks of a view, divided by the root of the sum
+        of their squares: large where many blocks agree, not a few strong ones."""
+        sums = self.blocks[:, 4]
+        return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))
+
+
+def _bounded_inverse(
+    observed: NDArray[np.float64], hessian: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Inverse (P, P) of `observed`, no direction held less than a share of what `hessian` says."""
+    own = np.sqrt(np.diag(hessian)) + 1e-12
+    values, vectors = np.linalg.eigh(observed / np.outer(own, own))
+    inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
+    return np.asarray(inverse / np.outer(own, own))
+
+
+class Comparison:
+    """A view beside the map under one pose.
+
+    `correlations`, `squares` and `gains` by kind of evidence: the step is made of gain * map -
+    correlation^2 * view, so that its part of each kind is what moves the peak, weighted by what
+    that kind can say: steps from the plain difference would fall short by the square of the
+    correlation.
+    """
+
+    def __init__(self, template: Template, pose: Pose, sums: Sums) -> None:
+        self.template, self.pose, self._sums = template, pose, sums
+        pixels = template.pixels - float(self._sums.left_pixels.sum())
+        self.overlap = pixels / max(template.pixels, 1.0)
+        # Rounding of a difference must not make it negative.
+        own = np.maximum(template.energies - self._sums.left_energies, 0.0).tolist()
+        found, squares, gains = [], [], []
+        for product, energy, mine in zip(
+            self._sums.products.tolist(), self._sums.energies.tolist(), own, strict=True
+        ):
+            correlation = product / math.sqrt(energy * mine) if energy * mine > 0 else 0.0
+            square = max(correlation, MIN_CORRELATION) ** 2
+            found.append(correlation)
+            squares.append(square)
+            gains.append(math.sqrt(square * mine / energy) if energy > 0 else 0.0)
+        self.correlations, self.squares, self.gains = tuple(found), tuple(squares), tuple(gains)
+        total = sum(w * c for w, c in zip(template.weights, found, strict=True))
+        self.weighted = total / sum(template.weights)
+        self.score = total * math.sqrt(max(pixels, 0.0)) * even_scale(pose.log_scale)
+
+    def slope(self) -> NDArray[np.float64]:
+        """Derivatives (4,) of the score by the steps."""
+        own = self.template.self_slopes - self._sums.left_slopes
+        return np.asarray(self.gains @ self._sums.slopes - self.squares @ own)
+
+    def shares(self) -> NDArray[np.float64]:
+        """Share of each block of the view (B * B) that lies on valid map."""
+        pixels = self.template.block_pixels
+        return np.asarray((pixels - self._sums.left_pixels) / np.maximum(pixels, 1.0))
+
+    def placed(self, converged: bool) -> Placed:
+        """The numbers of this pose."""
+        return Placed(
+            self.pose,
+            self.template.level,
+            self.score,
+            self.correlations,
+            self.weighted,
+            self.overlap,
+            converged=converged,
+        )
+
+
+class _Pixels:
+    """The pixels of a comparison: `map` (3, H, W) as the view's window shows it, `counts` (H, W), 1
+    where both are valid, and `residual` (3, H, W), gain * map - correlation^2 * view."""
+
+    def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
+        planes, valid = sampled_planes(template, window, pose)
+        seen = Comparison(template, pose, compared(template, planes, valid, slopes=False))
+        self.seen = seen
+        self.counts = template.mask * (valid > FULLY_VALID)
+        self.map = planes * self.counts
+        self._view = template.channels * self.counts
+        gains, squares = (np.repeat(each, [2, 1]) for each in (seen.gains, seen.squares))
+        self.residual = np.empty_like(self.map)
+        for at in range(len(self.map)):
+            cv2.addWeighted(
+                self.map[at], gains[at], self._view[at], -squares[at], 0, dst=self.residual[at]
+            )
+
+    def observed(self) -> NDArray[np.float64]:
+        """Products (4, 4) of the view's derivatives by the steps and the map's."""
+        mine = self.seen.template.gradients
+        theirs = gradients(self.map, self.counts)
+        theirs *= np.repeat(self.seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
+        x, y = from_middle(*self.seen.template.mask.shape)
+        rows, cols = (np.stack([np.ones(each.size, np.float32), each.ravel()]) for each in (y, x))
+        sums = np.empty((2, 4, 2, 2))  # of the view along x and y, of the map by the steps
+        for at in range(2):
+            products = mine[0, at] * theirs[0]
+            for one, other in zip(mine[1:, at], theirs[1:], strict=True):
+                products += one * other
+            sums[at] = rows @ by_steps(products) @ cols.T  # once, and times x and y
+        across, down = sums
+        return np.stack(
+            [
+                across[:, 0, 0],
+                down[:, 0, 0],
+                down[:, 0, 1] - across[:, 1, 0],
+                across[:, 0, 1] + down[:, 1, 0],
+            ]
+        )
+
+    def sums_by_block(self) -> NDArray[np.float64]:
+        """`SpreadSums.blocks`."""
+        terms = by_steps(np.einsum("cphw,chw->phw", self.seen.template.gradients, self.residual))
+        products = self._view * self.map
+        kinds = [products[group].sum(axis=0) for group in GROUPS]
+        each = np.stack([*terms, *kinds, self.counts])
+        return self.seen.template.block_sums(each).astype(np.float64).T

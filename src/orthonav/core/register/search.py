@@ -1,0 +1,429 @@
+"""Candidates: where, and how turned and scaled, a view might lie in a window of the map.
+
+The view's evidence is laid on the window at every position at once by FFT, for each heading and
+scale of a bank. Evidence of the map is divided by its local energy beforehand, so that one
+backward transform gives the sum over all kinds of evidence. What comes out is the correlation
+times the square root of the pixels that it rests on: pure chance then gives values alike at every
+scale, whereas correlation alone favours small views.
+"""
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
+
+from orthonav.core.geo.camera import counted_from_centres
+from orthonav.core.register.evidence import GROUPS
+from orthonav.core.register.kernel import KERNEL
+from orthonav.core.register.memory import thread_memory
+from orthonav.core.register.pose import Pose, even_scale, rotation
+from orthonav.core.register.reference import cut
+from orthonav.core.register.scale_map import ScaleMap
+from orthonav.core.register.template import Template, energy_of, turn_planes
+
+Array = NDArray[np.float32]
+ENERGY_FLOOR = 0.3
+"""Share of the typical energy added to the local one, so that blank ground is not amplified."""
+
+
+POSES_AT_ONCE = 6
+"""Poses that a thread takes at a time."""
+PLACES_AT_ONCE = 50
+"""Poses whose surroundings a thread searches at a time."""
+WIDE = 8
+"""Columns or rows that the kernel transforms together."""
+LONGEST_PX = 32768
+"""Longest side of a window that the kernel takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Turns (rad) and log scales (natural) that are tried, each with each."""
+
+    turns_rad: NDArray[np.float64]
+    log_scales: NDArray[np.float64]
+
+    @property
+    def poses(self) -> list[tuple[float, float]]:
+        """All pairs (turn, log scale)."""
+        return [(float(t), float(s)) for s in self.log_scales for t in self.turns_rad]
+
+
+def bank(
+    turn_std_rad: float | None,
+    log_scale_std: float,
+    *,
+    turn_step_rad: float,
+    scale_step: float,
+    sigmas: float,
+) -> Bank:
+    """Turns and scales that reach `sigmas` standard deviations; all turns where `None`."""
+    if turn_std_rad is None or sigmas * turn_std_rad + turn_step_rad / 2 >= math.pi:
+        count = math.ceil(2 * math.pi / turn_step_rad)
+        turns = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
+    else:
+        turns = _spread(sigmas * turn_std_rad, turn_step_rad)
+    return Bank(turns, _spread(sigmas * log_scale_std, scale_step))
+
+
+def _spread(reach: float, step: float) -> NDArray[np.float64]:
+    """Values around 0, `step` apart, so that nothing within `reach` is farther than half a step."""
+    count = max(1, math.ceil(2 * reach / step))
+    return (np.arange(count, dtype=np.float64) - (count - 1) / 2) * step
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A peak: `score` (correlation times square root of pixels) at a pose."""
+
+    score: float
+    pose: Pose
+
+
+class SearchWindow:
+    """A window of the map made ready to be searched: evidence (H, W, 4) at a level.
+
+    (`row`, `col`) is its first pixel on that level of the sheet; `view_px` about the side of the
+    views that will be laid on it; within `margin_px` of the border no middle of a view is sought.
+    `half_px`: the largest `posed_half_px` of these views; None: not known yet.
+    """
+
+    def __init__(
+        self,
+        made: Array,
+        level: int,
+        row: int,
+        col: int,
+        view_px: int,
+        margin_px: int = 0,
+        half_px: int | None = None,
+    ) -> None:
+        self.level, self.row, self.col, self.margin_px = level, row, col, margin_px
+        self.height, self.width = made.shape[:2]
+        if half_px is None:
+            # Beyond the border the other side shows: harmless where the window is far larger.
+            pad, least = view_px if min(self.height, self.width) < 3 * view_px else 0, view_px
+        else:
+            # A view reaches so far beyond the border; beyond it is nothing.
+            pad, least = max(half_px - margin_px, 0), 2 * half_px
+        self.size = (
+            next_fast_len(max(self.height + pad, least), real=True),
+            next_fast_len(max(self.width + pad, least), real=True),
+        )
+        self._made, self._view_px = made, view_px
+
+    @cached_property
+    def channels(self) -> Array:
+        """The evidence (H, W, 3) divided by its local energy."""
+        return self._normalized()
+
+    @cached_property
+    def spectra(self) -> NDArray[np.complex64]:
+        """Spectra (3, h, w) of the channels, padded to `size`; the channels are not kept."""
+        return self._transformed()
+
+    @cached_property
+    def spectra_by_columns(self) -> Array:
+        """The same as the kernel takes them (G, 3, h, 16): eight columns, real parts first."""
+        spectra = self._transformed()
+        channels, rows, cols = spectra.shape
+        out = np.zeros((-(-cols // WIDE), channels, rows, 2, WIDE), np.float32)
+        for group, into in enumerate(out):
+            some = spectra[..., WIDE * group : WIDE * (group + 1)]
+            into[..., 0, : some.shape[2]], into[..., 1, : some.shape[2]] = some.real, some.imag
+        return out.reshape(len(out), channels, rows, 2 * WIDE)
+
+    @property
+    def by_kernel(self) -> bool:
+        """Whether the kernel searches it: where there is one, and no side is too long for it."""
+        return KERNEL is not None and max(self.size) <= LONGEST_PX
+
+    def prepare(self, template: Template) -> None:
+        """Make what threads share when they search for a view, so that none makes it again."""
+        _ = self.spectra_by_columns if self.by_kernel else (self.spectra, template.interleaved)
+
+    def _transformed(self) -> NDArray[np.complex64]:
+        planes = np.moveaxis(self._normalized(), 2, 0)
+        return np.asarray(rfft2(planes, s=self.size), np.complex64)
+
+    def _normalized(self) -> Array:
+        groups = (self._made[..., group] for group in GROUPS)
+        made = [_by_local_energy(group, self._made[..., 3], self._view_px) for group in groups]
+        return np.concatenate(made, axis=2)
+
+
+def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
+    """Channels (H, W, C) divided by the root of their mean energy in windows as large as views."""
+    energy = np.einsum("ijc,ijc->ij", channels, channels)
+    side = min(max(3, view_px // 2), 2 * min(energy.shape) - 1)
+    local = cv2.blur(energy, (side, side)) / np.maximum(cv2.blur(counts, (side, side)), 0.1)
+    typical = float(energy.sum() / max(counts.sum(), 1.0))
+    return np.asarray(channels / np.sqrt(local + ENERGY_FLOOR * typical + 1e-12)[..., None])
+
+
+def search(
+    template: Template,
+    window: SearchWindow,
+    poses: list[tuple[float, float]],
+    count: int,
+    scales: ScaleMap | None = None,
+    pool: Executor | None = None,
+) -> list[Candidate]:
+    """The `count` best candidates, best first, not closer together than an eighth of the view.
+
+    With `scales` every place is compared under the scales that are expected there only. The threads
+    of `pool` share the poses; what comes out does not depend on them.
+    """
+    share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
+    parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
+    window.prepare(template)
+    surfaces = (pool.map if pool else map)(
+        lambda part: _best_of(template, window, poses, part, scales), parts
+    )
+    best, which = next(surfaces)
+    for scores, numbers in surfaces:
+        better = cv2.compare(scores, best, cv2.CMP_GT)
+        cv2.copyTo(scores, better, best)
+        cv2.copyTo(numbers, better, which)
+    if window.margin_px:
+        inner = np.zeros(best.shape, np.bool_)
+        inner[window.margin_px : -window.margin_px, window.margin_px : -window.margin_px] = True
+        best[~inner] = -np.inf
+    apart = max(1, round(math.sqrt(template.pixels) / 8))
+    peaks = _peaks(best, count, apart)
+    unit = 2.0**template.level
+    found = []
+    for row, col in peaks:
+        x, y = _between(best, row, col)
+        turn, log_scale = poses[int(which[row, col])]
+        pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
+        found.append(Candidate(float(best[row, col]), pose))
+    return found
+
+
+def best_near(
+    template: Template, window: SearchWindow, poses: Sequence[Pose], reach_px: float
+) -> list[Candidate]:
+    """The best place of a view within `reach_px` (level 0) of each pose, along each axis, under its
+    heading and scale."""
+    unit = 2.0**template.level
+    reach = math.ceil(reach_px / unit)
+    places = np.array(
+        [
+            (p.x_px / unit - window.col, p.y_px / unit - window.row, p.turn_rad, p.log_scale)
+            for p in poses
+        ]
+    ).reshape(-1, 4)
+    found = np.empty((len(places), 3))
+    if KERNEL is None:
+        for place, into in zip(places, found, strict=True):
+            into[:] = _best_near(template, window, place, reach)
+    else:
+        KERNEL.near(window.channels, template.values, template.weights, places, reach, found)
+    found[:, 1] = (window.col + found[:, 1]) * unit
+    found[:, 2] = (window.row + found[:, 2]) * unit
+    return [
+        Candidate(score, Pose(x, y, pose.turn_rad, pose.log_scale))
+        for (score, x, y), pose in zip(found.tolist(), poses, strict=True)
+    ]
+
+
+def _best_near(
+    template: Template, window: SearchWindow, place: NDArray[np.float64], reach: int
+) -> tuple[float, float, float]:
+    """Score, x and y of the best place within `reach` of (x, y, turn, log scale), pixels of the
+    window; without the kernel."""
+    x, y, turn, log_scale = place.tolist()
+    half = posed_half_px(template, log_scale)
+    # Middles of views lie on first corners of pixels, from these on.
+    row, col = round(y) - reach, round(x) - reach
+    posed = posed_channels(template, turn, log_scale)
+    around = cut(window.channels, row - half, col - half, *2 * [2 * (half + reach)])
+    surface = np.asarray(
+        cv2.matchTemplate(around, np.ascontiguousarray(np.moveaxis(posed, 0, 2)), cv2.TM_CCORR),
+        np.float32,
+    )
+    down, right = divmod(int(surface.argmax()), surface.shape[1])
+    x, y = _between(surface, down, right)
+    return float(surface[down, right]), col + x, row + y
+
+
+def _best_of(
+    template: Template,
+    window: SearchWindow,
+    poses: list[tuple[float, float]],
+    part: range,
+    scales: ScaleMap | None,
+) -> tuple[Array, NDArray[np.int32]]:
+    """The best score (H, W) of some of the poses at every place, and the number of its pose."""
+    shape = window.height, window.width
+    expected = None if scales is None else scales.over(window.level, window.row, window.col, shape)
+    if window.by_kernel:
+        return _best_by_kernel(template, window, poses, part, scales, expected)
+    best = np.full(shape, -np.inf, np.float32)
+    which = np.zeros(shape, np.int32)
+    numbers = np.empty(shape, np.int32)
+    scratch = _Scratch(window)
+    for number in part:
+        turn, log_scale = poses[number]
+        scores = scratch.scores(template, turn, log_scale)
+        if scores is None:
+            continue
+        better = cv2.compare(scores, best, cv2.CMP_GT)
+        if scales is not None and expected is not None:
+            low, high = scales.reach(log_scale)
+            better = cv2.bitwise_and(better, cv2.inRange(expected, low, high))
+        numbers.fill(number)
+        cv2.copyTo(scores, better, best)
+        cv2.copyTo(numbers, better, which)
+    return best, which
+
+
+def _best_by_kernel(
+    template: Template,
+    window: SearchWindow,
+    poses: list[tuple[float, float]],
+    part: range,
+    scales: ScaleMap | None,
+    expected: Array | None,
+) -> tuple[Array, NDArray[np.int32]]:
+    """The same by the kernel; `expected` (H, W): log scales expected at every place."""
+    bands = -(-window.height // (2 * WIDE))
+    best = np.full((bands, window.size[1], 2 * WIDE), -np.inf, np.float32)
+    which = np.zeros(best.shape, np.int32)
+    reach = (-math.inf, math.inf)
+    tried = np.array(
+        [
+            (turn, log_scale, *(scales.reach(log_scale) if scales else reach))
+            for turn, log_scale in (poses[number] for number in part)
+        ]
+    )
+    KERNEL.search(
+        *(window.spectra_by_columns, template.values, template.weights, tried, part.start),
+        *(best, which, None if expected is None else _in_bands(expected, best.shape)),
+    )
+    return _from_bands(best, window), _from_bands(which, window)
+
+
+def _in_bands(values: Array, shape: tuple[int, ...]) -> Array:
+    """Values (H, W) as the kernel takes them (B, C, 16): bands of sixteen rows, column by column;
+    NaN beyond them."""
+    bands, cols, rows = shape
+    out = np.full((bands * rows, cols), np.nan, np.float32)
+    out[: values.shape[0], : values.shape[1]] = values
+    return np.ascontiguousarray(out.reshape(bands, rows, cols).swapaxes(1, 2))
+
+
+def _from_bands(values: NDArray[Any], window: SearchWindow) -> NDArray[Any]:
+    """Values (H, W) of the window from what the kernel made (B, C, 16)."""
+    rows = values.swapaxes(1, 2).reshape(-1, values.shape[1])
+    return np.ascontiguousarray(rows[: window.height, : window.width])
+
+
+class _Scratch:
+    """Memory of one search, used again for every pose."""
+
+    def __init__(self, window: SearchWindow) -> None:
+        self._window = window
+        rows, cols = window.size
+        half = cols // 2 + 1
+        # Real and imaginary parts: three channels, their sum, and one product.
+        made = thread_memory("search", 2 * 5 * rows * half).view(np.complex64)
+        self._spectra = made[: 3 * rows * half].reshape(3, rows, half)
+        self._total, self._product = made[3 * rows * half :].reshape(2, rows, half)
+
+    def scores(self, template: Template, turn: float, log_scale: float) -> Array | None:
+        """Score (H, W) of the view's middle lying on each pixel's first corner; None if the view
+        does not fit into the window."""
+        window = self._window
+        half = posed_half_px(template, log_scale)
+        rows, cols = window.size
+        if 2 * half > min(rows, cols):
+            return None
+        # Turned by half a turn, for a product of spectra to be a correlation; the middle goes to
+        # the first pixel, what lies before it wraps to the end.
+        posed = posed_channels(template, turn, log_scale)[:, ::-1, ::-1]
+        strip = np.zeros((3, 2 * half, cols), np.float32)
+        strip[:, :, : half + 1] = posed[:, :, half - 1 :]
+        strip[:, :, cols - half + 1 :] = posed[:, :, : half - 1]
+        along = rfft(strip, axis=2)
+        self._spectra[:, : half + 1] = along[:, half - 1 :]
+        self._spectra[:, half + 1 : rows - half + 1] = 0
+        self._spectra[:, rows - half + 1 :] = along[:, : half - 1]
+        spectra = fft(self._spectra, axis=1, overwrite_x=True)
+        np.multiply(window.spectra[0], spectra[0], out=self._total)
+        for number in (1, 2):
+            np.multiply(window.spectra[number], spectra[number], out=self._product)
+            np.add(self._total, self._product, out=self._total)
+        surface = irfft2(self._total, s=window.size, overwrite_x=True)
+        return np.asarray(surface, np.float32)[: window.height, : window.width]
+
+
+def posed_half_px(template: Template, log_scale: float) -> int:
+    """Half the side of the square in which a template fits under any turn."""
+    return math.ceil(math.exp(log_scale) * math.hypot(*template.mask.shape) / 2) + 1
+
+
+def largest_half_px(template: Template, poses: Sequence[tuple[float, float]]) -> int:
+    """The largest `posed_half_px` of a template under poses (turn, log scale)."""
+    return posed_half_px(template, max(log_scale for _, log_scale in poses))
+
+
+def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
+    """Channels (3, P, P) of a template as the map would show them, its middle in theirs.
+
+    Each kind of evidence has the norm of its weight over `even_scale`, so that scores of all scales
+    compare.
+    """
+    height, width = template.mask.shape
+    half = posed_half_px(template, log_scale)
+    linear = rotation(turn, math.exp(log_scale))
+    move = np.array([half, half]) - linear @ [width / 2, height / 2]
+    matrix = np.vstack([np.column_stack([linear, move]), [0, 0, 1]])
+    centred = counted_from_centres(matrix)
+    size = 2 * half, 2 * half
+    warped = np.asarray(cv2.warpAffine(template.interleaved, centred[:2], size), np.float32)
+    planes = np.empty((2 + warped.shape[2], *warped.shape[:2]), np.float32)
+    posed, scratch = planes[2:], planes[:2]
+    turn_planes(warped, turn, posed, scratch)
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        energy = energy_of(posed[group])
+        even = even_scale(-log_scale)
+        posed[group] *= np.float32(even * weight / math.sqrt(energy) if energy > 0 else 0.0)
+    return posed
+
+
+def _peaks(scores: Array, count: int, apart: int) -> list[tuple[int, int]]:
+    """Rows and columns of the `count` highest local maxima, at least `apart` from each other."""
+    side = 2 * apart + 1
+    highest = cv2.dilate(scores, np.ones((side, side), np.uint8))
+    rows, cols = np.nonzero((scores >= highest) & np.isfinite(scores))
+    values = scores[rows, cols]
+    if len(values) > count:
+        kept = np.argpartition(-values, count)[:count]
+        rows, cols, values = rows[kept], cols[kept], values[kept]
+    order = np.argsort(-values, kind="stable")
+    return [(int(rows[i]), int(cols[i])) for i in order]
+
+
+def _between(scores: Array, row: int, col: int) -> tuple[float, float]:
+    """Peak (x, y) in pixels, by a parabola on each axis."""
+
+    def offset(before: float, at: float, after: float) -> float:
+        bend = before - 2 * at + after
+        return max(-0.5, min(0.5, (before - after) / (2 * bend))) if bend < 0 else 0.0
+
+    height, width = scores.shape
+    x, y = float(col), float(row)
+    if 0 < col < width - 1:
+        x += offset(*(float(v) for v in scores[row, col - 1 : col + 2]))
+    if 0 < row < height - 1:
+        y += offset(*(float(v) for v in scores[row - 1 : row + 2, col]))
+    return x, y

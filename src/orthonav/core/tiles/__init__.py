@@ -1,0 +1,1 @@
+"""Tiles: representations of images, their embeddings, and the search by scalar product."""

@@ -1,0 +1,140 @@
+"""Edges by a network from a file: `onnx:weights=PATH`.
+
+Di Piazza et al. 2024 name learnt edges as the next step. Any network will do that takes "grey"
+(1, 1, H + 2 m, W + 2 m) float32, grey levels as 0 to 1 with a margin of m pixels, and gives "edges"
+(1, 1, H, W) float32, positive where there is an edge; H and W are free. `python -m
+experiments.paper.between_dates` makes one. onnxruntime runs it, and nothing else of the file is
+executed. A map stores the SHA-256 of the network, and flies with that network only.
+"""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import VariantError
+from orthonav.core.extras import needed
+from orthonav.core.files import require_file
+
+VARIABLE = "ORTHONAV_EDGES"
+PROBE_PX, LARGEST_MARGIN_PX = 96, 32
+LARGEST_BYTES = 64 << 20
+"""A network above this is not meant for an aircraft; nothing larger is read."""
+
+
+@dataclass(frozen=True)
+class LearnedEdges:
+    """Binary edges of a network in an ONNX file.
+
+    - `weights`: path of the file; by default ORTHONAV_EDGES. Maps do not store it.
+    - `sha256`: digest of the file in hexadecimal; by default that of the file that is there. Maps
+      store it, so that a view is never compared with edges of another network.
+
+    Raises `MissingFileError` without the file, `MissingExtraError` without onnxruntime, and
+    `VariantError` for a file with another digest or one that holds no such network.
+    """
+
+    weights: str = ""
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise VariantError(
+                f"onnx edges need a network: give --edges onnx:weights=PATH, or set {VARIABLE}"
+            )
+        if not self.sha256:
+            object.__setattr__(self, "sha256", hashlib.sha256(_read(self.path)).hexdigest())
+        _network(self.path, self.sha256)  # fails here, not at the first view
+
+    @property
+    def path(self) -> str:
+        """Path of the network: `weights`, else ORTHONAV_EDGES."""
+        return self.weights or os.environ.get(VARIABLE, "")
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C."""
+        return 1
+
+    @property
+    def margin_px(self) -> int:
+        """Radius of influence of a pixel on the edges."""
+        return _network(self.path, self.sha256)[1]
+
+    def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Edges (1, H, W), 1 on an edge, else 0; none along the border of `valid`.
+
+        Values of pixels that are not valid have no influence.
+        """
+        out = np.zeros((1, *grey.shape), np.float32)
+        if not valid.any():
+            return out
+        session, margin = _network(self.path, self.sha256)
+        filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+        out[0] = _run(session, np.pad(filled.astype(np.float32) / 255, margin, mode="edge")) > 0
+        if not valid.all():
+            kernel = np.ones((2 * margin + 1,) * 2, np.uint8)
+            inner = cv2.erode(valid.astype(np.uint8), kernel, borderValue=1)
+            out[0][inner.reshape(valid.shape) == 0] = 0
+        return out
+
+
+def _read(path: str) -> bytes:
+    """The file, up to a limit; raises `MissingFileError` or `VariantError`."""
+    with require_file(Path(path), "edge network").open("rb") as stream:
+        data = stream.read(LARGEST_BYTES + 1)
+    if len(data) > LARGEST_BYTES:
+        raise VariantError(f"edge network is larger than {LARGEST_BYTES >> 20} MiB: {path}")
+    return data
+
+
+@lru_cache(maxsize=4)
+def _network(path: str, sha256: str) -> tuple[Any, int]:
+    """onnxruntime's session of a network and its margin in pixels; one session serves all threads.
+
+    Raises as `LearnedEdges`.
+    """
+    data = _read(path)
+    found = hashlib.sha256(data).hexdigest()
+    if found != sha256:
+        raise VariantError(
+            f"map was made with another edge network (SHA-256 {sha256[:12]}, this has "
+            f"{found[:12]}); give the one it was made with: {path}"
+        )
+    runtime = needed("onnxruntime", "neural", "edges by a network")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        shape = _run(session, np.zeros((PROBE_PX, PROBE_PX + 2), np.float32)).shape
+    except Exception as error:
+        # Its errors have no common class below Exception.
+        raise VariantError(
+            f'no network from "grey" (1, 1, H, W) to "edges", float32: {path} ({error})'
+        ) from error
+    margin, odd = divmod(PROBE_PX - shape[-1] + 2, 2) if len(shape) == 2 else (-1, 0)
+    if odd or shape != (PROBE_PX - 2 * margin, PROBE_PX + 2 - 2 * margin):
+        raise VariantError(
+            f"edges must be as large as the grey levels less the same margin on each side, got "
+            f"{shape} of {(PROBE_PX, PROBE_PX + 2)}: {path}"
+        )
+    if not 0 <= margin <= LARGEST_MARGIN_PX:
+        raise VariantError(
+            f"edges must have a margin of 0 to {LARGEST_MARGIN_PX} px, got {margin}: {path}"
+        )
+    return session, margin
+
+
+def _run(session: Any, levels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What the network gives for grey levels (H, W); (h, w) where it gives one channel."""
+    found = session.run(["edges"], {"grey": levels[None, None]})[0]
+    return np.asarray(found[0, 0] if found.ndim == 4 and found.shape[:2] == (1, 1) else found)

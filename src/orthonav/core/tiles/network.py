@@ -1,0 +1,312 @@
+"""Neural encoders as they fly: an ONNX graph in the map, run by onnxruntime.
+
+Embeddings of Di Piazza et al. 2024, section Methodology: an auto-encoder's 1024 numbers or a
+triplet network's. How they are learnt is in `orthonav.research`; nothing here needs PyTorch.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import MapFileError, VariantError
+from orthonav.core.extras import needed
+
+SIMILARITIES = ("product", "cosine")
+PRECISIONS = ("float32", "float16", "int8")
+MININGS = ("hardest", "semihard")
+CHUNK_TILES = 16
+"""Tiles run at once: enough to keep a core busy, few enough for a small machine's memory."""
+OPERATORS = frozenset(
+    [
+        "Add",
+        "AveragePool",
+        "Cast",
+        "Concat",
+        "Conv",
+        "DequantizeLinear",
+        "Flatten",
+        "Gemm",
+        "GlobalAveragePool",
+        "Identity",
+        "LeakyRelu",
+        "MaxPool",
+        "QuantizeLinear",
+        "Relu",
+    ]
+)
+"""What an encoder may consist of: nothing that loops, branches, reads files or makes big arrays."""
+
+
+@dataclass(frozen=True)
+class AutoEncoderRecipe:
+    """Parameters of the auto-encoder.
+
+    `dims`: numbers per tile. `width`: channels before its dense layer, a multiple of 8; 512 gives
+    the paper's 172,506,561 parameters. `epochs`, `batch`, `learning_rate`: of AdamW. `similarity`:
+    "product" compares embeddings as they come (the paper), "cosine" scaled to length 1. `precision`
+    of what flies: "float32", "float16" (weights only) or "int8".
+    """
+
+    dims: int = 1024
+    width: int = 512
+    epochs: int = 200
+    batch: int = 32
+    learning_rate: float = 3e-4
+    similarity: str = "product"
+    precision: str = "float32"
+
+    def __post_init__(self) -> None:
+        _require("dims", self.dims, 1 <= self.dims <= 4096, "1 to 4096")
+        fits = 8 <= self.width <= 1024 and self.width % 8 == 0
+        _require("width", self.width, fits, "a multiple of 8, 8 to 1024")
+        _require_training(self)
+
+
+@dataclass(frozen=True)
+class TripletRecipe:
+    """Parameters of the triplet network.
+
+    `width`: channels of its first stage, 64 in ResNet34; embeddings have 16 times as many numbers.
+    `margin`: alpha of the loss, in squared distances of embeddings as they are compared. `mining`:
+    "hardest" or "semihard" negatives. `apart`: how far, in tile widths, another tile of the batch
+    must lie along rows or columns to count as another place: neighbours that overlap nearly wholly
+    cannot be separated by a loss. The others are as in `AutoEncoderRecipe`, for Adam.
+    """
+
+    width: int = 64
+    epochs: int = 200
+    batch: int = 512
+    learning_rate: float = 1e-3
+    margin: float = 1.0
+    mining: str = "hardest"
+    apart: float = 0.25
+    similarity: str = "product"
+    precision: str = "float32"
+
+    def __post_init__(self) -> None:
+        _require("width", self.width, 1 <= self.width <= 256, "1 to 256")
+        _require("margin", self.margin, 0 < self.margin <= 1e6, "above 0, at most 1000000")
+        _require("mining", self.mining, self.mining in MININGS, " or ".join(MININGS))
+        _require("apart", self.apart, 0 <= self.apart <= 100, "0 to 100")
+        _require("batch", self.batch, self.batch >= 2, "at least 2")
+        _require_training(self)
+
+    @property
+    def dims(self) -> int:
+        """Numbers per embedding."""
+        return 16 * self.width
+
+
+def _require_training(recipe: AutoEncoderRecipe | TripletRecipe) -> None:
+    _require("epochs", recipe.epochs, 1 <= recipe.epochs <= 100_000, "1 to 100000")
+    _require("batch", recipe.batch, 1 <= recipe.batch <= 65_536, "1 to 65536")
+    rate = recipe.learning_rate
+    _require("learning_rate", rate, 0 < rate <= 1, "above 0, at most 1")
+    similarity, precision = recipe.similarity, recipe.precision
+    _require("similarity", similarity, similarity in SIMILARITIES, " or ".join(SIMILARITIES))
+    _require("precision", precision, precision in PRECISIONS, " or ".join(PRECISIONS))
+
+
+def _require(name: str, value: object, fits: bool, what: str) -> None:
+    if not fits:
+        raise VariantError(f"{name} must be {what}, got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkEmbedder:
+    """A learnt encoder: `onnx` is its graph as bytes (n,) uint8, `threads` what one run may use.
+
+    The graph takes "maps" (N, C, S, S) and gives "embedding" (N, D), both float32, N free. Raises
+    `MapFileError` for bytes that are no such graph, contain anything but plain layers or point to
+    other files: at once where that can be seen without onnxruntime, else at first use.
+    `MissingExtraError` comes at first use where onnxruntime is not installed.
+    """
+
+    recipe: AutoEncoderRecipe | TripletRecipe
+    onnx: NDArray[np.uint8]
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.onnx.dtype != np.uint8 or self.onnx.ndim != 1:
+            raise MapFileError(f"encoder must be bytes, got {self.onnx.dtype} {self.onnx.shape}")
+        check_graph(self.onnx)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled or copied: all but the running session."""
+        return {"recipe": self.recipe, "onnx": self.onnx, "threads": self.threads}
+
+    @property
+    def dims(self) -> int:
+        """Numbers per embedding."""
+        return self.recipe.dims
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Channels, rows and columns (C, S, S) of what is embedded."""
+        _, channels, height, width = self._session.get_inputs()[0].shape
+        return int(channels), int(height), int(width)
+
+    def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Embedding (D,) of a view's representation (C, S, S), zero where not valid (S, S).
+
+        Raises `ValueError` if the shapes are not those that the encoder was learnt for.
+        """
+        if valid.shape != maps.shape[1:]:
+            raise ValueError(f"valid must be {maps.shape[1:]}, got {valid.shape}")
+        return np.asarray(self.views(np.where(valid, maps, np.float32(0))[None])[0])
+
+    def views(self, maps: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Embeddings (N, D) of representations (N, C, S, S), zero where not valid.
+
+        Unit vectors for the similarity "cosine" (zero for one without length), as the network
+        gives them for "product". Each is the same whatever comes beside it up to rounding. Raises
+        `ValueError` if the shapes are not those that the encoder was learnt for.
+        """
+        if maps.ndim != 4 or maps.shape[1:] != self.shape:
+            raise ValueError(f"maps must be (N, {self.shape}), got {maps.shape}")
+        out = np.empty((len(maps), self.dims), dtype=np.float32)
+        for start in range(0, len(maps), CHUNK_TILES):
+            part = np.ascontiguousarray(maps[start : start + CHUNK_TILES], dtype=np.float32)
+            out[start : start + CHUNK_TILES] = self._session.run(["embedding"], {"maps": part})[0]
+        if not np.isfinite(out).all():
+            raise MapFileError("map's encoder gives numbers that are not finite")
+        if self.recipe.similarity == "cosine":
+            out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), np.float32(1e-12))
+        return out
+
+    def parts(self) -> dict[str, NDArray[Any]]:
+        """Arrays to be stored in the map."""
+        return {"onnx": self.onnx}
+
+    @cached_property
+    def _session(self) -> Any:
+        """onnxruntime's session: made at first use, may be used by several threads at once."""
+        runtime = _onnxruntime()
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = self.threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        options.add_session_config_entry("session.load_model_format", "ONNX")
+        # Threads that wait must not use time that the aircraft needs.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            session = runtime.InferenceSession(
+                self.onnx.tobytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:
+            # Its errors have no common class below Exception.
+            raise MapFileError(f"map's encoder cannot be loaded: {error}") from error
+        self._check_interface(session)
+        return session
+
+    def _check_interface(self, session: Any) -> None:
+        sides = [
+            [(end.name, end.type, list(end.shape)) for end in ends]
+            for ends in (session.get_inputs(), session.get_outputs())
+        ]
+        match sides:
+            case [
+                [("maps", "tensor(float)", [str() | None, int(), int() as rows, int() as cols])],
+                [("embedding", "tensor(float)", [str() | None, int() as dims])],
+            ] if rows == cols and dims == self.dims:
+                return
+        raise MapFileError(
+            f"map's encoder must take maps (N, C, S, S) and give embedding (N, {self.dims}) "
+            f"in float32, got {sides[0]} and {sides[1]}"
+        )
+
+
+def _onnxruntime() -> Any:
+    return needed("onnxruntime", "neural", "running a neural encoder")
+
+
+def check_graph(data: NDArray[np.uint8]) -> None:
+    """Raise `MapFileError` unless bytes (n,) are one plain ONNX graph that holds all its weights.
+
+    Only the layout is read (onnx.proto, IR version 8), so that nothing of an untrusted file is
+    run or opened before it is known to be harmless: operators of `OPERATORS` in the standard
+    domain, no functions, no graphs inside the graph, no weights in other files.
+    """
+    whole = np.ascontiguousarray(data).data
+    graphs = 0
+    for number, value in _fields(whole):
+        if number in (20, 25):  # training_info, functions
+            raise MapFileError("map's encoder holds more than a graph")
+        if number == 7:
+            graphs += 1
+            _check_layers(_bytes(value))
+    if graphs != 1:
+        raise MapFileError("map's encoder is not an ONNX graph")
+
+
+def _check_layers(graph: memoryview) -> None:
+    for number, value in _fields(graph):
+        if number == 1:
+            _check_layer(_bytes(value))
+        elif number == 5:
+            _check_tensor(_bytes(value))
+        elif number == 15:  # sparse_initializer
+            raise MapFileError("map's encoder holds sparse weights")
+
+
+def _check_layer(node: memoryview) -> None:
+    operator = ""
+    for number, value in _fields(node):
+        if number == 4:
+            operator = bytes(_bytes(value)).decode("utf-8", "replace")
+        elif number == 7 and bytes(_bytes(value)) not in (b"", b"ai.onnx"):
+            raise MapFileError("map's encoder needs operators of another domain")
+        elif number == 5:
+            for inner, _ in _fields(_bytes(value)):
+                if inner in (5, 6, 10, 11, 14, 15, 22, 23):  # tensors, graphs, types
+                    raise MapFileError("map's encoder holds graphs or tensors inside its layers")
+    if operator not in OPERATORS:
+        raise MapFileError(f"map's encoder holds an operator that encoders do not: '{operator}'")
+
+
+def _check_tensor(tensor: memoryview) -> None:
+    for number, value in _fields(tensor):
+        if number == 13 or (number == 14 and value != 0):  # external_data, data_location
+            raise MapFileError("map's encoder keeps its weights in another file")
+
+
+def _bytes(value: int | memoryview) -> memoryview:
+    if isinstance(value, int):
+        raise MapFileError("map's encoder is not an ONNX graph")
+    return value
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Fields of a Protocol Buffers message: number, and integer or bytes (encoding guide)."""
+    at, end = 0, len(message)
+    while at < end:
+        key, at = _varint(message, at)
+        number, kind = key >> 3, key & 7
+        if kind == 0:
+            value, at = _varint(message, at)
+            yield number, value
+            continue
+        size = {1: 8, 5: 4}.get(kind)
+        if kind == 2:
+            size, at = _varint(message, at)
+        if size is None or number == 0 or at + size > end:
+            raise MapFileError("map's encoder is not an ONNX graph, or is truncated")
+        yield number, message[at : at + size]
+        at += size
+
+
+def _varint(message: memoryview, at: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if at >= len(message):
+            break
+        byte = message[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+    raise MapFileError("map's encoder is not an ONNX graph, or is truncated")

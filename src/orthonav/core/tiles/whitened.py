@@ -1,0 +1,444 @@
+"""The whitened embedding: pooled oriented gradients, decorrelated on the reference area itself.
+
+Cells of a tile overlap (each pixel belongs to up to four, with triangular weights), so that a
+shift or turn of the view moves energy gradually from one cell to the next. Each cell is divided
+by its own norm: contrast differs between years, directions do not. Principal components of the
+reference tiles, each divided by its standard deviation (whitening, Jegou and Chum, ECCV 2012),
+give all directions of variation the same weight. Similarity is the scalar product of unit
+vectors.
+"""
+
+import contextlib
+import math
+import mmap
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from orthonav.core.errors import VariantError
+from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
+
+CHUNK_TILES = 512
+"""Tiles worked on at once: 0.9 MB of features, which stays in the cache."""
+MAX_LEARNT_TILES = 20_000
+"""Tiles from which a whitening is learnt, at most: 44 for each of 448 features."""
+PART_NOISE = 2.0
+"""Noise of the conditional mean where cells are missing, over the smallest variance kept; chosen
+with docs/decisions/embedding.md."""
+SOLVER_STEPS = 6
+"""Steps of conjugate gradients for the same, over many poses."""
+SHARE_ROUNDING = 1e-3
+"""A cell seen to this much less than the whole counts as whole: resampling rounds."""
+TINY = np.float32(1e-30)
+"""Guards divisions by zero."""
+SPARSE_BYTES = 32 * 2**20
+"""Larger arrays of a sheet take memory only where they are written."""
+Made = TypeVar("Made")
+Features = NDArray[np.float32]
+Work = Callable[[Features, Features], Made]
+
+
+@dataclass(frozen=True)
+class WhitenedRecipe:
+    """Parameters of the whitened embedding.
+
+    `cells`: cells along one side of a tile. `dims`: numbers kept per tile. `floor`: norm below
+    which a cell counts as empty rather than being blown up, in units of the representation.
+    """
+
+    cells: int = 8
+    dims: int = 128
+    floor: float = 0.6
+
+    def __post_init__(self) -> None:
+        if self.cells < 1 or MICRO % self.cells:
+            raise VariantError(f"cells must divide {MICRO}, got {self.cells}")
+        if not 1 <= self.dims <= 4096:
+            raise VariantError(f"dims must be 1 to 4096, got {self.dims}")
+        if not self.floor > 0:
+            raise VariantError(f"floor must be above 0, got {self.floor}")
+
+    @cached_property
+    def pooling(self) -> NDArray[np.float32]:
+        """Weights (cells, MICRO) of micro-cells in cells: triangles two cells wide."""
+        width = MICRO / self.cells
+        micro = (np.arange(MICRO) + 0.5) / width
+        centre = np.arange(self.cells) + 0.5
+        weights = np.maximum(0, 1 - np.abs(micro[None] - centre[:, None])) / width
+        return np.asarray(weights, dtype=np.float32)
+
+
+class CellSheet:
+    """Micro-cell means of a whole sheet, filled block by block.
+
+    `means` is (h, w, C) and `valid` (h, w), sampled as `CellLayout` says.
+    """
+
+    def __init__(self, layout: CellLayout, height_px: int, width_px: int, channels: int) -> None:
+        shape = (layout.samples(height_px), layout.samples(width_px))
+        self.layout = layout
+        self.means = _sparse_zeros((*shape, channels))
+        self.valid = _sparse_zeros(shape)
+
+    def fill(
+        self, row_px: int, col_px: int, maps: NDArray[np.float32], valid: NDArray[np.bool_]
+    ) -> None:
+        """Take in maps (C, H, W) and valid (H, W) of the block that starts at a sampled pixel."""
+        self.put(row_px, col_px, *cell_means(maps, valid, self.layout))
+
+    def put(
+        self, row_px: int, col_px: int, means: NDArray[np.float32], share: NDArray[np.float32]
+    ) -> None:
+        """Take in the `cell_means` of such a block."""
+        row, col = row_px // self.layout.spacing_px, col_px // self.layout.spacing_px
+        part = np.s_[row : row + share.shape[0], col : col + share.shape[1]]
+        self.means[part], self.valid[part] = means, share
+
+    def valid_share(self, tiles_px: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Share of valid pixels of each tile whose first pixel (row, col) is in (N, 2)."""
+        out = np.empty(len(tiles_px))
+        for part in _chunks(len(tiles_px)):
+            cells = self.micro_cells(self.valid[..., None], tiles_px[part])
+            out[part] = cells[..., 0].mean(axis=(1, 2))
+        return out
+
+    def micro_cells(
+        self, samples: NDArray[np.float32], tiles_px: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """Those of the samples (h, w, C) of the sheet that are a tile's, (N, MICRO, MICRO, C).
+
+        Raises `IndexError` for tiles that reach beyond the sheet.
+        """
+        step = self.layout.step
+        height, width = (size - (MICRO - 1) * step for size in samples.shape[:2])
+        down, right, deep = samples.strides
+        # A view of all tiles: taken from it rows of cells are copied whole, four times as fast.
+        windows = np.lib.stride_tricks.as_strided(
+            samples,
+            (max(0, height), max(0, width), MICRO, MICRO, samples.shape[2]),
+            (down, right, down * step, right * step, deep),
+            writeable=False,
+        )
+        row, col = (tiles_px // self.layout.spacing_px).T
+        return np.asarray(windows[row, col])
+
+
+def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Zeros of which only what is written takes memory: a corridor fills little of its box.
+
+    NumPy asks for huge pages, of which one number would take megabytes.
+    """
+    size = math.prod(shape)
+    if 4 * size < SPARSE_BYTES:
+        return np.zeros(shape, dtype=np.float32)
+    pages = mmap.mmap(-1, 4 * size)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        with contextlib.suppress(OSError):  # a kernel without them
+            pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(pages, dtype=np.float32).reshape(shape)
+
+
+def pooled_features(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Features (N, F) of the tiles whose first pixels (row, col) are given, and weights (N, F).
+
+    A weight is the share of a cell that is valid; features are normalized cell by cell.
+    """
+    features = _normalized(recipe, _pooled_tiles(recipe, sheet, tiles_px))
+    count, channels = len(tiles_px), features.shape[-1]
+    valid = sheet.micro_cells(sheet.valid[..., None], tiles_px)
+    if valid.min() >= 1:
+        weights = np.ones((1, 1), dtype=np.float32)
+        return features.reshape(count, -1), np.broadcast_to(weights, (count, features[0].size))
+    full = _pooled(recipe, np.ones_like(valid[:1]))
+    share = np.repeat(_pooled(recipe, valid) / full, channels, axis=-1)
+    return features.reshape(count, -1), share.reshape(count, -1)
+
+
+def _normalized(recipe: WhitenedRecipe, cells: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cells (N, cells, cells, C) free of contrast: each divided by its norm.
+
+    Where there is one channel only (grey levels, edge maps) a cell has no direction to keep: the
+    tile's mean is taken out and the tile as a whole divided by its norm.
+    """
+    axes: tuple[int, ...] = (-1,)
+    if cells.shape[-1] == 1:
+        cells = cells - cells.mean(axis=(1, 2), keepdims=True)
+        axes = (1, 2, 3)
+    power = np.sum(cells**2, axis=axes, keepdims=True)
+    return np.asarray(cells / np.sqrt(power + np.float32(recipe.floor) ** 2))
+
+
+def _pooled(recipe: WhitenedRecipe, micro: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cells (N, cells, cells, C) of micro-cells (N, MICRO, MICRO, C)."""
+    count, _, _, channels = micro.shape
+    cells = recipe.cells
+    rows = recipe.pooling @ micro.reshape(count, MICRO, MICRO * channels)
+    cols = rows.reshape(count, cells, MICRO, channels).transpose(0, 1, 3, 2) @ recipe.pooling.T
+    return np.ascontiguousarray(cols.transpose(0, 1, 3, 2))
+
+
+def _pooled_tiles(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """Cells (N, cells, cells, C) of tiles; what those beside each other share is summed once."""
+    step, cells, channels = sheet.layout.step, recipe.cells, sheet.means.shape[2]
+    reach = (MICRO - 1) * step + 1
+    row, col = (tiles_px // sheet.layout.spacing_px).T
+    out = np.empty((len(tiles_px), cells, cells, channels), dtype=np.float32)
+    for some in np.split(np.arange(len(row)), np.flatnonzero(np.diff(row)) + 1):
+        first, last = int(col[some].min()), int(col[some].max()) + reach
+        strip = sheet.means[row[some[0]] : row[some[0]] + reach : step, first:last]
+        if strip.shape[:2] != (MICRO, last - first) or last - first > len(some) * reach:
+            # Far apart they share nothing (or a tile lies beyond the sheet).
+            out[some] = _pooled(recipe, sheet.micro_cells(sheet.means, tiles_px[some]))
+            continue
+        down = recipe.pooling @ strip.reshape(MICRO, -1)
+        down = down.reshape(cells, -1, channels).swapaxes(0, 1).reshape(-1, cells * channels)
+        windows = sliding_window_view(down, reach, axis=0)[col[some] - first, :, ::step]
+        across = recipe.pooling @ windows.swapaxes(1, 2)
+        out[some] = across.reshape(-1, cells, cells, channels).swapaxes(1, 2)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedEmbedder:
+    """A learnt whitened embedding.
+
+    `mean` (F,) and `basis` (F, D) float16 as stored in the map; computed in float32.
+    """
+
+    recipe: WhitenedRecipe
+    mean: NDArray[np.float16]
+    basis: NDArray[np.float16]
+
+    @cached_property
+    def _mean(self) -> NDArray[np.float32]:
+        return self.mean.astype(np.float32)
+
+    @cached_property
+    def _basis(self) -> NDArray[np.float32]:
+        return self.basis.astype(np.float32)
+
+    @property
+    def dims(self) -> int:
+        """Numbers per embedding."""
+        return int(self.basis.shape[1])
+
+    def tiles(
+        self, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
+    ) -> NDArray[np.float16]:
+        """Unit embeddings (N, D) of tiles whose first pixels (row, col) are given (N, 2).
+
+        They are the same for any number of threads (`workers`).
+        """
+        out = np.empty((len(tiles_px), self.dims), dtype=np.float16)
+        _ = self._mean, self._basis  # made before threads ask for them
+
+        def fill(part: slice) -> None:
+            features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
+            out[part] = self.features(features, weights)
+
+        for _ in _worked(fill, len(tiles_px), workers):
+            pass
+        return out
+
+    def features(
+        self, features: NDArray[np.float32], weights: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Unit embeddings (N, D) of tiles of which `pooled_features` are known, (N, F) each."""
+        return _unit(((features - self._mean) * weights) @ self._basis)
+
+    def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Unit embedding (D,) of a view's representation (C, S, S); zero for an empty one.
+
+        Raises `ValueError` if the view is not a square of a multiple of `MICRO` pixels.
+        """
+        channels, height, width = maps.shape
+        if height != width or height % MICRO:
+            raise ValueError(f"view must be square, a multiple of {MICRO} px, got {maps.shape}")
+        sheet = CellSheet(CellLayout(height // MICRO, height // MICRO), height, width, channels)
+        sheet.fill(0, 0, maps, valid)
+        origin = np.zeros((1, 2), dtype=np.intp)
+        features, weights = pooled_features(self.recipe, sheet, origin)
+        centred = (features - self._mean)[0]
+        if weights.min() < 1:
+            return _unit(self._from_part(centred, weights[0]))
+        return _unit(centred @ self._basis)
+
+    def _from_part(
+        self, centred: NDArray[np.float32], weights: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Whitened components (D,) of a view in which cells are missing or partly seen.
+
+        Components are no longer orthogonal on the rest of the tile, so their most probable values
+        are solved for: the conditional mean of probabilistic PCA (Tipping and Bishop 1999) with
+        noise of `PART_NOISE` times the smallest variance kept. In reference tiles missing cells
+        stay at the mean instead: solved for, tiles with little imagery attract too many views.
+        """
+        loadings = self._loadings
+        seen = loadings.T * (weights / PART_NOISE)
+        normal = seen @ loadings + np.eye(self.dims, dtype=np.float32)
+        return np.asarray(np.linalg.solve(normal, seen @ centred))
+
+    def cells(self, cells: NDArray[np.float32], valid: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Unit embeddings (Q, D) of many views at once, as `view` gives them one by one.
+
+        `cells` (Q, cells, cells, C) are sums of micro-cells weighted by `recipe.pooling` along
+        rows and columns, `valid` (Q, cells, cells) sums of their valid shares.
+        """
+        out = np.empty((len(cells), self.dims), dtype=np.float32)
+        along = self.recipe.pooling.sum(axis=1)
+        shares = (valid / np.outer(along, along)).reshape(len(cells), -1)
+        for part in _chunks(len(cells)):
+            features = _normalized(self.recipe, cells[part])
+            centred = features.reshape(len(features), -1) - self._mean
+            out[part] = centred @ self._basis
+            missing = shares[part].min(axis=1) < 1 - SHARE_ROUNDING
+            if missing.any():
+                weights = np.repeat(shares[part][missing], cells.shape[-1], axis=-1)
+                out[part][missing] = self._from_parts(centred[missing], weights)
+        return _unit(out)
+
+    def _from_parts(
+        self, centred: NDArray[np.float32], weights: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Components (Q, D) of many views, solved for as in `_from_part`.
+
+        By conjugate gradients for all of them at once, preconditioned with what would be exact if
+        every cell had the mean weight: a twentieth of the time of exact solutions.
+        """
+        loadings = self._loadings
+        noisy = weights / np.float32(PART_NOISE)
+        power = np.square(loadings).sum(axis=0)
+        shrink = np.reciprocal(noisy.mean(axis=1, keepdims=True) * power + np.float32(1))
+        wanted = (centred * noisy) @ loadings
+        solved = shrink * wanted
+        residual = wanted - self._normal(solved, noisy)
+        step = shrink * residual
+        fit = _dots(residual, step)
+        for _ in range(SOLVER_STEPS):
+            response = self._normal(step, noisy)
+            length = fit / np.maximum(_dots(step, response), TINY)
+            solved += length * step
+            residual -= length * response
+            scaled = shrink * residual
+            before, fit = fit, _dots(residual, scaled)
+            step = scaled + (fit / np.maximum(before, TINY)) * step
+        return np.asarray(solved)
+
+    def _normal(
+        self, components: NDArray[np.float32], noisy: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """What the normal matrices of `_from_part` make of components (Q, D)."""
+        loadings = self._loadings
+        return np.asarray(components + ((components @ loadings.T) * noisy) @ loadings)
+
+    @cached_property
+    def _loadings(self) -> NDArray[np.float32]:
+        """Features (F, D) per unit of each whitened component, smallest variance kept = 1."""
+        norms = np.linalg.norm(self._basis, axis=0)
+        return np.asarray(self._basis / norms**2 * norms.max())
+
+    def parts(self) -> dict[str, NDArray[Any]]:
+        """Arrays to be stored in the map."""
+        return {"mean": self.mean, "basis": self.basis}
+
+
+def _unit(vectors: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(norms, 1e-12), dtype=np.float32)
+
+
+def _dots(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scalar products (Q, 1) of the rows of two arrays (Q, D)."""
+    return np.asarray(np.einsum("qd,qd->q", first, second)[:, None])
+
+
+def learn(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
+) -> WhitenedEmbedder:
+    """Learn mean and whitening from the tiles (N, 2) of the reference area.
+
+    At most `MAX_LEARNT_TILES` of them, evenly taken, are used. Fewer than `dims` components are
+    kept where the tiles do not span more. The same is learnt by any number of threads (`workers`).
+    """
+    taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
+
+    def over_batches(work: Work[Made]) -> Iterator[Made]:
+        return _worked(
+            lambda part: work(*pooled_features(recipe, sheet, taken[part])), len(taken), workers
+        )
+
+    return learn_in_two_passes(recipe, over_batches)
+
+
+class OverBatches(Protocol):
+    """Runs a function on the features (N, F) and weights (N, F) of every batch, in order."""
+
+    def __call__(self, work: "Work[Made]") -> Iterator[Made]:
+        """What the function makes of each batch."""
+
+
+def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> WhitenedEmbedder:
+    """The whitening of features that come in batches: one pass for their mean, one for scatter."""
+
+    def sums(features: Features, weights: Features) -> tuple[Any, Any]:
+        total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
+        return total, weights.sum(axis=0, dtype=np.float64)
+
+    total: Any = 0.0
+    weight: Any = 1e-9
+    for some, their_weight in over_batches(sums):
+        total, weight = total + some, weight + their_weight
+    mean = (total / weight).astype(np.float16)
+
+    def products(features: Features, weights: Features) -> tuple[Any, int]:
+        centred = (features - mean.astype(np.float32)) * weights
+        return (centred.T @ centred).astype(np.float64), len(features)
+
+    scatter: Any = 0.0
+    count = 0
+    for product, size in over_batches(products):
+        scatter, count = scatter + product, count + size
+    return _whitening(recipe, mean, scatter, count)
+
+
+def _whitening(
+    recipe: WhitenedRecipe,
+    mean: NDArray[np.float16],
+    scatter: NDArray[np.float64],
+    count: int,
+) -> WhitenedEmbedder:
+    """The embedding that whitens `count` features of mean (F,) and scatter matrix (F, F)."""
+    variances, vectors = np.linalg.eigh(scatter / count)
+    variances, vectors = variances[::-1], vectors[:, ::-1]
+    kept = int(np.count_nonzero(variances[: recipe.dims] > 1e-6 * max(variances[0], 1e-12)))
+    kept = max(1, min(kept, count))
+    scale = 1 / np.sqrt(np.maximum(variances[:kept], 1e-12))
+    basis = vectors[:, :kept] * (scale / scale.max())
+    # The sign of an eigenvector is arbitrary: the largest entry is made positive.
+    largest = np.abs(basis).argmax(axis=0)
+    basis *= np.sign(basis[largest, np.arange(kept)])
+    return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
+
+
+def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
+    """What `work` makes of some tiles at a time, in their order, by so many threads."""
+    if workers <= 1:
+        yield from map(work, _chunks(count))
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        yield from pool.map(work, _chunks(count))
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    for start in range(0, count, CHUNK_TILES):
+        yield slice(start, min(count, start + CHUNK_TILES))

@@ -1,0 +1,205 @@
+"""Bag of visual words (Sivic and Zisserman, ICCV 2003): how often which local features occur.
+
+Di Piazza et al. 2024, section 2: features of all reference pictures are grouped into k clusters,
+the words; a picture is the vector of how many of its features fall to each word, and two pictures
+are similar by the scalar product of their vectors. Features are SIFT (Lowe, IJCV 2004) or
+SuperPoint (DeTone et al. 2018). Words are meant for grey levels, as in the paper.
+`orthonav.research.words` learns them.
+
+SIFT descriptors and words are whole numbers of at most 255, and so are, below 2^24, all sums that
+decide on the nearest word: float32 gives them exactly, on every machine and in any order.
+SuperPoint needs PyTorch and does not fly: its detector is handed in by `orthonav.research.words`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import VariantError
+
+CHUNK_FEATURES = 4096
+"""Features compared with all words at once: 16 MB for 1,024 words."""
+DIMS = {"sift": 128, "superpoint": 256}
+"""Numbers per descriptor."""
+
+Grey = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Array = NDArray[np.float32]
+Detector = Callable[[Grey], tuple[Array, Array, Array]]
+"""Features of a picture: points (N, 2) in pixels from the outer corner, radii (N,) and descriptors
+(N, D)."""
+
+
+@dataclass(frozen=True)
+class WordsRecipe:
+    """Parameters of a bag of visual words.
+
+    `words`: clusters k; the paper tries 256 to 10000. `features`: "sift" or "superpoint", the
+    latter with the path of its `weights`. `max_features`: at most so many of a picture, the
+    strongest. `similarity`: "product" compares frequencies (sum 1) as the paper does, "cosine"
+    vectors of unit length. `tfidf`: 1 weighs each word by how rare it is among the pictures.
+    """
+
+    words: int = 1024
+    features: str = "sift"
+    weights: str = ""
+    max_features: int = 2000
+    similarity: str = "product"
+    tfidf: int = 0
+
+    def __post_init__(self) -> None:
+        if not 256 <= self.words <= 10_000:
+            raise VariantError(f"words must be 256 to 10000, got {self.words}")
+        if self.features not in DIMS:
+            raise VariantError(f"features must be sift or superpoint, got '{self.features}'")
+        if bool(self.weights) != (self.features == "superpoint"):
+            raise VariantError(
+                "weights=PATH is for superpoint and needed there, got "
+                f"features={self.features}, weights='{self.weights}'"
+            )
+        if not 1 <= self.max_features <= 100_000:
+            raise VariantError(f"max_features must be 1 to 100000, got {self.max_features}")
+        if self.similarity not in ("product", "cosine"):
+            raise VariantError(f"similarity must be product or cosine, got '{self.similarity}'")
+        if self.tfidf not in (0, 1):
+            raise VariantError(f"tfidf must be 0 or 1, got {self.tfidf}")
+
+
+@dataclass(frozen=True, eq=False)
+class WordsEmbedder:
+    """A learnt vocabulary.
+
+    `vocabulary` (k, D) as stored in the map: uint8 for SIFT (D = 128), float16 for SuperPoint
+    (D = 256). `idf` (k,) float32, weights of rare words; empty without `tfidf`. `detector`: finds
+    the features; None for SIFT.
+    """
+
+    recipe: WordsRecipe
+    vocabulary: NDArray[Any]
+    idf: Array
+    detector: Detector | None = None
+
+    def __post_init__(self) -> None:
+        recipe = self.recipe
+        shape = recipe.words, DIMS[recipe.features]
+        dtype = np.uint8 if recipe.features == "sift" else np.float16
+        if self.vocabulary.shape != shape or self.vocabulary.dtype != dtype:
+            raise VariantError(
+                f"expected a vocabulary {shape} {np.dtype(dtype)}, "
+                f"got {self.vocabulary.shape} {self.vocabulary.dtype}"
+            )
+        if self.idf.shape != ((recipe.words,) if recipe.tfidf else (0,)):
+            raise VariantError(f"idf does not fit tfidf={recipe.tfidf}, got {self.idf.shape}")
+        if not (np.isfinite(self.vocabulary).all() and np.isfinite(self.idf).all()):
+            raise VariantError("vocabulary or idf is not finite")
+
+    @property
+    def dims(self) -> int:
+        """Numbers per embedding, k."""
+        return self.recipe.words
+
+    @cached_property
+    def _words(self) -> Array:
+        return np.ascontiguousarray(self.vocabulary.T, dtype=np.float32)
+
+    @cached_property
+    def _half_power(self) -> Array:
+        return np.asarray(np.square(self._words).sum(axis=0) / 2, dtype=np.float32)
+
+    def view(self, maps: Array, valid: Mask) -> Array:
+        """Frequencies of words (k,) in a view's grey levels (1, S, S), as `similarity` says.
+
+        Grey levels are 0..1 as `orthonav.core.tiles.gray` gives them, or 0..255 if one is above 1.
+        A view without features gives zeros. Raises `ValueError` if there is not one channel.
+        """
+        return self._weighted(self.counts(_levels(maps), valid))
+
+    def views(self, maps: Array, valid: Mask | None = None) -> Array:
+        """Frequencies (N, k) of views (N, 1, S, S), everywhere valid or where (N, S, S) says."""
+        if valid is None:
+            valid = np.ones((len(maps), *maps.shape[2:]), dtype=bool)
+        out = np.empty((len(maps), self.dims), dtype=np.float32)
+        for index, (one, seen) in enumerate(zip(maps, valid, strict=True)):
+            out[index] = self.view(one, seen)
+        return out
+
+    def counts(self, grey: Grey, valid: Mask) -> NDArray[np.int64]:
+        """How many features of a picture (H, W) fall to each word (k,)."""
+        found = self.assigned(describe(self.recipe, grey, valid, self.detector))
+        return np.bincount(found, minlength=self.dims)
+
+    def assigned(self, descriptors: Array) -> NDArray[np.intp]:
+        """Nearest words (N,) of descriptors (N, D); the first of equally near ones."""
+        out = np.empty(len(descriptors), dtype=np.intp)
+        for start in range(0, len(descriptors), CHUNK_FEATURES):
+            part = slice(start, start + CHUNK_FEATURES)
+            nearness = descriptors[part].astype(np.float32, copy=False) @ self._words
+            nearness -= self._half_power
+            out[part] = nearness.argmax(axis=1)
+        return out
+
+    def _weighted(self, counts: NDArray[np.int64]) -> Array:
+        vector = counts / max(1, counts.sum())
+        if self.recipe.tfidf:
+            vector = vector * self.idf
+        if self.recipe.similarity == "cosine":
+            vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
+        return np.asarray(vector, dtype=np.float32)
+
+    def parts(self) -> dict[str, NDArray[Any]]:
+        """Arrays to be stored in the map."""
+        return {"vocabulary": self.vocabulary, "idf": self.idf}
+
+
+def _levels(maps: Array) -> Grey:
+    """Grey levels (S, S) uint8 of a representation (1, S, S) of 0..1 or 0..255."""
+    if maps.ndim != 3 or len(maps) != 1:
+        raise ValueError(f"words are of grey levels, one channel (1, S, S); got {maps.shape}")
+    factor = 255 if maps.max(initial=0) <= 1 else 1
+    return np.asarray(np.rint(maps[0] * factor).clip(0, 255), dtype=np.uint8)
+
+
+def describe(
+    recipe: WordsRecipe, grey: Grey, valid: Mask, detector: Detector | None = None
+) -> Array:
+    """Descriptors (N, D) of the features of a picture (H, W) that see valid pixels only.
+
+    A feature is left out if a pixel within its radius is not valid. `detector` is needed for other
+    features than SIFT; raises `VariantError` without.
+    """
+    if detector is None and recipe.features != "sift":
+        raise VariantError(f"features '{recipe.features}' do not fly; they need their detector")
+    if not valid.any():
+        return np.zeros((0, DIMS[recipe.features]), dtype=np.float32)
+    if not valid.all():
+        grey = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+    picture = np.ascontiguousarray(grey)
+    found = _sift(picture, recipe.max_features) if detector is None else detector(picture)
+    points, radii, descriptors = found
+    if len(points) and not valid.all():
+        free = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        height, width = valid.shape
+        columns, rows = np.floor(points).astype(int).T
+        descriptors = descriptors[
+            free.reshape(height, width)[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+            > radii
+        ]
+    return descriptors
+
+
+def _sift(grey: Grey, most: int) -> tuple[Array, Array, Array]:
+    """Points (N, 2) from the outer corner, radii (N,) and descriptors (N, 128), whole numbers."""
+    sift = cv2.SIFT.create(nfeatures=most)
+    found, descriptors = sift.detectAndCompute(grey, None)
+    if not len(found):
+        nothing = np.zeros((0, 2), dtype=np.float32)
+        return nothing, nothing[:, 0], np.zeros((0, DIMS["sift"]), dtype=np.float32)
+    points = np.array([point.pt for point in found], dtype=np.float32) + np.float32(0.5)
+    radii = np.array([point.size / 2 for point in found], dtype=np.float32)
+    kept = slice(most)  # of equally strong ones there may be more
+    return points[kept], radii[kept], np.asarray(descriptors, dtype=np.float32)[kept]

@@ -1,0 +1,119 @@
+"""What one view says: how likely each of its places is, and whether it shows the map there."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthonav.core.track.model import (
+    SEEN,
+    Array,
+    Model,
+    ReportedAttitude,
+    Sighting,
+    log_densities,
+    log_density,
+    measurement,
+)
+
+TRUSTED = (0.1, 0.5)
+"""Views with a probability of their own below the first do not count, above the second fully."""
+MOST_OF_ONE = 0.75
+"""A single view counts at most so much: less than `CONFIRMED`."""
+POSE = slice(2, 4)
+"""Heading and scale in a measurement."""
+SEARCHED_SIGMAS = 6.0
+"""Width of the search over heading and scale, in standard deviations, from end to end."""
+MAX_LOG_ODDS = 7.0
+"""Limit of the log odds of a single view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A sighting as a measurement of the state.
+
+    `mean` (6,), `noise` (6, 6): of `model.SEEN`. `log_odds`: log odds over the density of
+    places, headings and scales that only look alike. `own_noise` (6, 6): covariance without regard
+    to earlier views of the same ground. `alone`: probability by the view alone. `log_chance`: log
+    density of places, headings and scales that chance finds in the area searched.
+    """
+
+    mean: Array
+    noise: Array
+    log_odds: float
+    own_noise: Array
+    alone: float
+    log_chance: float
+
+
+def tempered(
+    model: Model,
+    mounts: Sequence[tuple[float, Array]],
+    areas_m2: tuple[float, float],
+    reported: ReportedAttitude,
+    sighting: Sighting,
+    newness: float,
+) -> Measurement:
+    """A sighting as a measurement, tempered by the share of it that is new.
+
+    `mounts`: probability and covariance (10, 10) of the initial state of each kind of mount.
+    `areas_m2`: of the map, and of the part of it that was searched.
+
+    A likelihood raised to the power `newness` has a broader peak, which stands out less from
+    all places, headings and scales. The telemetry noise, independent at every view, is
+    excluded.
+    """
+    mean, noise, independent = measurement(model, reported, sighting)
+    map_m2, searched_m2 = areas_m2
+    own = np.diag(noise)[POSE] + model.initial_bias()[:2]
+    poses = float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
+    wide = math.log(map_m2) + poses
+    # Tilts are distributed as those of mounts at every place: no evidence for one.
+    tilts = noise[4:, 4:] + independent[4:, 4:]
+    wide -= float(
+        np.logaddexp.reduce(
+            [
+                math.log(share) + log_density(mean[4:], tilts + (SEEN @ each @ SEEN.T)[4:, 4:])
+                for share, each in mounts
+            ]
+        )
+    )
+    _, log_det = np.linalg.slogdet(2 * math.pi * (noise + independent))
+    odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
+    odds += (1 - newness) * float(log_det) / 2 - len(mean) / 2 * math.log(newness)
+    return Measurement(
+        mean,
+        noise / newness + independent,
+        odds,
+        noise + independent,
+        sighting.alone,
+        -math.log(searched_m2) - poses,
+    )
+
+
+def recognition(
+    seen: Measurement, covariances: Array, innovations: Array, most_agreement: float
+) -> Array:
+    """Probabilities (K,) that a view showed the map, given its place and predictions of that.
+
+    `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The
+    odds by the view alone, times the likelihood ratio of the innovations (K, 6) in position,
+    heading and scale between a right place and one that chance finds in the area searched. A place
+    within the gate is never less likely for its distance.
+    """
+    spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
+    ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
+    agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
+    odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
+    return np.asarray(odds / (1 + odds))
+
+
+def confirmed_ground(alone: float, ground: float) -> float:
+    """New ground, in views, that a view confirms by its probability `alone`.
+
+    `ground`: share of the view that the last one did not show.
+    """
+    low, high = TRUSTED
+    trust = min(max((alone - low) / (high - low), 0.0), 1.0)
+    return min(ground * trust, MOST_OF_ONE)

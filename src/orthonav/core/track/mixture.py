@@ -1,0 +1,550 @@
+"""The track: a mixture of hypotheses, each a Kalman filter, and the belief "elsewhere".
+
+A view is ambiguous: its true place may be the second best, or none of those found. So every
+hypothesis is split, into one for each place where the view may have been taken and one for none of
+them, weighted by likelihood (multiple hypothesis tracking, Reid 1979; a Gaussian sum filter,
+Sorenson and Alspach 1971). Unlikely hypotheses are dropped, similar ones merged. The remaining
+probability stands for "elsewhere": it is 1 at the start, new hypotheses are born from it, and some
+returns to it with every view, so that no error is permanent (docs/decisions/tracking.md).
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
+
+import numpy as np
+
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import CONFIDENT
+from orthonav.core.track.evidence import Measurement, confirmed_ground, recognition, tempered
+from orthonav.core.track.hypotheses import (
+    Hypothesis,
+    distance,
+    major,
+    merged,
+    moments,
+    moved,
+    within,
+)
+from orthonav.core.track.model import (
+    POSITION,
+    SEEN,
+    STATE,
+    Array,
+    Model,
+    ReportedAttitude,
+    Sighting,
+    log_densities,
+    log_density,
+    updated,
+)
+from orthonav.core.track.motion import (
+    CameraDisplacement,
+    Expected,
+    ReportedVelocity,
+    after_bias_jump,
+    by_camera,
+    held_to_map,
+    predicted,
+    velocity_forgotten,
+)
+
+MIN_SPLIT = 1e-5
+"""Predictions less likely than this share of all predictions of a hypothesis are not followed. This
+and the other values without a source were chosen on the flights of docs/tracking.md."""
+MINOR_SHARE = 1e-4
+"""Less likely hypotheses are not split for rare events."""
+MAJOR_SHARE = 0.05
+"""The same without odometry, where hypotheses are not merged between views."""
+START_SHARE = 0.9
+"""Probability of a reported start position."""
+LIKELY = 0.5
+"""A track with less confidence is lost."""
+CONFIRMED = 1.25
+"""New ground, in views, that must be recognized before a track is confirmed. Each view counts by
+its own probability: no single view confirms a track, nor do further views of its ground, nor views
+that fit only because they were searched there (docs/decisions/tracking.md, 9 and 13)."""
+UNCONFIRMED = 0.8
+"""Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
+RECOGNIZED = 0.2
+"""Probability from which on a view shows the map, by this view alone and by its agreement with the
+prediction. Without, a track is coasting (docs/decisions/tracking.md, 12)."""
+RECOGNIZED_SIGMAS = 1.5
+"""Farther from the estimated position than this many standard deviations per axis, a view does not
+show the map there."""
+RECOGNIZED_SHARE = 0.1
+"""A hypothesis with less of the probability of its cluster does not show where the cluster is
+(docs/decisions/tracking.md, 16)."""
+UNRECOGNIZED = 0.5
+"""Factor on the count of recognized ground for each view of new ground that does not show the map:
+after a few, a track must be confirmed again."""
+BLIND = 0.5
+"""Factor on the evidence, against a track that was confirmed, of a view that does not show the map,
+for each such view before: clouds, water and a covered lens last (decisions/tracking.md, 13)."""
+MOST_SIGHTED = 3.0
+"""Highest count of recognized ground, in views."""
+FORGOTTEN = 0.5
+"""The count is multiplied by this with every view at which the position is less certain than
+`Model.wide_m`: after a while a track must be confirmed again."""
+GATE = 36.0
+"""Gate: largest squared innovation of the position over the trace of its covariance."""
+
+
+class State(Enum):
+    """State of the track, as `fixes.jsonl` has it."""
+
+    SEARCHING = "searching"
+    """No place has been confirmed."""
+    TRACKING = "tracking"
+    """Confirmed, and this view shows the map where the track is."""
+    COASTING = "coasting"
+    """Confirmed before; this view does not show the map, the position is dead reckoning."""
+    LOST = "lost"
+    """Confirmed before; the position is no longer likely, or that of another, unconfirmed place."""
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether the position is that of a confirmed track."""
+        return self in (State.TRACKING, State.COASTING)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The estimate of the track: its best cluster of hypotheses. Its arrays are not to be changed.
+
+    `mean` (10,), `covariance` (10, 10): of the cluster. `confidence`: probability that the aircraft
+    is within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
+    however wide it is. `recognized`: probability that the last view showed the map there.
+    `confirmed`: whether enough of its ground was recognized lately. `followed`: whether it descends
+    from a confirmed track or a reported position.
+    """
+
+    mean: Array
+    covariance: Array
+    confidence: float
+    state: State
+    belief: float
+    recognized: float
+    confirmed: bool
+    followed: bool
+
+
+class Mixture:
+    """The belief about one flight. Mutable; not to be shared between threads."""
+
+    def __init__(self, model: Model, extent_en_m: tuple[float, float, float, float]) -> None:
+        """`extent_en_m` (west, south, east, north) is that of the map: the aircraft may be
+        anywhere on it."""
+        self.model = model
+        self._set_extent(extent_en_m)
+        self.hypotheses: list[Hypothesis] = []
+        self.elsewhere = 1.0
+        self._state = State.SEARCHING
+        self._blind = 0.0
+        self._numbers = 0
+
+    def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
+        self._extent = np.array(extent_en_m)
+        self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
+
+    def move(
+        self,
+        plane: LocalFrame,
+        other: LocalFrame,
+        extent_en_m: tuple[float, float, float, float],
+    ) -> None:
+        """Continue between two views in another plane, on a map of this extent there."""
+        self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
+        self._set_extent(extent_en_m)
+
+    def start(self, mean_en_m: Array, std_m: float) -> None:
+        """Begin at a reported position (2,) with standard deviation `std_m` per axis."""
+        self.hypotheses = list(self._born_at(mean_en_m, std_m, START_SHARE))
+        self.elsewhere = 1 - START_SHARE
+
+    def _born_at(self, mean_en_m: Array, std_m: float, share: float) -> Iterator[Hypothesis]:
+        """Hypotheses at a position, together of probability `share`."""
+        for mount, mean, covariance in self._mounts():
+            mean[POSITION] = mean_en_m
+            covariance[POSITION, POSITION] = np.eye(2) * std_m**2
+            self._numbers += 1
+            yield Hypothesis(share * mount, mean, covariance, 0.0, self._numbers, followed=True)
+
+    def measure_position(self, mean_en_m: Array, std_m: float) -> None:
+        """Update with a position (2,) measured by other means, such as GNSS, `std_m` per axis."""
+        if not self.hypotheses:
+            self.start(mean_en_m, std_m)
+            return
+        made, noise = [], np.eye(2) * std_m**2
+        for each in self.hypotheses:
+            spread = each.covariance[POSITION, POSITION] + noise
+            innovation = mean_en_m - each.mean[POSITION]
+            gain = np.linalg.solve(spread, each.covariance[POSITION]).T
+            after = each.covariance - gain @ spread @ gain.T
+            share = each.share * math.exp(max(log_density(innovation, spread), -700.0))
+            made.append(
+                replace(
+                    each,
+                    share=share,
+                    mean=each.mean + gain @ innovation,
+                    covariance=(after + after.T) / 2,
+                )
+            )
+        # Belief elsewhere is spread over the map: its density at this position remains.
+        self.elsewhere /= self.area_m2
+        made += self._born_at(mean_en_m, std_m, START_SHARE * self.elsewhere)
+        self.elsewhere *= 1 - START_SHARE
+        self.hypotheses = made
+        self._settle()
+        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
+        self._settle()
+
+    def predict(
+        self,
+        seconds: float,
+        velocity: ReportedVelocity | None = None,
+        camera: CameraDisplacement | None = None,
+        telemetry_noise: Array | None = None,
+    ) -> None:
+        """Predict over so many seconds, by the reported velocity and the camera's odometry.
+
+        `telemetry_noise` (3,): variances of reported heading (rad) and log scale from view to view
+        and of the horizon (rad), those of the model where None.
+        """
+        noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
+        stays = 1 - self.model.lost
+        made = []
+        for each in self.hypotheses:
+            for share, expected in self._predictions(each, seconds, velocity, camera, noise):
+                on_map = held_to_map(self.model, expected, self.area_m2)
+                made.append(self._from(each, on_map, each.share * share * stays))
+        self.hypotheses = made
+        self.elsewhere += (1 - stays) * (1 - self.elsewhere)
+
+    def _predictions(
+        self,
+        each: Hypothesis,
+        seconds: float,
+        velocity: ReportedVelocity | None,
+        camera: CameraDisplacement | None,
+        telemetry_noise: Array,
+    ) -> Iterator[tuple[float, Expected]]:
+        """The predictions of a hypothesis with their probabilities: with odometry and without.
+
+        Odometry may be an outlier; it is weighted by its innovation. Where no velocity is reported,
+        the aircraft may also have made an unexpected turn.
+        """
+        model, likely = self.model, 1 - self.model.odometry_outlier
+        coasting = self._state in (State.COASTING, State.LOST)
+        step = partial(predicted, model, each.mean, coasting=coasting)
+        dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
+        if camera is None:
+            chance = 0.0
+            if velocity is None and each.share >= MAJOR_SHARE:  # nothing measures the displacement
+                chance = 1 - (1 - model.turn) ** seconds
+                free = velocity_forgotten(model, each.covariance)
+                yield chance, step(free, seconds, velocity, telemetry_noise)
+            yield 1.0 - chance, dead_reckoned
+            return
+        # An outlier lies anywhere within the radius of the search.
+        outlier = math.log(model.odometry_outlier / (math.pi * camera.reach_m**2))
+        splits = [(outlier, dead_reckoned)]
+        turns = [(likely, each.covariance)]
+        if each.share < MINOR_SHARE:
+            splits = []
+        elif velocity is None:
+            turns = [
+                (likely * (1 - model.turn), each.covariance),
+                (likely * model.turn, velocity_forgotten(model, each.covariance)),
+            ]
+        for share, covariance in turns:
+            turned = step(covariance, seconds, velocity, telemetry_noise, camera)
+            seen, log_fit = by_camera(turned, camera)
+            splits.append((math.log(share) + log_fit, seen))
+        best = max(log_share for log_share, _ in splits)
+        shares = [math.exp(max(log_share - best, -700.0)) for log_share, _ in splits]
+        for share, (_, expected) in zip(shares, splits, strict=True):
+            if share > MIN_SPLIT * sum(shares):
+                yield share / sum(shares), expected
+
+    def update(
+        self,
+        reported: ReportedAttitude,
+        sightings: Sequence[Sighting],
+        newness: float = 1.0,
+        searched: tuple[Array, float] | None = None,
+        new_ground: float | None = None,
+        *,
+        confirms: bool = True,
+    ) -> None:
+        """Update with the places where a view may have been taken; all of them may be wrong.
+
+        `searched`: the circle of the map that was searched, middle (2,) and radius in metres; None
+        for all of it. `newness`: share of the view that counts as new evidence. Views of the same
+        ground have the same errors, so many of them count no more than one. `new_ground`: share of
+        the view that the last one did not show, which alone confirms a track; None: `newness`.
+        `confirms`: whether these places competed with all others where the aircraft may be. Without
+        that, a view does not count towards a confirmed track.
+        """
+        ground = newness if new_ground is None else new_ground
+        made = []
+        missed = self.model.miss**newness
+        missed_again = self.model.miss ** (newness * BLIND**self._blind)
+        found = (1 - self.model.miss) ** newness
+        searched_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
+        mounts = [(share, covariance) for share, _, covariance in self._mounts()]
+        measurements = [
+            tempered(self.model, mounts, (self.area_m2, searched_m2), reported, each, newness)
+            for each in sightings
+        ]
+        starts = []
+        for each in self.hypotheses:
+            in_search = self._on_map(each.mean)
+            if searched is not None:
+                in_search &= math.dist(each.mean[:2], searched[0]) < searched[1]
+            miss = missed_again if each.followed else missed
+            share = each.share * (miss if in_search else 1.0)
+            each = replace(each, uncounted=min(each.uncounted + ground, 1.0))
+            made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
+            starts += self._with_bias_jump(each)
+        for seen in measurements:
+            made += self._updated(starts, seen, found, ground, confirms)
+            made += self._born(seen, confirms)
+        self.hypotheses = made
+        self._settle()
+        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
+        self._settle()
+        shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
+        confirmed = self._state is not State.SEARCHING
+        self._blind = self._blind + newness if confirmed and not shown else 0.0
+
+    def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
+        """The best cluster, None where there is no hypothesis.
+
+        It updates the state of the track, except with `between_views`: after the prediction to a
+        view, before the update with it.
+        """
+        if not self.hypotheses:
+            return None
+        best = self._best(radius_m)
+        near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
+        mean, covariance = moments(near)
+        confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
+        confirmed = max(each.sighted for each in major(near)) >= CONFIRMED
+        seen, follows = self._recognized_at(mean, covariance, near), best.followed
+        if not between_views:
+            shown = confirmed and seen >= RECOGNIZED
+            self._state = self._next_state(confidence, shown, best.followed)
+            if self._state is State.TRACKING:
+                self._follow(near)
+                follows = True
+        if self._state is not State.TRACKING:
+            confidence = min(confidence, UNCONFIRMED)
+        belief = sum(each.share for each in near)
+        return Estimate(mean, covariance, confidence, self._state, belief, seen, confirmed, follows)
+
+    def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
+        """Largest probability of having recognized the map at the estimated position.
+
+        Hypotheses of the cluster that are farther from it than it is certain, or that hardly
+        contribute to it, do not count.
+        """
+        reach_m = RECOGNIZED_SIGMAS * math.sqrt(float(np.trace(covariance[POSITION, POSITION])) / 2)
+        least = RECOGNIZED_SHARE * sum(each.share for each in near)
+        return max(
+            (
+                each.recognized
+                for each in near
+                if each.share >= least and float(np.hypot(*(each.mean - mean)[POSITION])) <= reach_m
+            ),
+            default=0.0,
+        )
+
+    def _follow(self, near: list[Hypothesis]) -> None:
+        """Mark the hypotheses of a confirmed track."""
+        numbers = {each.number for each in near}
+        self.hypotheses = [
+            replace(each, followed=True) if each.number in numbers else each
+            for each in self.hypotheses
+        ]
+
+    @property
+    def likeliest(self) -> Hypothesis | None:
+        """The most likely single hypothesis."""
+        return self.hypotheses[0] if self.hypotheses else None
+
+    def _best(self, radius_m: float) -> Hypothesis:
+        """The hypothesis with the highest probability around it, of the eight most likely."""
+        heaviest = self.hypotheses[:8]
+        return max(heaviest, key=lambda one: self._inside(radius_m, one.mean[POSITION]))
+
+    def _inside(self, radius_m: float, middle: Array) -> float:
+        """Probability that the aircraft is within a radius of a place (2,)."""
+        return sum(
+            each.share * within(each.mean, each.covariance, radius_m, middle)
+            for each in self.hypotheses
+        )
+
+    def bias(self) -> tuple[Array, Array]:
+        """The estimated errors of heading (rad), log scale, pitch and roll (rad) as reported: mean
+        (4,) and covariance (4, 4) over all hypotheses."""
+        if not self.hypotheses:
+            _, covariance = self._nowhere()
+            return np.zeros(4), (SEEN @ covariance @ SEEN.T)[2:, 2:]
+        mean, covariance = moments(self.hypotheses)
+        return (SEEN @ mean)[2:], (SEEN @ covariance @ SEEN.T)[2:, 2:]
+
+    def _next_state(self, confidence: float, confirmed: bool, follows: bool) -> State:
+        """State after a view.
+
+        `confirmed`: by it and by enough ground recognized before. `follows`: whether the likeliest
+        place descends from a confirmed track or a reported position; another one is no dead
+        reckoning.
+        """
+        followed = self._state.is_followed
+        if confirmed and confidence >= (LIKELY if followed and follows else CONFIDENT):
+            return State.TRACKING
+        if followed:
+            return State.COASTING if follows and confidence >= LIKELY else State.LOST
+        return self._state
+
+    def _on_map(self, mean: Array) -> bool:
+        inside = (mean[:2] >= self._extent[:2]) & (mean[:2] <= self._extent[2:])
+        return bool(inside.all())
+
+    def _with_bias_jump(self, each: Hypothesis) -> list[Hypothesis]:
+        """A hypothesis without and with a bias jump since the last view."""
+        rare = self.model.bias_jump
+        if each.expected is None or each.share < MINOR_SHARE:
+            return [each]
+        expected = after_bias_jump(self.model, each.expected)
+        other = replace(
+            each,
+            share=each.share * rare,
+            mean=expected.mean,
+            covariance=expected.covariance,
+            expected=expected,
+        )
+        return [replace(each, share=each.share * (1 - rare)), other]
+
+    def _updated(
+        self,
+        starts: Sequence[Hypothesis],
+        seen: Measurement,
+        found: float,
+        ground: float,
+        confirms: bool,
+    ) -> Iterator[Hypothesis]:
+        """Hypotheses after a measurement, without those for which it lies outside the gate.
+
+        `found`: probability that a view is found. `ground`: share of the view that the last one did
+        not show. `confirms`: see `update`.
+        """
+        near = [each for each in starts if self._is_near(each, seen)]
+        if not near:
+            return
+        # All at once: each is small, and calls of NumPy take longer than what they compute.
+        before = np.array([each.covariance for each in near])
+        innovations = seen.mean - np.array([each.mean for each in near]) @ SEEN.T
+        expected = SEEN @ before @ SEEN.T
+        spreads = expected + seen.noise
+        log_weights = (seen.log_odds + log_densities(innovations, spreads)).tolist()
+        means, covariances = updated(
+            np.array([each.mean for each in near]), before, innovations, spreads
+        )
+        shown = recognition(seen, expected, innovations, self.model.most_agreement).tolist()
+        for number, each in enumerate(near):
+            sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
+            if shown[number] >= RECOGNIZED:
+                # Only of a track that was confirmed: chance has many views to agree with a new one.
+                shown_anew = uncounted if each.followed else ground
+                counted = confirmed_ground(seen.alone, shown_anew) if confirms else 0.0
+                sighted = min(each.sighted + counted, MOST_SIGHTED)
+                uncounted = 0.0 if counted else uncounted
+            self._numbers += 1
+            yield replace(
+                each,
+                share=each.share * math.exp(min(log_weights[number], 60.0)) * found,
+                mean=means[number].copy(),  # a history of views must not keep them all
+                covariance=covariances[number].copy(),
+                sighted=sighted,
+                uncounted=uncounted,
+                number=self._numbers,
+                recognized=shown[number],
+            )
+
+    @staticmethod
+    def _is_near(each: Hypothesis, seen: Measurement) -> bool:
+        """Whether a measurement lies within the gate of a hypothesis."""
+        variances = each.covariance[0, 0] + each.covariance[1, 1]
+        reach = variances + seen.noise[0, 0] + seen.noise[1, 1]
+        return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
+
+    def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
+        """Mean (10,) and covariance (10, 10) of a state that may be anywhere on the map."""
+        place, speed = self.area_m2, self.model.speed_mps**2
+        horizon = self.model.horizon_rad**2
+        variances = [
+            *(place, place, speed, speed),
+            *(*self.model.initial_bias(tilt_rad), horizon, horizon),
+        ]
+        return np.zeros(STATE), np.diag(np.array(variances))
+
+    def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
+        """Good and bad mount: probability, and a state anywhere on the map."""
+        off = self.model.off_mount
+        yield 1 - off, *self._nowhere()
+        if off > 0:
+            yield off, *self._nowhere(self.model.off_tilt_rad)
+
+    def _born(self, seen: Measurement, confirms: bool) -> Iterator[Hypothesis]:
+        """The hypotheses born from the belief elsewhere, at a measurement. `confirms`: see
+        `update`."""
+        for share, mean, covariance in self._mounts():
+            spread = SEEN @ covariance @ SEEN.T + seen.noise
+            log_weight = seen.log_odds - math.log(self.area_m2)
+            log_weight += log_density(seen.mean[2:], spread[2:, 2:])
+            mean, covariance = updated(mean, covariance, seen.mean, spread)
+            share *= self.elsewhere * math.exp(min(log_weight, 60.0))
+            self._numbers += 1
+            yield Hypothesis(
+                share,
+                mean,
+                covariance,
+                sighted=confirmed_ground(seen.alone, 1.0) if confirms else 0.0,
+                number=self._numbers,
+                recognized=seen.alone,
+                uncounted=0.0 if confirms else 1.0,
+            )
+
+    def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
+        self._numbers += 1
+        mean, covariance = expected.mean, expected.covariance
+        sighted = each.sighted
+        if float(np.trace(covariance[POSITION, POSITION])) > 2 * self.model.wide_m**2:
+            sighted *= FORGOTTEN
+        return replace(
+            each,
+            share=share,
+            mean=mean,
+            covariance=covariance,
+            sighted=sighted,
+            number=self._numbers,
+            parent=each.number,
+            expected=expected,
+            recognized=0.0,
+        )
+
+    def _settle(self) -> None:
+        """Normalize: shares and the belief elsewhere add up to one."""
+        total = sum(each.share for each in self.hypotheses) + self.elsewhere
+        self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
+        self.elsewhere /= total
+
+
+def _forgotten(sighted: float, ground: float) -> float:
+    """The count of recognized ground after a view that does not show the map; `ground`: the share
+    of it that the last one did not show."""
+    return sighted * float(UNRECOGNIZED**ground)

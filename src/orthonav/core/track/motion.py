@@ -1,0 +1,222 @@
+"""Prediction of the state: by time, by the reported velocity, and by the camera's odometry."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from orthonav.core.track.model import (
+    HEADING,
+    HORIZON,
+    POSITION,
+    SCALE,
+    STATE,
+    TILT,
+    VELOCITY,
+    Array,
+    Model,
+    log_density,
+)
+
+VELOCITY_JITTER = 0.3
+"""Share of the error of a reported velocity that is independent at every view; chosen on the
+flights of docs/tracking.md."""
+VELOCITY_STD_MPS, VELOCITY_SHARE = 1.0, 0.02
+"""Standard deviation of a reported velocity that comes without one: this, and this share of the
+speed (docs/tracking.md)."""
+
+
+def usual_velocity_std_mps(speed_mps: float) -> float:
+    """Standard deviation per axis of a reported velocity that comes without one."""
+    return VELOCITY_STD_MPS + VELOCITY_SHARE * speed_mps
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedVelocity:
+    """The reported velocity over ground, m/s east and north.
+
+    `now_en_mps` (2,): since the last view. `before_en_mps` (2,): the one reported with the last
+    view, None where there was none. `std_mps`: standard deviation per axis of its error, which is
+    nearly constant for `correlation_s`; None: `Model.reported_velocity_s`.
+    """
+
+    now_en_mps: Array
+    before_en_mps: Array | None
+    std_mps: float
+    correlation_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraDisplacement:
+    """The displacement since the last view, measured by the camera.
+
+    `moved_en_m` (2,): metres east and north, rotated by the reported heading and scaled by the
+    reported height of the view before, and so subject to their errors. `covariance` (2, 2).
+    `reach_m`: the radius within which it was sought. `turned_rad`, `scaled`: change of heading
+    (rad) and log scale beyond the reported change. `turned_std_rad`, `scaled_std`: their standard
+    deviations. `levers_m` (2, 2, 2): metres east and north by which an error of the pitch and roll
+    (rad) displaces the camera, now and before; `corrected_rad` (2, 2): what they were corrected by.
+    """
+
+    moved_en_m: Array
+    covariance: Array
+    reach_m: float
+    turned_rad: float = 0.0
+    scaled: float = 0.0
+    turned_std_rad: float = math.radians(0.4)
+    scaled_std: float = 0.004
+    levers_m: Array = field(default_factory=lambda: np.zeros((2, 2, 2)))
+    corrected_rad: Array = field(default_factory=lambda: np.zeros((2, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """A predicted state, with the state before it.
+
+    `mean` (10,), `covariance` (10, 10): the prediction. `mean_before`, `covariance_before`: the
+    state at the last view, by the odometry in between too. `cross` (10, 10): covariance of the
+    state before (rows) and the prediction (columns).
+    """
+
+    mean: Array
+    covariance: Array
+    mean_before: Array
+    covariance_before: Array
+    cross: Array
+
+    def without(self, part: slice, variances: Array) -> "Expected":
+        """The same with components of the state reset to zero mean and these variances."""
+        mean, covariance, cross = self.mean.copy(), self.covariance.copy(), self.cross.copy()
+        mean[part] = 0.0
+        cross[:, part] = 0.0
+        covariance[part] = covariance[:, part] = 0.0
+        covariance[part, part] = np.diag(variances)
+        return replace(self, mean=mean, covariance=covariance, cross=cross)
+
+
+def predicted(
+    model: Model,
+    mean: Array,
+    covariance: Array,
+    seconds: float,
+    velocity: ReportedVelocity | None,
+    telemetry_noise: Array,
+    camera: CameraDisplacement | None = None,
+    *,
+    coasting: bool = False,
+) -> Expected:
+    """The state predicted over so many seconds, by the reported velocity or else its own.
+
+    `telemetry_noise` (3,): variances of reported heading (rad) and log scale from view to view, and
+    of the horizon. The first two are added to the biases of these, unless the `camera` measured the
+    change; the horizon is a Gauss-Markov process (`Model.horizon_s`). The displacement
+    by the camera is not included: see `by_camera`. While `coasting`, the error of a reported
+    velocity drifts (`Model.coasting_walk`).
+    """
+    after, step = mean.copy(), np.eye(STATE)
+    noise = np.zeros((STATE, STATE))
+    noise[range(4, 8), range(4, 8)] = model.drift(seconds)
+    if camera is None:
+        noise[[HEADING, SCALE], [HEADING, SCALE]] += telemetry_noise[:2]
+    else:
+        after[[HEADING, SCALE]] += [camera.turned_rad, camera.scaled]
+        noise[HEADING, HEADING] += camera.turned_std_rad**2
+        noise[SCALE, SCALE] += camera.scaled_std**2
+    left = math.exp(-seconds / model.horizon_s)
+    after[HORIZON] *= left
+    step[HORIZON, HORIZON] = left * np.eye(2)
+    noise[range(8, 10), range(8, 10)] = telemetry_noise[2] * (1 - left**2)
+    if velocity is None:
+        after[POSITION] += seconds * mean[VELOCITY]
+        step[0, 2] = step[1, 3] = seconds
+        power = model.accel_mps2**2
+        _add(noise, power * seconds**4 / 4, power * seconds**3 / 2, power * seconds**2)
+    else:
+        like_before = 0.0
+        after[VELOCITY] = velocity.now_en_mps
+        known_mps = model.speed_mps / 2 if coasting else 3 * velocity.std_mps
+        if velocity.before_en_mps is not None and covariance[2, 2] < known_mps**2:
+            like_before = math.exp(-seconds / (velocity.correlation_s or model.reported_velocity_s))
+            after[VELOCITY] += like_before * (mean[VELOCITY] - velocity.before_en_mps)
+        after[POSITION] += seconds * after[VELOCITY]
+        step[VELOCITY, VELOCITY] = like_before * np.eye(2)
+        step[POSITION, VELOCITY] = seconds * like_before * np.eye(2)
+        added = velocity.std_mps**2 * (1 - like_before**2)
+        jitter = (VELOCITY_JITTER * velocity.std_mps * seconds) ** 2
+        _add(noise, added * seconds**2 + jitter, added * seconds, added)
+        if coasting:
+            power = model.coasting_walk**2
+            _add(noise, power * seconds**3 / 3, power * seconds**2 / 2, power * seconds)
+    return Expected(
+        after, step @ covariance @ step.T + noise, mean, covariance, covariance @ step.T
+    )
+
+
+def _add(noise: Array, position: float, both: float, velocity: float) -> None:
+    """Add variances of position and velocity and their covariance `both`, alike on both axes."""
+    for axis in (0, 1):
+        noise[axis, axis] += position
+        noise[axis, axis + 2] += both
+        noise[axis + 2, axis] += both
+        noise[axis + 2, axis + 2] += velocity
+
+
+def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected, float]:
+    """The prediction updated with a displacement by the camera, and the log density of the latter.
+
+    The displacement measures the position now less that before (stochastic cloning, Roumeliotis and
+    Burdick 2002), rotated and scaled by the errors of heading and scale before; what the tilts of
+    both views err by looks like motion.
+    """
+    mean = np.concatenate([expected.mean, expected.mean_before])
+    now, before = slice(0, STATE), slice(STATE, 2 * STATE)
+    joint = np.empty((2 * STATE, 2 * STATE))  # filled: np.block takes ten times as long
+    joint[now, now], joint[now, before] = expected.covariance, expected.cross.T
+    joint[before, now], joint[before, before] = expected.cross, expected.covariance_before
+    east, north = camera.moved_en_m
+    heading, scale = expected.mean_before[HEADING], expected.mean_before[SCALE]
+    cos, sin = math.cos(heading), math.sin(heading)
+    turn = math.exp(scale) * np.array([[cos, sin], [-sin, cos]])
+    observes = np.zeros((2, 2 * STATE))
+    observes[:, POSITION] = np.eye(2)
+    observes[:, STATE : STATE + 2] = -np.eye(2)
+    observes[:, STATE + HEADING] = -turn @ [north, -east]
+    observes[:, STATE + SCALE] = -turn @ [east, north]
+    innovation = turn @ [east, north] - (mean[POSITION] - mean[STATE : STATE + 2])
+    for sign, lever, known, first in zip(
+        (1, -1), camera.levers_m, camera.corrected_rad, (0, STATE), strict=True
+    ):
+        state = mean[first : first + STATE]
+        innovation -= sign * lever @ (state[TILT] + state[HORIZON] - known)
+        observes[:, first + TILT.start : first + STATE] += sign * np.hstack([lever, lever])
+    spread = observes @ joint @ observes.T + turn @ camera.covariance @ turn.T
+    gain = np.linalg.solve(spread, observes @ joint).T
+    mean = mean + gain @ innovation
+    joint = joint - gain @ spread @ gain.T
+    joint = (joint + joint.T) / 2
+    after = Expected(
+        mean[now], joint[now, now], mean[before], joint[before, before], joint[before, now]
+    )
+    return after, log_density(innovation, spread)
+
+
+def velocity_forgotten(model: Model, covariance: Array) -> Array:
+    """The covariance (10, 10) of a state with its velocity reset to unknown."""
+    out = covariance.copy()
+    out[VELOCITY] = out[:, VELOCITY] = 0.0
+    out[VELOCITY, VELOCITY] = np.eye(2) * model.speed_mps**2
+    return out
+
+
+def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
+    """The same; position and velocity are reset where that is less certain than the map."""
+    spread = expected.covariance[POSITION, POSITION]
+    # The sum of both variances is no less than the larger one of its axes.
+    if spread[0, 0] + spread[1, 1] <= area_m2 or np.linalg.eigvalsh(spread)[-1] <= area_m2:
+        return expected
+    return expected.without(slice(0, 4), np.repeat([area_m2, model.speed_mps**2], 2))
+
+
+def after_bias_jump(model: Model, expected: Expected) -> Expected:
+    """The same after a bias jump: heading, scale and tilt are reset."""
+    return expected.without(slice(4, 8), model.initial_bias(model.off_tilt_rad))

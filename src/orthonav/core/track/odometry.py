@@ -1,0 +1,378 @@
+"""Odometry by the camera: the displacement between two views, by registering one on the other."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.geo.camera import axis_on_ground_en_m
+from orthonav.core.localize.checks import check_footprint
+from orthonav.core.localize.rectify import downsampled, rectify_footprint
+from orthonav.core.records import Telemetry, View
+from orthonav.core.register.evidence import FINE, EvidenceRecipe
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.reference import Reference
+from orthonav.core.register.refine import Placed
+from orthonav.core.register.registrar import Levels, PosePrior, Registrar
+from orthonav.core.register.search import bank, largest_half_px, search
+from orthonav.core.register.template import ViewTemplates
+from orthonav.core.track import CameraDisplacement
+
+VIEW_PX = 160
+"""Views are compared at about so many pixels across: odometry needs half the resolution of a fix.
+Like the other values here without a source of their own, chosen on the flights of
+docs/tracking.md."""
+LEVELS = 3
+"""Levels of a view that serves as the map of the next one."""
+TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
+"""Spacing of headings and log scales in the search, which is refined from a coarse level: about
+that of `plan.SearchPlan`."""
+MAX_SPEED_MPS = 80.0
+"""Largest speed over ground for which a displacement is sought."""
+MIN_SCORE_RATIO = 2.5
+"""Least score of a displacement over that of its strongest rival: right ones have at least 4 on
+Arroio and generated landscapes, wrong ones at most 1.7."""
+MIN_CORRELATION = 0.4
+"""Least correlation: right ones have at least 0.56, wrong ones at most 0.11
+(docs/decisions/tracking.md, 5)."""
+EXPECTED_CORRELATION = 0.6
+"""An expected displacement that fits this well ends the search (docs/decisions/tracking.md, 5)."""
+NOISE_PX, NOISE_SHARE = 0.4, 0.01
+"""Standard deviation of a displacement per axis: in pixels, and as a share of its length."""
+CANDIDATES = 8
+"""Candidates of the search."""
+EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
+"""Refinement of the expected displacement at each level: most steps, and the step that ends it."""
+TILT_SHARE = 0.6
+"""Share of the error by an independent error of the tilt that remains in the sum of many
+displacements: the next displacement cancels most of it."""
+SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
+"""Changes of the biases of heading, log scale, pitch and roll up to which a view need not be
+rectified again. Heading has no limit: views are rectified with their heading up."""
+LEVER_STEP_DEG = 0.05
+"""Step of the numerical derivatives by pitch and roll."""
+UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
+"""Usual slope of ground whose slope is unknown, and the share of it that a terrain leaves."""
+LEAST_SCALED = 0.5
+"""Least height or distance over the one expected: the rest is an error."""
+Array = NDArray[np.float64]
+NO_BIAS: Array = np.zeros(4)
+
+
+def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
+    """Telemetry corrected by estimated biases (4,) of heading (rad), log scale, pitch and roll
+    (rad)."""
+    yaw_deg, pitch_deg, roll_deg = np.degrees(bias[[0, 2, 3]]).tolist()
+    return replace(
+        telemetry,
+        yaw_deg=telemetry.yaw_deg + yaw_deg,
+        agl_m=telemetry.agl_m * math.exp(bias[1]),
+        pitch_deg=telemetry.pitch_deg + pitch_deg,
+        roll_deg=telemetry.roll_deg + roll_deg,
+    )
+
+
+def tilt_lever_m(telemetry: Telemetry) -> Array:
+    """Metres east and north (2, 2) by which a camera seems displaced per rad that its pitch and its
+    roll are more than reported: how far the ground on its optical axis moves."""
+    angles, columns = np.array([telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg]), []
+    for axis in (1, 2):
+        step = np.zeros(3)
+        step[axis] = LEVER_STEP_DEG
+        seen = []
+        for sign in (1, -1):
+            yaw_deg, pitch_deg, roll_deg = (angles + sign * step).tolist()
+            seen.append(axis_on_ground_en_m(yaw_deg, pitch_deg, roll_deg, telemetry.agl_m))
+        ahead, behind = seen
+        columns.append(np.subtract(ahead, behind) / (2 * math.radians(LEVER_STEP_DEG)))
+    return np.stack(columns, axis=1)
+
+
+class _ViewAsMap(Reference):
+    """One rectified view in the role of the map. Not to be shared between threads.
+
+    Its evidence is that of its templates, so that it is made once for both roles. They differ by a
+    factor for each kind of evidence, which changes no correlation.
+    """
+
+    def __init__(self, templates: ViewTemplates) -> None:
+        self._templates = templates
+
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return LEVELS
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        return self._templates.shape(level)
+
+    def caches(self, level: int) -> bool:
+        """All levels are small."""
+        return True
+
+    def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> NDArray[np.float32]:
+        """Evidence (H, W, 4) of a level."""
+        return self._templates.at(level, recipe).values
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryView:
+    """A view rectified for odometry, heading up.
+
+    `registrar`: registers the next view on this one. `templates`: the rectified view, of `pixel_m`
+    metres a pixel. `camera_px` (2,): the camera seen from its middle, x to the right and y down.
+    `telemetry`: that of the view, corrected by `bias` (4,) of heading (rad), log scale, pitch and
+    roll (rad). `view`: what it was made of, averaged towards `pixel_m`.
+    """
+
+    registrar: Registrar
+    templates: ViewTemplates
+    pixel_m: float
+    camera_px: Array
+    telemetry: Telemetry
+    bias: Array
+    view: View
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.templates.shape(0)
+
+    @property
+    def middle_px(self) -> tuple[float, float]:
+        """Middle of the view, x and y."""
+        rows, cols = self.shape
+        return cols / 2, rows / 2
+
+    @property
+    def en_from_px(self) -> Array:
+        """Matrix (2, 2) from pixels (x, y) to metres east and north, by the reported telemetry."""
+        heading = math.radians(self.view.telemetry.yaw_deg)
+        cos, sin = math.cos(heading), math.sin(heading)
+        metres = self.pixel_m * math.exp(-self.bias[1])
+        return np.array([[cos, -sin], [-sin, -cos]]) * metres
+
+    @property
+    def ahead_en_m(self) -> Array:
+        """Middle of the view (2,), metres east and north of the camera, by the same."""
+        return np.asarray(self.en_from_px @ -self.camera_px)
+
+    @classmethod
+    def of(
+        cls,
+        view: View,
+        pixel_m: float | None,
+        bias: Array = NO_BIAS,
+    ) -> "OdometryView | None":
+        """A view for odometry, None where it shows too little."""
+        camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
+        side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
+        pixel_m = pixel_m or side_m / VIEW_PX
+        thinned = downsampled(replace(view, telemetry=telemetry), pixel_m)
+        made = rectify_footprint(thinned, gsd_m=pixel_m, multiple_px=2 ** (LEVELS - 1))
+        if check_footprint(made, 1.0, VIEW_PX / 4) is not None:
+            return None
+        camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
+        templates = ViewTemplates(made.grey, made.valid, 0)
+        return cls(
+            registrar=Registrar(_ViewAsMap(templates)),
+            templates=templates,
+            pixel_m=pixel_m,
+            camera_px=camera_px,
+            telemetry=telemetry,
+            bias=bias,
+            view=replace(thinned, telemetry=view.telemetry),
+        )
+
+    def corrected(self, bias: Array) -> "OdometryView | None":
+        """The same view with the present estimate of the biases.
+
+        Both views of a displacement need the same estimate: otherwise what was learnt between
+        them, a tilt most of all, would appear as motion (docs/decisions/tracking.md, 11).
+        """
+        if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
+            return OdometryView.of(self.view, self.pixel_m, bias)
+        # Rectified with its heading up, so only the heading may change without rectifying again.
+        same = np.array([bias[0], *self.bias[1:]])
+        return replace(self, telemetry=corrected_by(self.view.telemetry, same), bias=same)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewDisplacement:
+    """A displacement, and the `overlap`: share of the later view that the earlier one shows too."""
+
+    displacement: CameraDisplacement
+    overlap: float
+
+
+def displacement(
+    before: OdometryView,
+    now: OdometryView,
+    tilt_noise_rad: float,
+    telemetry_noise: Array,
+    expected_en_m: Array | None = None,
+) -> ViewDisplacement | None:
+    """The displacement from one view to the next, both with the same `pixel_m`.
+
+    None where they do not show enough common ground. The displacement is rotated and scaled by the
+    telemetry reported with the view before. `tilt_noise_rad`: standard deviation of the error of a
+    reported tilt that is independent at every view. `telemetry_noise` (3,): variances of reported
+    heading (rad) and log scale between views; the third is not used. `expected_en_m` (2,) is tried
+    first: where it fits it saves the search, elsewhere it changes nothing.
+    """
+    reported_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
+    if not math.isfinite(reported_turn):
+        return None
+    prior = PosePrior(
+        math.remainder(reported_turn, 2 * math.pi),
+        max(math.sqrt(2 * telemetry_noise[0]), TURN_STEP_RAD / 3),
+        max(math.sqrt(2 * telemetry_noise[1]), SCALE_STEP / 3),
+    )
+    placed = _registered(before, now, prior, expected_en_m)
+    if placed is None or placed.weighted < MIN_CORRELATION:
+        return None
+    pose = placed.pose
+    moved_en_m = before.en_from_px @ (
+        pose.map_px(now.camera_px) - np.array(before.middle_px) - before.camera_px
+    )
+    std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*moved_en_m)))
+    variance = std_m**2 + (TILT_SHARE * now.telemetry.agl_m * tilt_noise_rad) ** 2
+    reported_rad = math.radians(now.view.telemetry.yaw_deg - before.view.telemetry.yaw_deg)
+    seen = CameraDisplacement(
+        moved_en_m,
+        np.eye(2) * variance,
+        reach_m=_reach_px(before, now) * before.pixel_m,
+        turned_rad=math.remainder(pose.turn_rad - reported_rad, 2 * math.pi),
+        scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
+        levers_m=np.stack([tilt_lever_m(now.telemetry), tilt_lever_m(before.telemetry)]),
+        corrected_rad=np.stack([now.bias[2:], before.bias[2:]]),
+    )
+    return ViewDisplacement(seen, min(max(placed.overlap, 0.0), 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """Ground that is not level.
+
+    `below`, `seen` (2,): its rise per metre east and north below the camera, and at the middle of
+    what both views show. `rise`: of the ground there over that below, as a share of the height.
+    """
+
+    below: Array
+    seen: Array
+    rise: float
+
+
+def over_terrain(
+    measured: ViewDisplacement,
+    agl_m: tuple[float, float],
+    terrain: Terrain | None,
+    ahead_en_m: Array,
+) -> ViewDisplacement:
+    """A displacement over ground that is not level.
+
+    `agl_m`: heights reported with both views. `terrain`: None where it is unknown. `ahead_en_m`
+    (2,): middle of a view, from the camera. Level ground is assumed by the
+    measurement: by parallax, a slope along the way looks like a change of scale, one across it like
+    a turn, each by half, about the middle of the views. They displace the camera, which is not
+    there. The displacement is seen at the distance of the ground there, and the height above the
+    ground below changes by what this rises (docs/decisions/terrain.md).
+    """
+    seen = measured.displacement
+    moved_en_m, near, below = seen.moved_en_m, 1.0, 0.0
+    along, across = 0.0, 0.0
+    unknown = UNKNOWN_SLOPE
+    if terrain is not None:
+        near = max(1 - terrain.rise, LEAST_SCALED)
+        steep = max(1 + float(terrain.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
+        share_en = moved_en_m / (agl_m[0] * steep)
+        along = float(share_en @ terrain.seen) / 2
+        across = float(share_en[1] * terrain.seen[0] - share_en[0] * terrain.seen[1]) / 2
+        parallax = np.array([[along, -across], [across, along]])
+        moved_en_m = near * (moved_en_m + parallax @ ahead_en_m)
+        below = float(moved_en_m @ terrain.below) / agl_m[0]
+        unknown *= LEFT_OF_SLOPE
+    unknown *= float(np.hypot(*moved_en_m)) / agl_m[0]
+    aside_m = float(np.hypot(*ahead_en_m)) * unknown / 2
+    reported = math.log(agl_m[1] / agl_m[0])
+    left = near * (math.exp(seen.scaled + reported) - along) + 1 - near - below
+    over = replace(
+        seen,
+        moved_en_m=moved_en_m,
+        covariance=seen.covariance + np.eye(2) * aside_m**2,
+        turned_rad=seen.turned_rad + across,
+        turned_std_rad=math.hypot(seen.turned_std_rad, unknown / 2),
+        scaled=math.log(max(left, LEAST_SCALED)) - reported,
+        scaled_std=math.hypot(seen.scaled_std, 1.5 * unknown),
+    )
+    return replace(measured, displacement=over)
+
+
+def _registered(
+    before: OdometryView, now: OdometryView, prior: PosePrior, expected_en_m: Array | None
+) -> Placed | None:
+    """The later view registered on the earlier one; None where no place stands out."""
+    templates = now.templates
+    side_px = math.sqrt(float(templates.valid.sum()))
+    levels = Levels.of(side_px, LEVELS)
+    if expected_en_m is not None:
+        placed = _as_expected(before, now, templates, levels, prior, expected_en_m)
+        if placed.weighted >= EXPECTED_CORRELATION:
+            return placed
+    reach = _reach_px(before, now)
+    tried = bank(
+        prior.turn_std_rad,
+        prior.log_scale_std,
+        turn_step_rad=TURN_STEP_RAD,
+        scale_step=SCALE_STEP,
+        sigmas=2.5,
+    )
+    poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried.poses]
+    level = levels.coarse
+    recipe = levels.recipe(level)
+    registrar = before.registrar
+    template = templates.at(level, recipe)
+    window = registrar.part_window(
+        level,
+        recipe,
+        side_px,
+        before.middle_px,
+        reach + 2.0 * 2**level,
+        largest_half_px(template, poses),
+    )
+    candidates = search(template, window, poses, CANDIDATES)
+    if not candidates:
+        return None
+    judged = registrar.judged(templates, levels, candidates, level, prior)
+    found = registrar.finished(templates, levels, judged, prior, len(candidates))
+    return found.placed if found.peak_ratio >= MIN_SCORE_RATIO else None
+
+
+def _as_expected(
+    before: OdometryView,
+    now: OdometryView,
+    templates: ViewTemplates,
+    levels: Levels,
+    prior: PosePrior,
+    expected_en_m: Array,
+) -> Placed:
+    """The later view refined from its expected place, from coarse to fine."""
+    turned = Pose(0.0, 0.0, prior.turn_rad or 0.0, 0.0)
+    moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
+    x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
+    pose = replace(turned, x_px=float(x), y_px=float(y))
+    for level in range(levels.look, levels.final - 1, -1):
+        refiner = before.registrar.refiner(templates, levels, level)
+        placed = refiner.place(pose, EXPECTED_STEPS, SMALL_STEP_PX)
+        pose = placed.pose
+    return placed
+
+
+def _reach_px(before: OdometryView, now: OdometryView) -> float:
+    """How far from the earlier view the later one is sought, in pixels of both."""
+    seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
+    far = math.hypot(*before.shape)
+    # A clock that stands still does not bound the distance.
+    return min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far

@@ -1,0 +1,674 @@
+"""From the views of a flight to one track: registration measures, the mixture decides.
+
+Every view is registered around the predicted position, or anywhere on the map while that is not
+known; all its plausible places go to the mixture with their odds. Views that overlap are registered
+on each other too, which is odometry by the camera (`odometry`).
+"""
+
+import math
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import MapFileError
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.ground import Ground
+from orthonav.core.localize.camera import CameraFound
+from orthonav.core.localize.checks import check_view
+from orthonav.core.localize.localizer import Localizer
+from orthonav.core.localize.places import places_of
+from orthonav.core.localize.prepared import PreparedView
+from orthonav.core.localize.registration import RegisteredView
+from orthonav.core.localize.relief import Relief
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.register.pose import rotation
+from orthonav.core.register.refine import Placed
+from orthonav.core.register.registrar import Registered
+from orthonav.core.track import (
+    CameraDisplacement,
+    Estimate,
+    Mixture,
+    Model,
+    ReportedAttitude,
+    ReportedVelocity,
+    Sighting,
+    State,
+)
+from orthonav.core.track.hypotheses import within
+from orthonav.core.track.model import (
+    BIASES,
+    HEADING,
+    HORIZON,
+    POSITION,
+    SCALE,
+    SEEN,
+    TILT,
+    VELOCITY,
+    WHITE_SHARE,
+)
+from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.core.track.odometry import (
+    OdometryView,
+    Terrain,
+    ViewDisplacement,
+    corrected_by,
+    displacement,
+    over_terrain,
+    tilt_lever_m,
+)
+from orthonav.core.track.smooth import History, Smoothed
+
+LOCAL_SHARE = 0.75
+"""Belief in one place from which on views are searched around it only. Like the other values here
+without a source of their own, chosen on the flights of docs/tracking.md."""
+LOCAL_SIGMAS = 4.0
+"""Half width of that search, in standard deviations of the predicted position."""
+MIN_LOCAL_M = 30.0
+"""Least half width of that search."""
+LEAST_NEW = 0.15
+"""Least share of a view that counts as new evidence, however much it overlaps the view before:
+noise, light and tilt differ (docs/decisions/tracking.md, 2)."""
+LIKELY_NATS = 5.0
+"""Places so much less likely than the best one are not examined for their tilt."""
+UNSEEN_TILT_RAD = math.radians(20.0)
+"""Standard deviation of a tilt that a view does not show."""
+LEAST_TILT_STD_DEG = 0.1
+"""Least deviation of the tilt that a track expects of a view."""
+UNAIDED_STD_MPS, UNAIDED_S = 3.0, 15.0
+"""The error of a reported velocity with at least this deviation changes within so many seconds:
+that of an autopilot which nothing aids."""
+LEARNT_S = 10.0
+"""Time over which the error of a reported velocity is learnt from odometry, s."""
+LONGEST_GAP_S = 600.0
+"""Longer gaps between views are predicted as if they had this length: by then the position is
+known to no more than the map."""
+UNKNOWN_STEP_S = 1.0
+"""Time step where the clock stands still or jumps back."""
+NEAR_SHARE = 0.05
+"""Places closer to each other than this share of the side of a view are one place."""
+KNOWN_MPS = 5.0
+"""An estimated velocity with less uncertainty than this predicts the next displacement."""
+KNOWN_PLACE_M = 50.0
+"""The ground below and ahead is known where the position is known better than this."""
+SIGHT_STEPS = 4
+"""Steps along the line of sight to the ground that a view shows. Each leaves a share of the error:
+the slope of the ground over that of the line."""
+Array = NDArray[np.float64]
+
+
+class Tracker:
+    """Follows one flight over one map. Mutable; not to be shared between threads."""
+
+    def __init__(
+        self,
+        localizer: Localizer | MapFile,
+        *,
+        model: Model | None = None,
+        heading_known: bool = True,
+        use_prior: bool = True,
+        every_prior: bool = False,
+        smooth: bool = False,
+        lag: int | None = None,
+    ) -> None:
+        """Begin a track on the map of a localizer, or on an opened map.
+
+        `model`: None for the usual one, with a mount as good as the height of the flight asks for.
+        With `use_prior` the track starts at the first view's prior; with `every_prior` the priors
+        of all views are position measurements, such as GNSS. With `smooth` the history that
+        `smoothed_track` needs is recorded: each view is smoothed over all of them, or, with `lag`,
+        over those before it and so many after it.
+
+        Raises `MapFileError` where the map has no registration layer or no confidence.
+        """
+        if isinstance(localizer, MapFile):
+            localizer = Localizer(localizer)
+        self._heading_known = heading_known
+        self.model, self._usual_model = model or Model(), model is None
+        self._usual_scale = self._usual_model
+        self.mixture = Mixture(self.model, self._use(localizer))
+        self._time_ns: int | None = None
+        self._predicted: Telemetry | None = None
+        self._before: OdometryView | None = None
+        self._velocity: Array | None = None
+        self._velocity_variance, self._learnt_s = 0.0, 0.0
+        self._seen: list[Sighting] = []
+        self._whole_map = False
+        self._use_prior, self._every_prior = use_prior, every_prior
+        self._history = History() if smooth else None
+        self._lag = lag
+        self._outcomes: list[tuple[Fix | NoFix, Telemetry]] = []
+        self._lagged: list[Fix | NoFix] = []
+        self.state = State.SEARCHING
+
+    def _use(self, localizer: Localizer) -> tuple[float, float, float, float]:
+        """Use the map of a localizer: its extent (west, south, east, north) in metres."""
+        registration = localizer.registration
+        if registration is None or registration.confidence is None:
+            raise MapFileError("a track needs a map with a registration layer and its confidence")
+        self._registration, self._confidence = registration, registration.confidence
+        self._localizer = localizer
+        return localizer.grid.extent_en_m
+
+    def continue_on(self, localizer: Localizer) -> None:
+        """Continue the track between two views on another map, which shows the aircraft too.
+
+        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor.
+        """
+        frame = self._localizer.sheet.frame
+        self.mixture.move(frame, localizer.sheet.frame, self._use(localizer))
+
+    def locate(self, view: View) -> Fix | NoFix:
+        """The position of the aircraft, by this view and all before it.
+
+        A view that shows nothing is bridged by dead reckoning. Raises `CameraError` if the camera
+        has another size than the picture.
+        """
+        refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
+        if self._usual_scale:
+            self._usual_scale = False
+            scale = math.hypot(Model.log_scale, view.camera.focal_std)
+            self.model = self.mixture.model = replace(self.model, log_scale=scale)
+        overlap, ground = self._predict(None if refused else view, view.telemetry)
+        self._seen = []
+        if refused is None:
+            refused = self._update(view, overlap, ground)
+        return self._outcome(view.telemetry, refused)
+
+    def update(
+        self,
+        image: NDArray[Any],
+        camera: Camera,
+        *,
+        time_s: float,
+        agl_m: float,
+        heading_deg: float | None = None,
+        pitch_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        prior: Prior | None = None,
+        heading_std_deg: float | None = None,
+        agl_std_m: float | None = None,
+        tilt_std_deg: float | None = None,
+        vel_en_mps: tuple[float, float] | None = None,
+    ) -> Fix | NoFix:
+        """The position of the aircraft by this image and all before it; arguments as of `View.of`.
+
+        `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
+        reported velocity over ground. Raises as `View.of`.
+        """
+        view = View.of(
+            image,
+            camera,
+            time_s=time_s,
+            agl_m=agl_m,
+            heading_deg=heading_deg,
+            pitch_deg=pitch_deg,
+            roll_deg=roll_deg,
+            prior=prior,
+            heading_std_deg=heading_std_deg,
+            agl_std_m=agl_std_m,
+            tilt_std_deg=tilt_std_deg,
+            vel_en_mps=vel_en_mps,
+        )
+        return self.locate(view)
+
+    def __repr__(self) -> str:
+        return f"Tracker({self._localizer.opened.path}, {self.state.value})"
+
+    @property
+    def state_name(self) -> str:
+        """The state as it stands in `fixes.jsonl`."""
+        return self.state.value
+
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        """The position by dead reckoning, at a view whose picture cannot be used for `reason`."""
+        self._seen = []
+        if telemetry is not self._predicted:  # else an error ended the view after its prediction
+            self._predict(None, telemetry)
+        return self._outcome(telemetry, reason)
+
+    def smoothed_track(self) -> list[Fix | NoFix]:
+        """Positions at all views so far, each estimated from the views after it too."""
+        if self._history is None:
+            raise ValueError("smoothing needs a tracker made with smooth=True")
+        left = len(self._outcomes) - len(self._lagged)
+        smoothed = self._history.smoothed(left) if left else []
+        return self._lagged + [
+            self._smoothed_fix(*pair)
+            for pair in zip(smoothed, self._outcomes[len(self._lagged) :], strict=True)
+        ]
+
+    def _smoothed_fix(
+        self, smoothed: Smoothed | None, filtered: tuple[Fix | NoFix, Telemetry]
+    ) -> Fix | NoFix:
+        """The smoothed position of a view; the filtered one where smoothing makes it less certain.
+
+        That happens where the most likely track passes over a view that is far from its neighbours.
+        """
+        before, telemetry = filtered
+        if smoothed is None:
+            return NoFix("searching", "no place was found")
+        spread = float(np.trace(smoothed.covariance[:2, :2]))
+        if isinstance(before, Fix) and spread > float(np.trace(before.cov_en_m2)):
+            return before
+        inside = within(smoothed.mean, smoothed.covariance, self._radius_m(telemetry))
+        belief = min(smoothed.belief, 1.0) * inside
+        return self._fix(smoothed.mean, smoothed.covariance, belief, telemetry, {})
+
+    def _radius_m(self, telemetry: Telemetry) -> float:
+        """The error that a confidence is about, m."""
+        high = RADIUS_SHARE * telemetry.agl_m
+        least = self._registration.radius_m
+        return max(least, high) if math.isfinite(high) else least
+
+    def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
+        """The estimate of the mixture as a fix, recorded for smoothing."""
+        estimate = self.mixture.estimate(self._radius_m(telemetry))
+        self.state = State.SEARCHING if estimate is None else estimate.state
+        outcome: Fix | NoFix = refused or NoFix("searching", "no place has been found yet")
+        if estimate is not None:
+            more = {
+                "hypotheses": float(len(self.mixture.hypotheses)),
+                "elsewhere": self.mixture.elsewhere,
+                "recognized": estimate.recognized,
+            }
+            mean, covariance = estimate.mean, estimate.covariance
+            outcome = self._fix(mean, covariance, estimate.confidence, telemetry, more)
+            if not self._heading_known:
+                outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
+        if self._history is not None:
+            self._history.record(self.mixture)
+            self._outcomes.append((outcome, telemetry))
+            if self._lag is not None and len(self._outcomes) > self._lag:
+                smoothed = self._history.smoothed(self._lag + 1)[0]
+                self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-self._lag - 1]))
+        return outcome
+
+    def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
+        """The heading under which this view was registered at a fix; NaN where it was not."""
+        off_m, turn_rad = min(
+            ((float(np.hypot(*(each.mean[:2] - mean[:2]))), each.mean[2]) for each in self._seen),
+            default=(math.inf, math.nan),
+        )
+        return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
+
+    def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
+        """Propagate the track to the time of this view.
+
+        Its measured overlap with the view before, 0..1, and the share of it that the view before
+        cannot have shown, 0..1.
+        """
+        before, now = self._before, None
+        self._predicted = telemetry
+        if view is not None and self._heading_known:
+            bias, _ = self.mixture.bias()
+            before = None if before is None else before.corrected(bias)
+            now = self._odometry_view(view, before, bias)
+        prior = telemetry.prior if self._use_prior or self._every_prior else None
+        if self._usual_model and math.isfinite(telemetry.agl_m):
+            self._usual_model = False
+            self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
+        if telemetry.tilt_std_deg is not None:
+            horizon = math.radians(telemetry.tilt_std_deg)
+            self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
+        if self._time_ns is None:
+            self._time_ns, self._before = telemetry.time_ns, now
+            if prior is not None:
+                self.mixture.start(*self._position_of(prior))
+            return 0.0, 1.0
+        seconds = (telemetry.time_ns - self._time_ns) / 1e9
+        if not 0 < seconds < LONGEST_GAP_S:
+            seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
+        self._time_ns = telemetry.time_ns
+        noise = self._telemetry_noise(telemetry)
+        velocity = self._reported_velocity(telemetry)
+        expected = self._expected_displacement(seconds, velocity)
+        moved = self._displacement(before, now, noise, expected)
+        self._before = now
+        camera = None if moved is None else moved.displacement
+        if camera is not None:
+            self._learn_velocity(velocity, camera, seconds)
+        self.mixture.predict(seconds, velocity, camera, noise)
+        if self._every_prior and prior is not None:
+            self.mixture.measure_position(*self._position_of(prior))
+        if moved is not None:
+            return moved.overlap, 1 - moved.overlap
+        # Clouds do not fit each other, but show no new ground either.
+        return 0.0, 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
+
+    def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
+        """Share of a view that is new, by the expected displacement or the largest usual speed."""
+        moved_m = self.model.speed_mps * seconds
+        if expected is not None:
+            moved_m = float(np.hypot(*expected))
+        side_m = view.telemetry.agl_m * min(view.camera.extent)
+        return min(moved_m / side_m, 1.0) if side_m > 0 else 1.0
+
+    def _position_of(self, prior: Prior) -> tuple[Array, float]:
+        """Metres east and north (2,) of a prior, and its standard deviation."""
+        frame = self._localizer.sheet.frame
+        return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
+
+    def _telemetry_noise(self, telemetry: Telemetry) -> Array:
+        """Variances (3,) of reported heading (rad) and log scale between views and of the horizon
+        (rad), or the usual."""
+        noise = self.model.telemetry_noise.copy()
+        if telemetry.yaw_std_deg is not None:
+            noise[0] = math.radians(telemetry.yaw_std_deg) ** 2
+        if telemetry.agl_std_m is not None and telemetry.agl_m > 0:
+            noise[1] = (telemetry.agl_std_m / telemetry.agl_m) ** 2
+        return noise
+
+    def _odometry_view(
+        self, view: View, before: OdometryView | None, bias: Array
+    ) -> OdometryView | None:
+        """The view for odometry, in pixels of the one before unless they differ too much."""
+        if before is not None:
+            made = OdometryView.of(view, before.pixel_m, bias)
+            if made is None or math.prod(made.shape) < 4 * math.prod(before.shape):
+                return made
+        return OdometryView.of(view, None, bias)
+
+    def _reported_velocity(self, telemetry: Telemetry) -> ReportedVelocity | None:
+        """The reported velocity together with that of the view before, None where none is given."""
+        before, reported = self._velocity, telemetry.vel_en_mps
+        self._velocity = None
+        if reported is None or not np.isfinite(reported).all():
+            return None
+        self._velocity = now = np.array(reported)
+        std = telemetry.vel_std_mps
+        if std is None or not std > 0:
+            std = usual_velocity_std_mps(float(np.hypot(*now)))
+        std = max(std, math.sqrt(max(self._velocity_variance, 0.0)))
+        return ReportedVelocity(now, before, std, UNAIDED_S if std >= UNAIDED_STD_MPS else None)
+
+    def _learn_velocity(
+        self, velocity: ReportedVelocity | None, moved: CameraDisplacement, seconds: float
+    ) -> None:
+        """Learn the variance of the reported velocity from odometry, less that of odometry itself:
+        a horizon that changes looks like motion."""
+        if velocity is None or seconds > LEARNT_S:
+            return
+        bias, _ = self.mixture.bias()
+        off = (
+            rotation(-bias[0], math.exp(bias[1])) @ moved.moved_en_m - velocity.now_en_mps * seconds
+        )
+        model = self.model
+        changed = 2 * model.horizon_rad**2 * (1 - math.exp(-seconds / model.horizon_s))
+        own = float(np.trace(moved.covariance)) + changed * float(np.sum(moved.levers_m[0] ** 2))
+        shown = (float(off @ off) - own) / (2 * seconds**2)
+        self._learnt_s += seconds
+        share = max(1 - math.exp(-seconds / LEARNT_S), seconds / self._learnt_s)
+        self._velocity_variance += share * (shown - self._velocity_variance)
+
+    def _expected_displacement(
+        self, seconds: float, velocity: ReportedVelocity | None
+    ) -> Array | None:
+        """Metres east and north (2,) by the reported or estimated velocity; None without one."""
+        if velocity is not None:
+            return velocity.now_en_mps * seconds
+        best = self.mixture.likeliest
+        if best is None or np.trace(best.covariance[VELOCITY, VELOCITY]) > KNOWN_MPS**2:
+            return None
+        return best.mean[VELOCITY] * seconds
+
+    def _displacement(
+        self,
+        before: OdometryView | None,
+        now: OdometryView | None,
+        telemetry_noise: Array,
+        expected_en_m: Array | None,
+    ) -> ViewDisplacement | None:
+        """The displacement since the last view by the camera, None where it cannot be measured."""
+        if before is None or now is None or before.pixel_m != now.pixel_m:
+            return None
+        white = WHITE_SHARE * math.sqrt(telemetry_noise[2])
+        made = displacement(before, now, white, telemetry_noise, expected_en_m)
+        if made is None or self._registration.relief.is_level:
+            return made
+        heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
+        ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
+        # What both views show lies half a displacement ahead of what the earlier one shows.
+        common_en_m = ahead_en_m + made.displacement.moved_en_m / 2
+        terrain = self._terrain(self._registration.relief, heights_m[0], common_en_m)
+        return over_terrain(made, heights_m, terrain, ahead_en_m)
+
+    def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
+        """The ground below, and that which a camera sees `ahead_en_m` (2,) of it on level ground
+        by the reported heading and height `agl_m`; None where it is unknown."""
+        best = self.mixture.likeliest
+        if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
+            return None
+        place, scale = best.mean[POSITION], math.exp(best.mean[SCALE])
+        ahead_m = rotation(-best.mean[HEADING], scale) @ ahead_en_m
+        seen, rise = place, 0.0
+        for _ in range(SIGHT_STEPS):
+            seen = place + (1 - rise) * ahead_m
+            ground_m = relief.terrain.at_en_m(np.stack([place, seen]))
+            rise = float(ground_m[1] - ground_m[0]) / (agl_m * scale)
+        slopes = relief.slopes(np.stack([place, seen]))
+        if not (np.isfinite(slopes).all() and math.isfinite(rise)):
+            return None
+        return Terrain(slopes[0], slopes[1], rise)
+
+    def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
+        """Register the view and update the mixture; a `NoFix` where it shows too little."""
+        telemetry = view.telemetry
+        expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
+        prior, searched, confirms = self._search_area(expected)
+        bias, spread = self._correction(telemetry, expected, prior)
+        known = _known(corrected_by(telemetry, bias), spread)
+        if prior is not None and expected is not None and telemetry.below is not None:
+            known = self._above_expected(known, expected.mean[:2])
+        corrected = replace(
+            view,
+            camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
+            telemetry=known,
+        )
+        seen = self._registration.register(corrected, prior, self._heading_known)
+        if isinstance(seen, NoFix):
+            return seen
+        sightings, newness = [], max(1 - overlap, LEAST_NEW)
+        if not isinstance(seen.found, NoFix):
+            area = math.inf if searched is None else math.pi * searched[1] ** 2
+            share = min(area / self.mixture.area_m2, 1.0)
+            sightings = self._sightings(seen, seen.found, known, bias[1], share)
+        attitude = ReportedAttitude(
+            math.radians(telemetry.yaw_deg) if self._heading_known else None,
+            math.radians(telemetry.pitch_deg),
+            math.radians(telemetry.roll_deg),
+        )
+        self._seen = sightings
+        self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
+        return None
+
+    def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
+        """Corrected telemetry, its height above the ground where the aircraft is expected: what it
+        was corrected by includes the error of the ground that was assumed before."""
+        relief = self._registration.relief
+        height_m = float(relief.terrain.at_en_m(place_en_m))
+        if relief.is_level or not math.isfinite(height_m):
+            return replace(telemetry, below=None)
+        return replace(telemetry, below=Ground(height_m, 0.0, 1.0))
+
+    def _correction(
+        self, telemetry: Telemetry, expected: Estimate | None, prior: Prior | None
+    ) -> tuple[Array, Array]:
+        """Mean (4,) and covariance (4, 4) of the biases by which telemetry is corrected.
+
+        Those of the track in its surroundings. A search of the whole map has to find any place at
+        its own heading and height.
+        """
+        if expected is None or prior is None:
+            variances = self.model.initial_bias()
+            variances += self._telemetry_noise(telemetry)[[0, 1, 2, 2]]
+            return np.zeros(4), np.diag(variances)
+        return (SEEN @ expected.mean)[2:], (SEEN @ expected.covariance @ SEEN.T)[2:, 2:]
+
+    def _must_compete(self, expected: Estimate) -> bool:
+        """Whether places near the track have to compete with the whole map to confirm it.
+
+        Not while a reported start is likely.
+        """
+        if expected.state is State.SEARCHING:
+            return expected.belief < LOCAL_SHARE
+        return not (expected.state.is_followed and expected.confirmed)
+
+    def _search_area(
+        self, expected: Estimate | None
+    ) -> tuple[Prior | None, tuple[Array, float] | None, bool]:
+        """The part of the map to search, as a prior and as a circle (middle, radius), None for all,
+        and whether a place found there may confirm the track.
+
+        It is the surroundings of the predicted position where that is nearly certain. Where these
+        have to compete with the whole map, views are searched there and here by turns.
+        """
+        whole_map = None, None, True
+        if expected is None or not expected.followed:
+            return whole_map  # an unconfirmed place must compete with the whole map
+        competes = self._must_compete(expected)
+        if competes:
+            self._whole_map = not self._whole_map
+            if self._whole_map:
+                return whole_map
+        elif expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE:
+            return whole_map
+        spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
+        reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
+        if 4 * reach**2 > self.mixture.area_m2 / 4:
+            return whole_map
+        lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
+        prior = Prior(float(lat), float(lon), reach / PRIOR_SIGMAS)
+        # Dead reckoning from a confirmed place that is still exact is as good as tracking.
+        exact = expected.state is not State.SEARCHING and reach <= MIN_LOCAL_M
+        return prior, (expected.mean[:2], reach), exact or not competes
+
+    def _sightings(
+        self,
+        seen: RegisteredView,
+        found: Registered,
+        telemetry: Telemetry,
+        log_scale: float,
+        searched_share: float,
+    ) -> list[Sighting]:
+        """The places where the view may have been taken.
+
+        `telemetry`: corrected by the track; `log_scale`: what its height was corrected by.
+        `searched_share`: share of the map that was searched.
+        """
+        near_px = NEAR_SHARE * seen.prepared.side_px
+        places = places_of(found, self._confidence, near_px, searched_share)
+        made = []
+        for log_odds, alone, placed in places:
+            likely = log_odds > places[0][0] - LIKELY_NATS
+            camera = seen.camera(placed) if likely else None
+            if camera is None:
+                mean, covariance = self._by_similarity(seen.prepared, placed, telemetry)
+            else:
+                mean, covariance = self._by_camera(seen.prepared, camera, telemetry)
+            mean[3] += log_scale
+            if np.isfinite(covariance).all():
+                made.append(Sighting(mean, covariance, log_odds, alone))
+        return made
+
+    def _by_camera(
+        self, prepared: PreparedView, camera: CameraFound, telemetry: Telemetry
+    ) -> tuple[Array, Array]:
+        """Mean (6,) and covariance (6, 6) of a sighting by the view alone."""
+        rad, agl_m = math.pi / 180, camera.agl_m
+        east, north, up_m = camera.alone.position_m.tolist()
+        heading, pitch, roll = np.radians(camera.alone.attitude_deg).tolist()
+        above_m = agl_m + up_m - float(camera.orientation.position_m[2])
+        scale = math.log(max(above_m, agl_m / 2) / telemetry.agl_m)
+        units = np.diag([1.0, 1.0, 1 / agl_m, rad, rad, rad])
+        order = [0, 1, 3, 2, 4, 5]
+        covariance = (units @ camera.alone_covariance @ units)[np.ix_(order, order)]
+        floor_m = self._registration.floor_m(prepared)
+        covariance[:2, :2] += np.eye(2) * floor_m**2
+        return np.array([east, north, heading, scale, pitch, roll]), covariance
+
+    def _by_similarity(
+        self, prepared: PreparedView, placed: Placed, telemetry: Telemetry
+    ) -> tuple[Array, Array]:
+        """The same of a view that does not show its tilt."""
+        if placed.covariance is None:
+            again = self._registration.registrar.with_covariance(
+                prepared.templates, prepared.levels, placed
+            )
+            placed = replace(again, pose=placed.pose)
+        tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
+        mean = np.concatenate([self._registration.seen_from(prepared, placed.pose), tilt_rad])
+        heading_deg = math.degrees(placed.pose.turn_rad)
+        lever = tilt_lever_m(replace(telemetry, yaw_deg=heading_deg))
+        covariance = np.zeros((6, 6))
+        covariance[:4, :4] = self._registration.covariance(prepared, placed)
+        covariance[:2, :2] += UNSEEN_TILT_RAD**2 * lever @ lever.T
+        covariance[:2, 4:] = -(UNSEEN_TILT_RAD**2) * lever
+        covariance[4:, :2] = covariance[:2, 4:].T
+        covariance[4:, 4:] = UNSEEN_TILT_RAD**2 * np.eye(2)
+        return mean, covariance
+
+    def _fix(
+        self,
+        mean: Array,
+        covariance: Array,
+        confidence: float,
+        telemetry: Telemetry,
+        more: dict[str, float],
+    ) -> Fix:
+        """A state (10,) and its covariance (10, 10) as a fix; `more` goes into its evidence."""
+        lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
+        spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
+        spread.flags.writeable = False
+        pitch, roll = np.degrees(mean[TILT])
+        whole = mean[TILT] + mean[HORIZON]
+        evidence = {
+            "heading_bias_deg": math.degrees(mean[HEADING]),
+            "log_scale_bias": float(mean[SCALE]),
+            "pitch_bias_deg": float(pitch),
+            "roll_bias_deg": float(roll),
+            **_bias_stds(covariance),
+            "vel_east_mps": float(mean[2]),
+            "vel_north_mps": float(mean[3]),
+            "vel_std_mps": math.sqrt(float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])),
+            **more,
+        }
+        return Fix(
+            lat_deg=float(lat),
+            lon_deg=float(lon),
+            cov_en_m2=spread,
+            confidence=confidence,
+            radius_m=self._radius_m(telemetry),
+            heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
+            agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
+            evidence=MappingProxyType(evidence),
+            pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
+            roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
+        )
+
+
+def _bias_stds(covariance: Array) -> dict[str, float]:
+    """Standard deviations of the estimated biases of heading, scale, pitch and roll."""
+    std = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0))
+    names = (
+        "heading_bias_std_deg",
+        "log_scale_bias_std",
+        "pitch_bias_std_deg",
+        "roll_bias_std_deg",
+    )
+    values = np.where([True, False, True, True], np.degrees(std), std)
+    return dict(zip(names, values.tolist(), strict=True))
+
+
+def _known(corrected: Telemetry, spread: Array) -> Telemetry:
+    """Corrected telemetry with the uncertainty (4, 4) of the correction: it bounds the search."""
+    heading, scale, pitch, roll = np.sqrt(np.diag(spread)).tolist()
+    return replace(
+        corrected,
+        yaw_std_deg=math.degrees(heading),
+        agl_std_m=scale * corrected.agl_m,
+        tilt_std_deg=max(math.degrees(max(pitch, roll)), LEAST_TILT_STD_DEG),
+    )

@@ -1,0 +1,92 @@
+"""Choosing a variant by name: `canny:low=100,high=200`.
+
+A variant is a small frozen dataclass whose fields are its parameters. A table maps each name to
+its class and what it needs; nothing is found by reflection over modules and nothing is evaluated.
+"""
+
+import dataclasses
+import importlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from orthonav.core.errors import VariantError
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Where a variant lives (`module:Class`), whether it may fly, and the extra it needs."""
+
+    path: str
+    flies: bool = True
+    extra: str | None = None
+
+
+Table = Mapping[str, Variant]
+
+
+def make_variant(table: Table, text: str) -> Any:
+    """The variant that `name` or `name:field=value,...` describes.
+
+    Raises `VariantError` for an unknown name, an unknown field or a value of the wrong type.
+    """
+    name, _, rest = text.partition(":")
+    if name not in table:
+        raise VariantError(f"unknown variant '{name}'; known are: {', '.join(sorted(table))}")
+    values: dict[str, Any] = {}
+    for item in filter(None, rest.split(",")):
+        key, separator, value = item.partition("=")
+        if not separator:
+            raise VariantError(f"expected field=value in '{text}', got '{item}'")
+        values[key.strip()] = value.strip()
+    return _construct(table, name, values)
+
+
+def variant_from_recipe(table: Table, recipe: Any, *, flying: bool = False) -> Any:
+    """The variant that `variant_recipe` wrote down; raises `VariantError` if it does not fit.
+
+    With `flying`, variants that may not fly are refused before anything of theirs is loaded.
+    """
+    if not isinstance(recipe, dict) or not isinstance(recipe.get("name"), str):
+        raise VariantError(f"expected a variant with a name, got {recipe!r}")
+    if recipe["name"] not in table:
+        raise VariantError(f"unknown variant '{recipe['name']}'; this program is too old for it")
+    if flying and not table[recipe["name"]].flies:
+        raise VariantError(f"'{recipe['name']}' does not fly, it is for experiments only")
+    fields = {key: value for key, value in recipe.items() if key != "name"}
+    return _construct(table, recipe["name"], fields)
+
+
+def variant_recipe(table: Table, variant: Any) -> dict[str, Any]:
+    """Name and parameters of a variant, as plain values for a manifest."""
+    path = f"{type(variant).__module__}:{type(variant).__qualname__}"
+    for name, entry in table.items():
+        if entry.path == path:
+            return {"name": name, **dataclasses.asdict(variant)}
+    raise VariantError(f"{path} is not in the table of variants")
+
+
+def _construct(table: Table, name: str, values: Mapping[str, Any]) -> Any:
+    module, _, class_name = table[name].path.partition(":")
+    cls = getattr(importlib.import_module(module), class_name)
+    types = {field.name: field.type for field in dataclasses.fields(cls)}
+    unknown = sorted(set(values) - set(types))
+    if unknown:
+        raise VariantError(
+            f"'{name}' has no parameter {', '.join(unknown)}; it has: {', '.join(types) or 'none'}"
+        )
+    return cls(**{key: _converted(name, key, types[key], value) for key, value in values.items()})
+
+
+def _converted(name: str, key: str, kind: Any, value: Any) -> Any:
+    try:
+        if kind is int and float(value) == int(float(value)):
+            return int(float(value))
+        if kind is float and math.isfinite(float(value)):
+            return float(value)
+        if kind is str and isinstance(value, str):
+            return value
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise VariantError(f"'{name}' parameter {key} must be {kind.__name__}, got {value!r}")

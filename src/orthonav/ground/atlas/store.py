@@ -1,0 +1,279 @@
+"""The files of an atlas, in a local folder or in object storage.
+
+A file exists completely or not at all: locally it is written to a temporary name and renamed,
+object stores show a file when it is complete, elsewhere (SFTP) it is moved to its name. No file
+outside the atlas is ever named, because the catalogue may come from an untrusted source. Remote
+files are copied to a cache and verified; that of fsspec neither verifies nor limits its size.
+"""
+
+import contextlib
+import errno
+import hashlib
+import logging
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from orthonav.core.errors import MissingExtraError, OrthonavError, StorageError
+from orthonav.core.files import replacing
+from orthonav.ground.atlas.filesystems import LocalFolder, RemoteFiles
+
+log = logging.getLogger(__name__)
+
+MAX_READ_BYTES = 64 * 2**20
+"""A guard for memory: catalogue and index manifest are smaller."""
+LIMIT_BYTES = 20 * 10**9
+"""Some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)."""
+GRACE_S = 600.0
+"""Files used within this time are not removed: a process may be about to open them."""
+_PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
+_PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
+_PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
+_CREDENTIALS = re.compile(
+    "Credential|ClientAuthentication|NoAuthToken|ProfileNotFound|RefreshError"
+    "|TokenRetrieval|UnauthorizedSSOToken"
+)
+"""In the names of exceptions of boto, Google and Azure: there are no valid credentials."""
+_UNREACHABLE = re.compile(
+    "Connect(or|ion)|Timeout|HTTPClientError|SSLError|ServiceRe(quest|sponse)Error|gaierror"
+)
+"""In the names of exceptions: the storage cannot be reached."""
+_REFUSED = {401, 403}
+_MAX_TEXT = 300
+
+
+class Store:
+    """The files of one atlas by name (`folder/file`). Can be pickled and used by several threads.
+
+    Every failure is a `StorageError` with its cause, or `MissingExtraError` where the package of a
+    protocol is not installed. `str()` gives the address without a password.
+    """
+
+    def __init__(self, url: str) -> None:
+        """The store at a folder or URL, which need not exist yet."""
+        match = _PROTOCOL.match(url)
+        protocol = match.group(1).lower() if match else "file"
+        self.is_local = protocol in ("file", "local")
+        self._verified: set[tuple[str, int, int]] = set()
+        if self.is_local:
+            folder = Path(url[match.end() :] if match else url).expanduser().absolute()
+            self.url = str(folder)
+            self._files: LocalFolder | RemoteFiles = LocalFolder(folder)
+        else:
+            self.url = url.rstrip("/")
+            with storage_errors(str(self), "open the storage"):
+                self._files = RemoteFiles(self.url, protocol)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.url,)
+
+    def __str__(self) -> str:
+        return self.url if self.is_local else _PASSWORD.sub(r"\1@", self.url)
+
+    def names(self, folder: str = "", prefix: str = "") -> dict[str, int]:
+        """Names of the files of a folder that begin with `prefix`, sorted, and their sizes.
+
+        Subfolders are left out. Empty where there is no such folder.
+        """
+        with storage_errors(self.shown(folder), "list the files of the atlas"):
+            found = self._files.names(checked_name(folder) if folder else "", prefix)
+        return dict(sorted(found.items()))
+
+    def size(self, name: str) -> int | None:
+        """Bytes of a file, None where it does not exist."""
+        with storage_errors(self.shown(name), "access the atlas"):
+            return self._files.size(checked_name(name))
+
+    def age_s(self, name: str) -> float | None:
+        """Seconds since a file was written, None where the store does not report it."""
+        with storage_errors(self.shown(name), "access the atlas"):
+            modified = self._files.modified_s(checked_name(name))
+        return None if modified is None else time.time() - modified
+
+    def read(self, name: str, limit_bytes: int = MAX_READ_BYTES) -> bytes:
+        """Content of a file of at most `limit_bytes`."""
+        size = self.size(name)
+        if size is None:
+            raise StorageError(f"the atlas has no such file: {self.shown(name)}")
+        if size > limit_bytes:
+            raise StorageError(
+                f"file has {size} bytes, at most {limit_bytes} are allowed: {self.shown(name)}"
+            )
+        return self.read_many([name])[name]
+
+    def read_many(self, names: Iterable[str]) -> dict[str, bytes]:
+        """Contents of small files, in one request where the store supports it."""
+        with storage_errors(str(self), "read files of the atlas"):
+            return self._files.read([checked_name(name) for name in names])
+
+    def fetch(self, name: str, size: int, sha256: str) -> Path:
+        """A local file with that content, verified once: the file itself or a cached copy.
+
+        Several processes may use the cache at the same time.
+        """
+        if self.is_local:
+            return self._verified_path(name, size, sha256)
+        folder, limit_bytes = cache_folder(), cache_limit_bytes()
+        path = folder / sha256[:2] / f"{sha256}{Path(checked_name(name)).suffix}"
+        with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
+            if path.is_file() and path.stat().st_size == size:
+                os.utime(path)  # last used now
+                return path
+            with replacing(path) as temporary:
+                self.download(name, temporary)
+                _require(temporary, size, sha256, self.shown(name))
+            _shrink(folder, limit_bytes, path)
+        return path
+
+    def download(self, name: str, path: Path) -> None:
+        """Copy a file of a remote atlas to `path`, not verified."""
+        with storage_errors(self.shown(name), f"copy from the atlas to {path.parent}"):
+            name = checked_name(name)
+            assert isinstance(self._files, RemoteFiles)
+            self._files.get(name, path)
+
+    def write(self, name: str, content: Path | bytes) -> None:
+        """Write a file, a copy of a local one or these bytes, whole or not at all."""
+        with storage_errors(self.shown(name), "write to the atlas"):
+            self._files.save(content, checked_name(name))
+
+    def remove(self, name: str) -> None:
+        """Remove a file if it exists."""
+        with storage_errors(self.shown(name), "remove a file of the atlas"):
+            self._files.remove(checked_name(name))
+
+    def shown(self, name: str) -> str:
+        """The address of a file, without a password."""
+        return f"{self}/{name:.200}" if name else str(self)
+
+    def _verified_path(self, name: str, size: int, sha256: str) -> Path:
+        assert isinstance(self._files, LocalFolder)
+        with storage_errors(self.shown(name), "read the atlas"):
+            path = self._files.path(checked_name(name))
+            if not path.is_file():
+                raise StorageError(f"the atlas has no such file: {self.shown(name)}")
+            state = (sha256, path.stat().st_size, path.stat().st_mtime_ns)
+            if state not in self._verified:
+                _require(path, size, sha256, self.shown(name))
+                self._verified.add(state)
+        return path
+
+
+def checked_name(name: str) -> str:
+    """`name` if it is a valid name of a file inside an atlas. Raises `StorageError`."""
+    parts = name.split("/")
+    if not all(_PART.fullmatch(part) and part not in (".", "..") for part in parts):
+        raise StorageError(f"invalid name of a file in an atlas: {name!r:.120}")
+    return name
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, as hex."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _require(path: Path, size: int, sha256: str, shown: str) -> None:
+    """Raise `StorageError` where a file has not the size and digest of the catalogue."""
+    found = path.stat().st_size
+    if found != size:
+        wrong = f"incomplete or altered: {found} bytes, the catalogue has {size}"
+    elif digest_of(path) != sha256:
+        wrong = "damaged or altered: its checksum differs from the catalogue's"
+    else:
+        return
+    raise StorageError(f"{wrong}; 'orthonav atlas check --deep' finds all such files: {shown}")
+
+
+def cache_folder() -> Path:
+    """The folder of the cache: `ORTHONAV_CACHE`, otherwise the cache folder of the user."""
+    own = os.environ.get("ORTHONAV_CACHE")
+    if own:
+        return Path(own).expanduser()
+    users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(users).expanduser() / "orthonav" / "atlas"
+
+
+def cache_limit_bytes() -> int:
+    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB. Raises `StorageError`."""
+    gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
+    try:
+        return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
+    except (ValueError, OverflowError) as error:
+        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
+
+
+def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
+    """Remove the least recently used files until the limit holds."""
+    files = []
+    for path in folder.glob("??/*"):
+        with contextlib.suppress(FileNotFoundError):  # removed by another process
+            state = path.stat()
+            files.append((state.st_mtime, state.st_size, path))
+    excess = sum(size for _, size, _ in files) - limit_bytes
+    for used, size, path in sorted(files):
+        if excess <= 0:
+            return
+        if path != newest and time.time() - used > GRACE_S:
+            path.unlink(missing_ok=True)
+            excess -= size
+            log.debug("cache: removed %s", path.name)
+
+
+@contextmanager
+def storage_errors(place: str, action: str) -> Iterator[None]:
+    """Turn errors raised inside into `StorageError` with the cause.
+
+    `place`: address to show to people, without a password. `action`: what was attempted, a verb and
+    its object. Every exception is converted: the libraries behind fsspec raise many kinds.
+    """
+    try:
+        yield
+    except OrthonavError as error:
+        if isinstance(error, StorageError | MissingExtraError):
+            raise
+        raise StorageError(str(error)) from error
+    except Exception as error:
+        raise StorageError(f"cannot {action}: {_cause(error)}: {place}") from error
+
+
+def _cause(error: Exception) -> str:
+    chain = list(_chain(error))
+    names = {kind.__name__ for each in chain for kind in type(each).__mro__}
+    text = " ".join(str(error).split())[:_MAX_TEXT] or type(error).__name__
+    numbers = {each.errno for each in chain if isinstance(each, OSError)}
+    if numbers & {errno.ENOSPC, errno.EDQUOT}:
+        return "disk full; free some space"
+    if any(map(_CREDENTIALS.search, names)):
+        return f"no valid credentials ({text}); set those of the storage, see its documentation"
+    if errno.EROFS in numbers:
+        return "the file system is read-only"
+    if "PermissionError" in names or any(_status(each) in _REFUSED for each in chain):
+        return f"not permitted, or credentials refused ({text})"
+    if any(isinstance(each, FileNotFoundError) for each in chain):
+        return f"no such file, folder or bucket ({text})"
+    if any(map(_UNREACHABLE.search, names)):
+        return f"it cannot be reached ({text}); check the address and the network"
+    return f"{type(error).__name__}: {text}"
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    for _ in range(10):
+        if error is None:
+            return
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _status(error: BaseException) -> int | None:
+    """The HTTP status that an error of boto, Google or Azure carries."""
+    response = getattr(error, "response", None)
+    if isinstance(response, dict):
+        status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+    else:
+        status = getattr(error, "status_code", getattr(error, "code", None))
+    return status if isinstance(status, int) else None

@@ -1,0 +1,205 @@
+"""Writing the registration layer: blocks of grey in, compressed chunks of a pyramid out.
+
+A chunk is encoded as soon as it is complete, and passed at half the resolution to the next level,
+so memory holds compressed chunks and incomplete ones.
+"""
+
+import zlib
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.mapfile.layer import ChunkTable, part_names
+from orthonav.core.mapfile.manifest import MAX_LEVELS, GreyInfo
+
+CHUNK_PX = 256
+"""A view touches few chunks, and each decodes in 0.1 to 0.2 ms (docs/map-format.md)."""
+COARSEST_PX = 64
+"""Levels are added until the larger side is at most this."""
+QUALITY = 70
+"""Registration peaks are within 1 % of those of uncompressed imagery (docs/map-format.md)."""
+COARSER_QUALITIES = (50, 30)
+"""Used for chunks of noise, so that the size of a map is bounded."""
+MAX_BYTES_PER_PX = 0.5
+_HEADER_BYTES = 512
+_BLOBS = ("jpeg", "mask")
+Parts = dict[str, NDArray[Any]]
+
+
+def level_count(height_px: int, width_px: int) -> int:
+    """Levels of the pyramid of a sheet."""
+    levels = 1
+    while max(height_px, width_px) > COARSEST_PX << (levels - 1) and levels < MAX_LEVELS:
+        levels += 1
+    return levels
+
+
+def halved(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Grey and valid (H, W) at half the resolution, (ceil(H / 2), ceil(W / 2)).
+
+    A pixel is the mean of the valid ones of the four below it, rounded half up; it is valid if two
+    or more of them are. Pixels outside the image are not valid.
+    """
+    rows, cols = grey.shape
+    if rows % 2 == cols % 2 == 0 and valid.all():
+        # OpenCV rounds half up too, and is twenty times as fast.
+        small = cv2.resize(grey, (cols // 2, rows // 2), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.uint8), np.ones((rows // 2, cols // 2), np.bool_)
+    border = ((0, rows % 2), (0, cols % 2))
+    weight = np.pad(valid, border).astype(np.uint16)
+    count = _sum_of_four(weight)
+    total = _sum_of_four(np.pad(grey, border) * weight)
+    enough = count >= 2
+    mean = (total + count // 2) // np.maximum(count, 1)
+    return np.where(enough, mean, 0).astype(np.uint8), enough
+
+
+def _sum_of_four(values: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    pairs = values[0::2] + values[1::2]
+    return pairs[:, 0::2] + pairs[:, 1::2]
+
+
+class _Pending:
+    """An incomplete chunk."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.grey = np.zeros(shape, dtype=np.uint8)
+        self.valid = np.zeros(shape, dtype=bool)
+        self.missing_px = shape[0] * shape[1]
+
+
+class GreyLayerWriter:
+    """Compresses the grey levels of a sheet, given as blocks of any size in any order."""
+
+    def __init__(self, height_px: int, width_px: int, chunk_px: int = CHUNK_PX) -> None:
+        self._chunk_px = chunk_px
+        self._levels = level_count(height_px, width_px)
+        self._table = ChunkTable(height_px, width_px, self._levels, chunk_px)
+        self._pending: list[dict[tuple[int, int], _Pending]] = [{} for _ in range(self._levels)]
+        self._encoded: dict[int, tuple[bytes, bytes]] = {}
+        self._valid_px = 0
+
+    def add(self, row: int, col: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> None:
+        """Add a block (H, W) that begins at (row, col); no pixel may be added twice.
+
+        Pixels that are never added are not valid.
+        """
+        self._valid_px += int(np.count_nonzero(valid))
+        self._add(0, row, col, grey, valid)
+
+    def add_block(self, row: int, col: int, parts: Parts) -> None:
+        """Add the result of `compressed_block` for the block that begins at (row, col)."""
+        number, ends = 0, [np.concatenate([[0], parts[f"{kind}_ends"]]) for kind in _BLOBS]
+        rows, cols = self._table.shapes[0]
+        small = parts["half_valid"].shape
+        for chunk_row in range(row // CHUNK_PX, _chunks(min(row + 2 * small[0], rows))):
+            for chunk_col in range(col // CHUNK_PX, _chunks(min(col + 2 * small[1], cols))):
+                jpeg, mask = (
+                    parts[kind][end[number] : end[number + 1]].tobytes()
+                    for kind, end in zip(_BLOBS, ends, strict=True)
+                )
+                if jpeg:
+                    place = self._table.number(0, chunk_row, chunk_col)
+                    self._encoded[place] = (jpeg, mask)
+                number += 1
+        self._valid_px += int(parts["valid_px"][0])
+        if self._levels > 1:
+            self._add(1, row // 2, col // 2, parts["half"], parts["half_valid"])
+
+    def finish(self, sheet: int = 0) -> tuple[GreyInfo, dict[str, NDArray[np.uint8 | np.int64]]]:
+        """The record of the layer for the manifest, and its parts by name."""
+        for level, pending in enumerate(self._pending):
+            for place in sorted(pending):
+                self._complete(level, place)
+        empty = (b"", b"")
+        chunks = [self._encoded.get(number, empty) for number in range(self._table.count)]
+        names = part_names(sheet)
+        parts: dict[str, NDArray[np.uint8 | np.int64]] = {}
+        for index, kind in enumerate(("", "mask_")):
+            blobs = [chunk[index] for chunk in chunks]
+            ends = np.cumsum([0, *map(len, blobs)], dtype=np.int64)
+            parts[names[f"{kind}bytes"]] = np.frombuffer(b"".join(blobs), dtype=np.uint8)
+            parts[names[f"{kind}offsets"]] = ends
+        return GreyInfo(self._chunk_px, self._levels, QUALITY, self._valid_px), parts
+
+    def _add(
+        self, level: int, row: int, col: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+    ) -> None:
+        side = self._chunk_px
+        height, width = grey.shape
+        for chunk_row in range(row // side, -(-(row + height) // side)):
+            for chunk_col in range(col // side, -(-(col + width) // side)):
+                place = (chunk_row, chunk_col)
+                chunk = self._pending[level].get(place)
+                if chunk is None:
+                    chunk = _Pending(self._table.shape(level, *place))
+                    self._pending[level][place] = chunk
+                top, left = chunk_row * side, chunk_col * side
+                source = np.s_[
+                    max(top - row, 0) : top + side - row, max(left - col, 0) : left + side - col
+                ]
+                part = grey[source]
+                y, x = max(row - top, 0), max(col - left, 0)
+                target = np.s_[y : y + part.shape[0], x : x + part.shape[1]]
+                chunk.grey[target], chunk.valid[target] = part, valid[source]
+                chunk.missing_px -= part.size
+                if chunk.missing_px == 0:
+                    self._complete(level, place)
+
+    def _complete(self, level: int, place: tuple[int, int]) -> None:
+        """Encode a chunk and pass it on to the next level."""
+        chunk = self._pending[level].pop(place)
+        if chunk.valid.any():
+            number = self._table.number(level, *place)
+            self._encoded[number] = encode_chunk(chunk.grey, chunk.valid)
+        if level + 1 < self._levels:
+            half = self._chunk_px // 2
+            smaller = halved(chunk.grey, chunk.valid)
+            self._add(level + 1, place[0] * half, place[1] * half, *smaller)
+
+
+def compressed_block(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Parts:
+    """The compressed layer of a block (H, W) that begins at a chunk of `CHUNK_PX`.
+
+    The block must end at the end of a chunk or of the sheet. `jpeg`, `mask` (B,) with `.._ends`
+    (chunks,) are its chunks by rows, `half` and `half_valid` the next level.
+    """
+    chunks = [
+        encode_chunk(grey[part], valid[part]) if valid[part].any() else (b"", b"")
+        for row in range(0, grey.shape[0], CHUNK_PX)
+        for col in range(0, grey.shape[1], CHUNK_PX)
+        for part in [np.s_[row : row + CHUNK_PX, col : col + CHUNK_PX]]
+    ]
+    parts: Parts = {"valid_px": np.array([np.count_nonzero(valid)])}
+    for kind, blobs in zip(_BLOBS, zip(*chunks, strict=True), strict=True):
+        parts[kind] = np.frombuffer(b"".join(blobs), dtype=np.uint8)
+        parts[f"{kind}_ends"] = np.cumsum([len(blob) for blob in blobs])
+    parts["half"], parts["half_valid"] = halved(grey, valid)
+    return parts
+
+
+def _chunks(size_px: int) -> int:
+    return -(-size_px // CHUNK_PX)
+
+
+def encode_chunk(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:
+    """Bytes of a chunk (H, W) as JPEG, and of its mask (empty if all of it is valid)."""
+    if valid.all():
+        return _jpeg(grey), b""
+    # Filling with the mean gives the smallest file and the weakest edge.
+    filled = np.where(valid, grey, round(float(grey[valid].mean()))).astype(np.uint8)
+    return _jpeg(filled), zlib.compress(np.packbits(valid).tobytes(), 9)
+
+
+def _jpeg(grey: NDArray[np.uint8]) -> bytes:
+    encoded = b""
+    for quality in (QUALITY, *COARSER_QUALITIES):
+        options = [int(cv2.IMWRITE_JPEG_QUALITY), quality, int(cv2.IMWRITE_JPEG_OPTIMIZE), 1]
+        encoded = cv2.imencode(".jpg", grey, options)[1].tobytes()
+        if len(encoded) <= MAX_BYTES_PER_PX * grey.size + _HEADER_BYTES:
+            break
+    return encoded

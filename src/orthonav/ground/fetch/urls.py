@@ -1,0 +1,152 @@
+"""Addresses of services: only http and https, and never with a key where stored or shown.
+
+An address holds `{key}` in place of a key. The client inserts the value when it sends a request,
+and only for the origin that the key belongs to.
+"""
+
+import re
+from dataclasses import dataclass
+from urllib.parse import parse_qsl, quote, urlencode, urljoin, urlsplit, urlunsplit
+
+from orthonav.core.errors import FetchError
+
+KEY = "{key}"
+TOKEN = "{token}"
+"""Placeholder of a query string that a signing service issued for a file server."""
+MAX_URL = 4096
+"""Longest address, characters: half of what servers accept by default (8 KB of header)."""
+_SECRET_NAME = re.compile(
+    r"^(api[-_]?key|key|token|access[-_]?token|apikey|auth|authkey|password|pwd|sig|signature"
+    r"|subscription-key|ocp-apim-subscription-key)$",
+    re.IGNORECASE,
+)
+_PLACEHOLDERS = "{}"
+
+
+@dataclass(frozen=True)
+class Secret:
+    """The value of `placeholder` in addresses of `origin` (scheme, host and port).
+
+    `repr` leaves `value` out, so that no traceback shows it.
+    """
+
+    placeholder: str
+    origin: str
+    value: str
+
+    def __repr__(self) -> str:
+        return f"Secret({self.placeholder} of {self.origin})"
+
+
+def checked_url(url: str) -> str:
+    """`url`, if it is an http or https address without a user name.
+
+    Raises `FetchError`.
+    """
+    try:
+        parts = urlsplit(url)
+        named = bool(parts.hostname)
+        port_is_number = parts.port is None or parts.port > 0
+    except ValueError as error:
+        raise FetchError(f"invalid address: {shown(url)}") from error
+    if parts.scheme.lower() not in ("http", "https") or not named or not port_is_number:
+        raise FetchError(f"only http:// and https:// addresses are fetched, got: {shown(url)}")
+    if parts.username is not None or parts.password is not None:
+        raise FetchError(
+            "an address must not contain a user name or password; write the key as {key} and give "
+            f"it with --key-env: {parts.scheme}://{parts.hostname}"
+        )
+    if len(url) > MAX_URL or any(ord(letter) <= 32 or ord(letter) == 127 for letter in url):
+        raise FetchError(f"address is too long or contains blanks: {shown(url)}")
+    return url
+
+
+def origin_of(url: str) -> str:
+    """Scheme, host and port of an address: where a key may be sent."""
+    parts = urlsplit(url)
+    scheme = parts.scheme.lower()
+    port = parts.port or (443 if scheme == "https" else 80)
+    return f"{scheme}://{(parts.hostname or '').lower()}:{port}"
+
+
+def host_of(url: str) -> str:
+    """Host and port, which share one rate limit for both schemes."""
+    return origin_of(url).partition("://")[2]
+
+
+def without_literal_keys(url: str) -> tuple[str, str | None]:
+    """The address with `{key}` for a key written into its query, and that key.
+
+    Raises `FetchError` where several parameters look like keys.
+    """
+    parts = urlsplit(url)
+    query = parse_qsl(parts.query, keep_blank_values=True)
+    secret = [value for name, value in query if _SECRET_NAME.match(name) and "{" not in value]
+    secret = [value for value in secret if value]
+    if not secret:
+        return url, None
+    if len(set(secret)) > 1 or KEY in url:
+        raise FetchError(f"address contains several keys; one is supported: {shown(url)}")
+    plain = [(name, KEY if value == secret[0] else value) for name, value in query]
+    return urlunsplit(parts._replace(query=_encoded(plain))), secret[0]
+
+
+def shown(url: str) -> str:
+    """The address for messages and tags, without user names and values that look like keys."""
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        return url.partition("?")[0][:200]
+    host = parts.netloc.rpartition("@")[2]
+    query = [
+        (name, KEY if _SECRET_NAME.match(name) and "{" not in value else value)
+        for name, value in parse_qsl(parts.query, keep_blank_values=True)
+    ]
+    return urlunsplit((parts.scheme, host, parts.path, _encoded(query), ""))[:500]
+
+
+def with_query(url: str, parameters: dict[str, str]) -> str:
+    """The address with these query parameters, which replace those of the same name in any case."""
+    parts = urlsplit(url)
+    names = {name.lower() for name in parameters}
+    others = [
+        (name, value)
+        for name, value in parse_qsl(parts.query, keep_blank_values=True)
+        if name.lower() not in names
+    ]
+    return urlunsplit(parts._replace(query=_encoded([*others, *parameters.items()]), fragment=""))
+
+
+def joined(base: str, reference: str) -> str:
+    """A reference in a document as an absolute address, with https where the document has it.
+
+    Documents of services behind a proxy often refer to themselves with `http://`.
+    """
+    try:
+        url = urljoin(base, reference.strip())
+    except ValueError as error:
+        raise FetchError(f"not an address ({error}): {reference!r:.200}") from error
+    if base.startswith("https://") and url.startswith("http://"):
+        secure = "https://" + url[len("http://") :]
+        if host_of(secure) == host_of(base):
+            url = secure
+    return checked_url(url)
+
+
+def carrying_key(base: str, url: str) -> str:
+    """`url` with the key parameter of `base` where both have the same origin, else unchanged."""
+    if KEY not in base or KEY in url or origin_of(base) != origin_of(url):
+        return url
+    for name, value in parse_qsl(urlsplit(base).query):
+        if value == KEY:
+            return with_query(url, {name: KEY})
+    return url
+
+
+def quoted(value: str) -> str:
+    """A value for a path or a query; `{...}` stays unchanged."""
+    return quote(value, safe=_PLACEHOLDERS + ":,-._~")
+
+
+def _encoded(query: list[tuple[str, str]]) -> str:
+    return urlencode(query, safe=_PLACEHOLDERS + ":/,", quote_via=quote)

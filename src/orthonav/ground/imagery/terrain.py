@@ -1,0 +1,292 @@
+"""A terrain model in a file that GDAL reads: heights above mean sea level by position."""
+
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.caches import ByteCache
+from orthonav.core.errors import ImageryError
+from orthonav.core.extras import missing_extra
+from orthonav.core.files import require_file
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, bilinear
+
+try:
+    import pyproj
+    import rasterio
+    from rasterio._err import CPLE_BaseError
+    from rasterio.crs import CRS
+    from rasterio.enums import Resampling
+    from rasterio.errors import RasterioError
+    from rasterio.transform import Affine
+    from rasterio.vrt import WarpedVRT
+    from rasterio.windows import Window
+
+    from orthonav.ground.imagery.datum import VerticalDatum, geoid, horizontal_and_vertical
+    from orthonav.ground.imagery.quiet import quiet
+    from orthonav.ground.imagery.source import unwarped
+except ImportError as error:
+    raise missing_extra("reading terrain", "geo", "rasterio", error) from error
+
+Array = NDArray[np.float64]
+BLOCK_PX = 256
+"""Side of the windows that are read and cached."""
+CACHE_BYTES = 64 * 2**20
+SAMPLE_PX = 512
+"""Side of the overview from which units and voids are judged."""
+DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
+"""Tag of files that `orthonav fetch` wrote: what their heights count from."""
+_UNITS = {
+    "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
+    "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048,
+    "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,
+}  # fmt: skip
+_OPTIONS = {"GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 64 * 2**20}
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Dem:
+    """An open terrain model; calling it gives heights above mean sea level (`TerrainHeights`).
+
+    `path`: its file. `datum`: what its heights count from. `gsd_m`: its ground resolution.
+    Heights are read by windows and cached; for one thread.
+    """
+
+    path: Path
+    datum: VerticalDatum
+    gsd_m: float
+    _data: Any = field(repr=False)
+    _horizontal: pyproj.CRS = field(repr=False)
+    _void: float | None = field(repr=False)
+    _blocks: ByteCache[tuple[int, int], Array] = field(
+        init=False, repr=False, default_factory=lambda: ByteCache(CACHE_BYTES, _bytes_of)
+    )
+    _system_from_world: pyproj.Transformer = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        turned = pyproj.Transformer.from_crs("EPSG:4326", self._horizontal, always_xy=True)
+        object.__setattr__(self, "_system_from_world", turned)
+
+    def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
+        """Heights above mean sea level, bilinear; NaN for no data and outside the file.
+
+        Raises `ImageryError` where the file cannot be read, or where its heights count from the
+        ellipsoid and there is no geoid.
+        """
+        lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
+        col, row = self._pixels(lat.ravel(), lon.ravel())
+        found = np.full(col.shape, np.nan)
+        inside = (col >= 0) & (col <= self._data.width) & (row >= 0) & (row <= self._data.height)
+        for some, left, top, heights in self._blocks_of(col, row, inside):
+            found[some] = bilinear(heights, col[some] - left - 0.5, row[some] - top - 0.5)
+        return self._above_sea(found.reshape(lat.shape), lat, lon)
+
+    def covers(self, lat_deg: float, lon_deg: float) -> bool:
+        """Whether a position lies in the file, holes included."""
+        col, row = self._pixels(np.array([lat_deg]), np.array([lon_deg]))
+        return bool(0 <= col[0] <= self._data.width and 0 <= row[0] <= self._data.height)
+
+    def in_plane(
+        self,
+        frame: LocalFrame,
+        west_m: float,
+        north_m: float,
+        posting_m: float,
+        rows: int,
+        cols: int,
+    ) -> Array:
+        """Mean heights (rows, cols) above mean sea level of squares of `posting_m` in a plane.
+
+        The north-west corner of the first one is `west_m`, `north_m`. NaN for holes. Raises as
+        `__call__`.
+        """
+        row, col = np.mgrid[:rows, :cols] + 0.5
+        points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
+        lat, lon = frame.latlon_from_en(points)
+        if self.gsd_m >= 0.75 * posting_m:
+            return self(lat, lon)
+        grid = {
+            "crs": CRS.from_string(frame.proj4),
+            "transform": Affine(posting_m, 0, west_m, 0, -posting_m, north_m),
+            "width": cols,
+            "height": rows,
+        }
+        mean = self._warped(Resampling.average, **grid)
+        # The mean of heights and of a value that no ground can have may look like a height.
+        for kind in (Resampling.min, Resampling.max):
+            mean = np.where(np.isnan(self._warped(kind, **grid)), np.nan, mean)
+        return self._above_sea(mean, lat, lon)
+
+    def _warped(self, resampling: Resampling, **grid: Any) -> Array:
+        """Heights in metres, resampled onto a grid of `WarpedVRT`."""
+        try:
+            with (
+                quiet(),
+                rasterio.Env(**_OPTIONS),
+                WarpedVRT(
+                    self._data,
+                    src_crs=CRS.from_wkt(self._horizontal.to_wkt()),
+                    src_nodata=self._void,
+                    nodata=math.nan,
+                    dtype="float64",
+                    resampling=resampling,
+                    **grid,
+                ) as warped,
+            ):
+                return self._metres(warped.read(1, masked=True))
+        except (RasterioError, CPLE_BaseError) as error:
+            raise _unreadable(self.path, error) from error
+
+    def _above_sea(self, heights: Array, lat_deg: Array, lon_deg: Array) -> Array:
+        if self.datum.above_ellipsoid:
+            heights = heights - geoid()(lat_deg, lon_deg)
+        return heights
+
+    def _metres(self, raw: Any) -> Array:
+        """Heights in metres of stored values; NaN where masked, or where no ground can be."""
+        data = self._data
+        heights = np.ma.filled(raw.astype(np.float64), np.nan)
+        heights = (heights * data.scales[0] + data.offsets[0]) * self.datum.unit_m
+        sound = (heights >= LOWEST_M) & (heights <= HIGHEST_M)
+        return np.where(sound, heights, np.nan)
+
+    def _pixels(self, lat_deg: Array, lon_deg: Array) -> tuple[Array, Array]:
+        """Columns and rows from the outer corner of the first pixel; not finite where none."""
+        x, y = self._system_from_world.transform(lon_deg, lat_deg)
+        inverse = ~self._data.transform
+        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+        with np.errstate(invalid="ignore"):
+            return (
+                inverse.a * x + inverse.b * y + inverse.c,
+                inverse.d * x + inverse.e * y + inverse.f,
+            )
+
+    def _blocks_of(
+        self, col: Array, row: Array, inside: NDArray[np.bool_]
+    ) -> Iterator[tuple[NDArray[np.intp], int, int, Array]]:
+        """Positions of each window that holds some, its first column and row, and its heights."""
+        which = np.flatnonzero(inside)
+        blocks = np.stack([col[which], row[which]], axis=1) // BLOCK_PX
+        for left, top in np.unique(blocks.astype(np.intp), axis=0).tolist():
+            some = which[(blocks == (left, top)).all(axis=1)]
+            first_col, first_row = max(0, left * BLOCK_PX - 1), max(0, top * BLOCK_PX - 1)
+            yield some, first_col, first_row, self._block(left, top, first_col, first_row)
+
+    def _block(self, left: int, top: int, first_col: int, first_row: int) -> Array:
+        found = self._blocks.get((left, top))
+        if found is not None:
+            return found
+        last_col = min((left + 1) * BLOCK_PX + 1, self._data.width)
+        last_row = min((top + 1) * BLOCK_PX + 1, self._data.height)
+        window = Window(first_col, first_row, last_col - first_col, last_row - first_row)
+        try:
+            raw = self._data.read(1, window=window, masked=True)
+        except (RasterioError, CPLE_BaseError) as error:
+            raise _unreadable(self.path, error) from error
+        found = self._metres(_without(raw, self._void))
+        self._blocks.put((left, top), found)
+        return found
+
+
+def open_dem(path: Path, datum: str | None = None) -> Dem:
+    """Open a terrain model: one band of heights, in any coordinate system.
+
+    `datum`: what its heights count from, where the file does not state it (`datum.OPTION`).
+    Raises `MissingFileError` or `ImageryError`.
+    """
+    path = require_file(Path(path), "terrain file")
+    try:
+        with quiet(), rasterio.Env(**_OPTIONS):
+            return _inspected(path, rasterio.open(path), datum)
+    except (RasterioError, CPLE_BaseError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _inspected(path: Path, data: Any, given: str | None) -> Dem:
+    if reason := unwarped(path, data):
+        raise ImageryError(f"terrain file {reason}: {path}")
+    if data.crs is None:
+        raise ImageryError(f"terrain file has no coordinate reference system: {path}")
+    if data.count != 1 or data.dtypes[0] in ("uint8", "int8"):
+        raise ImageryError(
+            f"terrain file has {data.count} bands of {data.dtypes[0]}, which is a picture: one "
+            f"band of heights is expected: {path}"
+        )
+    known = given or data.tags().get(DATUM_TAG)
+    horizontal, vertical = horizontal_and_vertical(data.crs, known, path)
+    unit = (data.units[0] or "").strip().lower()
+    if unit and unit not in _UNITS:
+        raise ImageryError(
+            f"heights of the terrain file are in '{unit:.30}': metres or feet are expected: {path}"
+        )
+    unit_m = _UNITS.get(unit, vertical.unit_m)
+    vertical = VerticalDatum(vertical.name, vertical.above_ellipsoid, unit_m)
+    void = _void_of(path, data, vertical)
+    if vertical.above_ellipsoid:
+        geoid()  # refuses before the work
+    return Dem(path, vertical, _gsd_m(data, horizontal), data, horizontal, void)
+
+
+def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
+    """The stored value that stands for no height: as stated, else one that no ground can have.
+
+    Raises `ImageryError` where there is no height, or where many are impossible.
+    """
+    shape = min(data.height, SAMPLE_PX), min(data.width, SAMPLE_PX)
+    raw = data.read(1, out_shape=shape, masked=True, resampling=Resampling.nearest)
+    values = np.ma.compressed(raw).astype(np.float64)
+    values = values[np.isfinite(values)]
+    heights = (values * data.scales[0] + data.offsets[0]) * datum.unit_m
+    sound = (heights >= LOWEST_M) & (heights <= HIGHEST_M)
+    odd = np.unique(values[~sound])
+    if len(odd) > 1:
+        raise ImageryError(
+            f"heights of the terrain file are {heights.min():.6g} to {heights.max():.6g} m: "
+            f"{LOWEST_M:g} to {HIGHEST_M:g} m above the sea are expected; state its unit and its "
+            f"value for no data (gdal_edit.py -units, -a_nodata): {path}"
+        )
+    if not sound.any():
+        raise ImageryError(f"terrain file holds no height: {path}")
+    if heights[sound].min() == heights[sound].max():
+        log.warning(
+            "terrain is %g m high everywhere: check that this is the right file: %s",
+            heights[sound][0],
+            path,
+        )
+    stated = None if data.nodata is None else float(data.nodata)
+    if len(odd) and stated is None:
+        log.warning("terrain: %g is treated as no data: %s", odd[0], path)
+        return float(odd[0])
+    return stated
+
+
+def _without(raw: Any, void: float | None) -> Any:
+    return raw if void is None or math.isnan(void) else np.ma.masked_equal(raw, void)
+
+
+def _gsd_m(data: Any, horizontal: pyproj.CRS) -> float:
+    """Ground resolution in metres at the middle of the file."""
+    to_world = pyproj.Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True)
+    step = data.transform
+    col = data.width / 2 + np.array([0, 1, 0])
+    row = data.height / 2 + np.array([0, 0, 1])
+    lon, lat = to_world.transform(
+        step.a * col + step.b * row + step.c, step.d * col + step.e * row + step.f
+    )
+    middle, beside, below = LocalFrame(lat[0], lon[0]).en_from_latlon(lat, lon)
+    return math.sqrt(float(np.hypot(*(beside - middle)) * np.hypot(*(below - middle))))
+
+
+def _bytes_of(heights: Array) -> int:
+    return heights.nbytes
+
+
+def _unreadable(path: Path, error: Exception) -> ImageryError:
+    return ImageryError(f"terrain file cannot be read ({error}): {path}")

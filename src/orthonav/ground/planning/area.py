@@ -1,0 +1,132 @@
+"""The reference area: where the aircraft may be, and thus where tile centres are placed."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
+from orthonav.core.geo.swapped import swapped_bounds_hint
+from orthonav.ground.planning.route import Route, within_bands
+
+Extent = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Area:
+    """A reference area in its own local plane.
+
+    `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` the area is the
+    search band around it: the width of each leg, or `band_m` metres for legs without one.
+    Without a route it is the whole extent.
+    """
+
+    frame: LocalFrame
+    extent_en_m: Extent
+    route: Route | None = None
+    band_m: float = 0.0
+
+    @classmethod
+    def from_bounds(cls, bounds_deg: Extent) -> "Area":
+        """Area of a latitude/longitude box (west, south, east, north in degrees).
+
+        Raises `AreaError` for an invalid box; names swapped latitude and longitude.
+        """
+        west, south, east, north = bounds_deg
+        if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
+            east += 360
+        if not (np.isfinite(bounds_deg).all() and west < east and south < north):
+            raise AreaError(
+                "bounds must be west,south,east,north in degrees with west < east and "
+                f"south < north, got {','.join(map(str, bounds_deg))}"
+            )
+        if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
+            hint = swapped_bounds_hint((west, south, east, north))
+            raise AreaError(
+                "bounds must be west,south,east,north in degrees, at most 10 degrees across"
+                f"{hint}, got {','.join(map(str, bounds_deg))}"
+            )
+        share = np.linspace(0, 1, 33)
+        lon = west + (east - west) * share
+        lat = south + (north - south) * share
+        edge_lat = np.concatenate([np.full(33, south), np.full(33, north), lat, lat])
+        edge_lon = np.concatenate([lon, lon, np.full(33, west), np.full(33, east)])
+        return cls.from_outline(edge_lat, edge_lon)
+
+    @classmethod
+    def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
+        """Smallest north-up box around outline points, in a plane centred on that box.
+
+        Longitudes are unwrapped near the first point, so the outline may cross the antimeridian.
+        """
+        lon_deg = lon_deg - 360 * np.round((lon_deg - lon_deg[0]) / 360)
+        frame = LocalFrame(
+            round(float(lat_deg.min() + lat_deg.max()) / 2, 7),
+            round(float(lon_deg.min() + lon_deg.max()) / 2, 7),
+        )
+        points = frame.en_from_latlon(lat_deg, lon_deg)
+        west, south = points.min(axis=0)
+        east, north = points.max(axis=0)
+        return cls(frame, _checked((float(west), float(south), float(east), float(north))))
+
+    @classmethod
+    def from_route(cls, route: Route, band_m: float | None = None) -> "Area":
+        """Search band around `route`, `band_m` metres wide for legs without a width of their own.
+
+        Raises `AreaError` if a leg has no band, or if the area does not fit into one sheet.
+        """
+        if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
+            raise AreaError(f"search band must be wider than 0 m, got {band_m}")
+        bands_m = route.bands_m(band_m)
+        if bands_m is None:
+            raise AreaError("the route has no search band; give its width in metres (--band-m)")
+        lat_lon = np.array(route.waypoints)
+        box = cls.from_outline(lat_lon[:, 0], lat_lon[:, 1])
+        line = route.points_en_m(box.frame)
+        ends = line[1:] if len(line) > 1 else line
+        half = np.array(bands_m)[:, None] / 2
+        west, south = (np.minimum(line[: len(ends)], ends) - half).min(axis=0)
+        east, north = (np.maximum(line[: len(ends)], ends) + half).max(axis=0)
+        extent = _checked((float(west), float(south), float(east), float(north)))
+        return cls(box.frame, extent, route, band_m or 0.0)
+
+    def contains(
+        self, points_en_m: NDArray[np.float64], margin_m: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Mask `(N,)` of the local points `(N, 2)` inside, or at most `margin_m` outside."""
+        if self.route is not None:
+            return within_bands(points_en_m, *self._bands, margin_m)
+        west, south, east, north = self.extent_en_m
+        low = np.array([west, south]) - margin_m
+        high = np.array([east, north]) + margin_m
+        return np.asarray(((points_en_m >= low) & (points_en_m <= high)).all(axis=1))
+
+    @cached_property
+    def _bands(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Vertices of the route (M, 2) in the plane, and the band width of each leg."""
+        assert self.route is not None
+        bands_m = self.route.bands_m(self.band_m or None)
+        assert bands_m is not None
+        return self.route.points_en_m(self.frame), np.array(bands_m)
+
+
+def require_one_area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> None:
+    """Raise `AreaError` where both a route and bounds are given, or a band without a route."""
+    if route is not None and bounds_deg is not None:
+        raise AreaError("give either a route with a search band or bounds, not both")
+    if route is None and band_m is not None:
+        raise AreaError("a search band needs a route (--route)")
+
+
+def _checked(extent: Extent) -> Extent:
+    west, south, east, north = extent
+    across = max(east - west, north - south)
+    if across > MAX_SHEET_M:
+        raise AreaError(
+            f"area is {across / 1000:.1f} km across, a sheet holds at most "
+            f"{MAX_SHEET_M / 1000:.0f} km; build it in parts with --bounds or --route "
+            "(orthonav plan cuts it into sheets)"
+        )
+    return extent

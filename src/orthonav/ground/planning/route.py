@@ -1,0 +1,253 @@
+"""A planned route: read from the file formats of ground stations, and its geometry.
+
+The file name suffix selects the format; each format has a module in
+`orthonav.ground.planning.routes`.
+"""
+
+import csv
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import MissingFileError, RouteError, described, lfs_pointer
+from orthonav.core.geo.frames import distances_m
+from orthonav.ground.planning.routes.delimited import read_delimited
+from orthonav.ground.planning.routes.geojson import read_geojson, routes_of
+from orthonav.ground.planning.routes.gpx import read_gpx
+from orthonav.ground.planning.routes.kml import read_kml, read_kmz
+from orthonav.ground.planning.routes.presets import PREFIX, preset
+from orthonav.ground.planning.routes.qgc_plan import is_plan, plan_route, read_plan
+from orthonav.ground.planning.routes.record import Height, Route, left_out_text
+from orthonav.ground.planning.routes.values import json_object
+from orthonav.ground.planning.routes.wpl import is_wpl, read_wpl
+from orthonav.ground.planning.routes.wpml import read_wpml
+
+__all__ = [
+    "Height",
+    "Route",
+    "along_polyline_en_m",
+    "beyond_bands_m",
+    "distance_to_polyline_m",
+    "leg_lengths_m",
+    "read_route",
+    "within_bands",
+]
+
+MAX_ROUTE_BYTES = 20_000_000
+"""Twice as much as 100,000 waypoints take; JSON and XML take some 20 times their size in memory."""
+MAX_LISTED = 20
+_PAIRS_AT_ONCE = 2**18
+_FEW_POINTS = 64
+_BROKEN = (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error)
+
+log = logging.getLogger(__name__)
+
+
+def _read_json(data: bytes) -> list[Route]:
+    plain = json_object(data)
+    return [plan_route(plain)] if is_plan(plain) else routes_of(plain)
+
+
+def _read_text(data: bytes) -> list[Route]:
+    return read_wpl(data) if is_wpl(data) else read_delimited(data)
+
+
+_READERS: dict[str, Callable[[bytes], list[Route]]] = {
+    ".geojson": read_geojson,
+    ".json": _read_json,
+    ".csv": _read_text,
+    ".tsv": _read_text,
+    ".txt": _read_text,
+    ".waypoints": read_wpl,
+    ".plan": read_plan,
+    ".kml": read_kml,
+    ".kmz": read_kmz,
+    ".wpml": read_wpml,
+    ".gpx": read_gpx,
+}
+
+
+def read_route(path: Path) -> Route:
+    """Read a route from a file of one of the formats in `docs/routes.md`.
+
+    `FILE#NAME` selects a line by its name, or else its number from 1, if a file holds several;
+    `paper:B@46.6,1.9,30` is a preset. Raises `MissingFileError` or `RouteError` (naming found and
+    expected content).
+    """
+    if str(path).startswith(PREFIX):
+        return preset(str(path))
+    path, name = _name_apart(Path(path))
+    data = _bytes_of(path)
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        raise RouteError(f"route must be one of {', '.join(_READERS)}, got '{path.suffix}': {path}")
+    try:
+        found = _READERS[suffix](data)
+        route = _chosen(found, name, first=suffix in (".geojson", ".json"))
+    except RouteError as error:
+        raise RouteError(f"{error}: {path}") from error
+    except _BROKEN as error:
+        raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
+    if route.left_out:
+        log.warning("%s: %s", left_out_text(route.left_out), path)
+    return route
+
+
+def _bytes_of(path: Path) -> bytes:
+    if not path.is_file():
+        raise MissingFileError(f"route file does not exist: {path}")
+    if path.stat().st_size > MAX_ROUTE_BYTES:
+        raise RouteError(f"route file is larger than {MAX_ROUTE_BYTES // 10**6} MB: {path}")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
+    if pointer := lfs_pointer(data):
+        raise MissingFileError(f"route file {pointer}: {path}")
+    return data
+
+
+def _name_apart(path: Path) -> tuple[Path, str | None]:
+    """The file and the line name after `#`; an existing file may have `#` in its name."""
+    text = str(path)
+    if path.exists():
+        return path, None
+    for at, letter in enumerate(text):
+        if letter == "#" and Path(text[:at]).is_file():
+            return Path(text[:at]), text[at + 1 :]
+    return path, None
+
+
+def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
+    """The line of that name, else of that number, from 1; without a name the only one.
+
+    With `first`, the first of several unnamed lines, with a warning. Raises `RouteError`, which
+    lists numbers and names.
+    """
+    if name is not None:
+        named = [route for route in found if route.name == name]
+        number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
+        if not named and 1 <= number <= len(found):
+            return found[number - 1]
+        if len(named) != 1:
+            raise RouteError(
+                f"{len(named)} lines are named {name!r:.60}; give FILE#NAME or FILE#NUMBER: "
+                f"{_listed(found)}"
+            )
+        return named[0]
+    if len(found) > 1:
+        if not first or any(route.name for route in found):
+            raise RouteError(
+                f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
+            )
+        log.warning("route file holds %d unnamed lines: using the first", len(found))
+    return found[0]
+
+
+def _listed(found: list[Route]) -> str:
+    """Number and name of each line."""
+    shown = [
+        f"{number} {route.name!r:.60}" if route.name else f"{number} (no name)"
+        for number, route in enumerate(found[:MAX_LISTED], 1)
+    ]
+    return ", ".join(shown) + (", .." if len(found) > MAX_LISTED else "")
+
+
+def leg_lengths_m(route: Route) -> NDArray[np.float64]:
+    """Length in metres of each leg of a route, along the ellipsoid; `[0]` for one waypoint."""
+    places = np.array(route.waypoints)
+    return distances_m(places[:-1], places[1:]) if len(places) > 1 else np.zeros(1)
+
+
+def distance_to_polyline_m(
+    points_en_m: NDArray[np.float64], line_en_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
+    return beyond_bands_m(points_en_m, line_en_m, np.zeros(max(1, len(line_en_m) - 1)))
+
+
+def beyond_bands_m(
+    points_en_m: NDArray[np.float64],
+    line_en_m: NDArray[np.float64],
+    bands_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
+
+    `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)
+    legs. The result is the minimum over the legs of the distance to the leg minus half its band.
+    """
+    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
+    legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
+    length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)
+    best = np.full(len(points_en_m), np.inf)
+    at_once = max(1, _PAIRS_AT_ONCE // max(1, len(points_en_m)))
+    for first in range(0, len(legs), at_once):
+        some = slice(first, first + at_once)
+        east, north = (points_en_m[:, axis, None] - starts[some, axis] for axis in (0, 1))
+        along = (east * legs[some, 0] + north * legs[some, 1]) / length2[some]
+        np.clip(along, 0, 1, out=along)
+        east -= along * legs[some, 0]
+        north -= along * legs[some, 1]
+        beyond = np.hypot(east, north) - bands_m[some] / 2
+        np.minimum(best, beyond.min(axis=1), out=best)
+    return best
+
+
+def within_bands(
+    points_en_m: NDArray[np.float64],
+    line_en_m: NDArray[np.float64],
+    bands_m: NDArray[np.float64],
+    margin_m: float,
+) -> NDArray[np.bool_]:
+    """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
+
+    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs.
+    """
+    if len(points_en_m) <= _FEW_POINTS:
+        return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
+    order = np.argsort(points_en_m[:, 0], kind="stable")
+    x, y = points_en_m[order].T
+    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
+    ends = line_en_m[1:] if len(line_en_m) > 1 else line_en_m
+    reach = bands_m / 2 + margin_m
+    low, high = np.minimum(starts, ends) - reach[:, None], np.maximum(starts, ends) + reach[:, None]
+    first = np.searchsorted(x, low[:, 0], side="left").tolist()
+    last = np.searchsorted(x, high[:, 0], side="right").tolist()
+    inside = np.zeros(len(x), dtype=np.bool_)
+    for leg in np.flatnonzero(reach >= 0).tolist():
+        some = slice(first[leg], last[leg])
+        near = np.flatnonzero(~inside[some] & (y[some] >= low[leg, 1]) & (y[some] <= high[leg, 1]))
+        if len(near):
+            near += first[leg]
+            points = np.stack([x[near], y[near]], axis=1)
+            vertices = np.stack([starts[leg], ends[leg]])
+            inside[near] = beyond_bands_m(points, vertices, bands_m[leg : leg + 1]) <= margin_m
+    found = np.empty_like(inside)
+    found[order] = inside
+    return found
+
+
+def along_polyline_en_m(
+    line_en_m: NDArray[np.float64], spacing_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees.
+
+    The first position is the first vertex; a route of one vertex gives one position, course 0.
+    """
+    legs = np.diff(line_en_m, axis=0)
+    lengths = np.linalg.norm(legs, axis=1)
+    keep = lengths > 0
+    if not keep.any():
+        return line_en_m[:1].copy(), np.zeros(1)
+    legs, lengths, starts = legs[keep], lengths[keep], line_en_m[:-1][keep]
+    ends = np.cumsum(lengths)
+    at = np.arange(0.0, ends[-1] + 1e-9, spacing_m)
+    leg = np.minimum(np.searchsorted(ends, at, side="left"), len(lengths) - 1)
+    share = (at - (ends[leg] - lengths[leg])) / lengths[leg]
+    positions = starts[leg] + share[:, None] * legs[leg]
+    course = np.degrees(np.arctan2(legs[leg, 0], legs[leg, 1])) % 360
+    return positions, course

@@ -1,0 +1,158 @@
+"""A planned route, independent of its file format."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import RouteError
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.swapped import swapped_hint
+
+HeightFrame = Literal["agl", "home", "amsl", "hae"]
+HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
+MAX_HEIGHT_M = 100_000.0
+"""Sanity limit: the edge of space."""
+MAX_BAND_M = 50_000.0
+"""Width of the largest sheet."""
+MAX_WAYPOINTS = 100_000
+"""Sanity limit against files that exhaust memory."""
+
+
+MAX_NAMED = 12
+
+
+def left_out_text(left_out: Sequence[str]) -> str:
+    """A sentence that names what a route leaves out."""
+    more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
+    return (
+        "positions that are not part of the route, so the map may not cover them: "
+        f"{', '.join(left_out[:MAX_NAMED])}{more}"
+    )
+
+
+def require_few_waypoints(count: int) -> None:
+    """Raise `RouteError` for more than `MAX_WAYPOINTS`; readers ask before they make them."""
+    if count > MAX_WAYPOINTS:
+        raise RouteError(
+            f"route has at least {count:,} waypoints, at most {MAX_WAYPOINTS:,} are read; "
+            "simplify it"
+        )
+
+
+@dataclass(frozen=True)
+class Height:
+    """Height of a waypoint.
+
+    `height_m`: metres above the reference. `frame`: the reference, "agl" (terrain below the
+    waypoint), "home" (terrain at the take-off position), "amsl" (mean sea level), "hae" (the WGS 84
+    ellipsoid), or None if the file does not state it.
+    """
+
+    height_m: float
+    frame: HeightFrame | None = None
+
+    def __post_init__(self) -> None:
+        if not abs(self.height_m) <= MAX_HEIGHT_M:
+            raise RouteError(
+                f"height of a waypoint must be within {MAX_HEIGHT_M:,.0f} m, got {self.height_m}"
+            )
+        if self.frame is not None and self.frame not in HEIGHT_FRAMES:
+            raise RouteError(
+                f"height reference must be {', '.join(HEIGHT_FRAMES)}, got {self.frame!r:.40}"
+            )
+
+
+@dataclass(frozen=True)
+class Route:
+    """Waypoints joined by straight legs; raises `RouteError` if invalid.
+
+    Leg i goes from waypoint i to waypoint i + 1; a route of one waypoint has one leg of length 0.
+
+    - `waypoints`: `(lat_deg, lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360.
+    - `heights`: one per waypoint, None if unknown; empty if the file has none.
+    - `leg_bands_m`: full width of the search band per leg in metres, None for the default; empty
+      if the file has none.
+    - `name`: name of the line in its file, None if it has none.
+    - `home_amsl_m`: height of the take-off position above mean sea level, metres, None if unknown.
+    - `left_out`: what of the file has a position and is not part of the route, by name.
+    """
+
+    waypoints: tuple[tuple[float, float], ...]
+    heights: tuple[Height | None, ...] = ()
+    leg_bands_m: tuple[float | None, ...] = ()
+    name: str | None = None
+    home_amsl_m: float | None = None
+    left_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.waypoints:
+            raise RouteError("route has no waypoints")
+        require_few_waypoints(len(self.waypoints))
+        for lat, lon in self.waypoints:
+            if not (abs(lat) <= 90 and abs(lon) <= 360):
+                raise RouteError(
+                    "waypoint must have a latitude within 90 and a longitude within 360 degrees, "
+                    f"got {lat}, {lon}{swapped_hint(lat, lon)}"
+                )
+        if self.heights and len(self.heights) != len(self.waypoints):
+            raise RouteError(
+                f"route has {len(self.heights)} heights for {len(self.waypoints)} waypoints"
+            )
+        if self.leg_bands_m and len(self.leg_bands_m) != self.legs:
+            raise RouteError(f"route has {len(self.leg_bands_m)} bands for {self.legs} legs")
+        for band_m in self.leg_bands_m:
+            if band_m is not None and not 0 < band_m <= MAX_BAND_M:
+                raise RouteError(
+                    f"search band of a leg must be wider than 0 and at most {MAX_BAND_M:,.0f} m, "
+                    f"got {band_m}"
+                )
+        if self.home_amsl_m is not None and not math.isfinite(self.home_amsl_m):
+            raise RouteError(
+                f"height of the take-off position must be finite, got {self.home_amsl_m}"
+            )
+
+    def leaving_out(self, points: Sequence[tuple[str, Sequence[float]]]) -> "Route":
+        """The route with the names of those `points` (longitude, latitude, ..) that are none of its
+        waypoints in `left_out`."""
+        visited = {(round(lat, 6), round(lon, 6)) for lat, lon in self.waypoints}
+        lost = [
+            name
+            for name, place in points
+            if len(place) < 2 or (round(place[1], 6), round(place[0], 6)) not in visited
+        ]
+        return replace(self, left_out=tuple(lost))
+
+    @property
+    def legs(self) -> int:
+        """Number of legs, at least one."""
+        return max(1, len(self.waypoints) - 1)
+
+    def points_en_m(self, frame: LocalFrame) -> NDArray[np.float64]:
+        """Waypoints as local `(N, 2)` metres of `frame`."""
+        lat_lon = np.array(self.waypoints, dtype=np.float64)
+        return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
+
+    def bands_m(self, default_m: float | None) -> tuple[float, ...] | None:
+        """Width of the search band of each leg, `default_m` for legs without one.
+
+        None if a leg has none and there is no default.
+        """
+        if not self.leg_bands_m:
+            return None if default_m is None else (default_m,) * self.legs
+        bands = [default_m if band is None else band for band in self.leg_bands_m]
+        known = tuple(band for band in bands if band is not None)
+        return known if len(known) == len(bands) else None
+
+    def part(self, first: int, last: int, name: str | None = None) -> "Route":
+        """The legs from waypoint `first` to waypoint `last`, both included."""
+        return Route(
+            self.waypoints[first : last + 1],
+            self.heights[first : last + 1],
+            self.leg_bands_m[first : max(last, first + 1)],
+            name or self.name,
+            self.home_amsl_m,
+        )

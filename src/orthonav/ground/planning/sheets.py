@@ -1,0 +1,209 @@
+"""Division of areas too large for one sheet into parts that each fit.
+
+A map holds one sheet, so each part becomes a separate map. Neighbouring parts share a border; tiles
+reach half a tile beyond the area, so a view near the border lies completely on one of the two maps.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.frames import MAX_SHEET_M, WGS84_A_M
+from orthonav.core.geo.swapped import swapped_bounds_hint
+from orthonav.ground.planning.area import Area, Extent
+from orthonav.ground.planning.route import Height, Route, leg_lengths_m
+
+MAX_SHEETS = 10_000
+"""Limit of the program; 2500 km2 each, so 25 million km2."""
+MAX_ROUTE_SHEETS = 500
+"""Limit for a route: more than once around the Earth with bands of less than 10 km."""
+_DEGREE_M = 110_574.0
+"""Shortest degree of latitude, at the equator (WGS84)."""
+_LON_DEGREE_M = 111_320.0
+"""Degree of longitude at the equator (WGS84)."""
+_TRIES = 4
+"""Numbers of columns tried for one row before rows are made lower."""
+
+
+def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
+    """Boxes (west, south, east, north in degrees) that each fit a sheet and together fill the box.
+
+    Rows of equal height, from south to north; each row is divided into the number of equal boxes
+    its width requires, from west to east. Raises `AreaError` for an invalid box, or for more than
+    `MAX_SHEETS` boxes; names swapped latitude and longitude.
+    """
+    west, south, east, north = bounds_deg
+    if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
+        east += 360
+    if not (np.isfinite(bounds_deg).all() and west < east <= west + 360 and south < north):
+        raise AreaError(
+            "bounds must be west,south,east,north in degrees with west < east and south < north, "
+            f"got {','.join(map(str, bounds_deg))}"
+        )
+    if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
+        hint = swapped_bounds_hint((west, south, east, north))
+        raise AreaError(
+            f"bounds must lie within 89.5 deg of the equator{hint}, "
+            f"got {','.join(map(str, bounds_deg))}"
+        )
+    zone = math.sin(math.radians(north)) - math.sin(math.radians(south))
+    least = math.radians(east - west) * zone * WGS84_A_M**2 / MAX_SHEET_M**2
+    if least > MAX_SHEETS:
+        raise _too_many(round(least))
+    rows = max(1, int((north - south) * _DEGREE_M / MAX_SHEET_M))
+    while True:
+        edges = np.linspace(south, north, rows + 1).tolist()
+        found = [_row(west, low, east, high) for low, high in itertools.pairwise(edges)]
+        if all(found):
+            break
+        rows += 1
+    sheets = [sheet for row in found for sheet in row]
+    if len(sheets) > MAX_SHEETS:
+        raise _too_many(len(sheets))
+    return sheets
+
+
+def _row(west: float, south: float, east: float, north: float) -> list[Extent]:
+    """Boxes of a row; empty if the row is too high for boxes of any width."""
+    widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
+    width_m = (east - west) * _LON_DEGREE_M * math.cos(math.radians(widest))
+    least = max(1, int(width_m / MAX_SHEET_M))
+    for count in range(least, least + _TRIES):
+        edges = np.linspace(west, east, count + 1).tolist()
+        boxes = [
+            (_wrapped(left), south, _wrapped(right), north)
+            for left, right in itertools.pairwise(edges)
+        ]
+        if _box_fits((edges[0], south, edges[1], north)):
+            return boxes
+    return []
+
+
+def _box_fits(bounds_deg: Extent) -> bool:
+    try:
+        Area.from_bounds(bounds_deg)
+    except AreaError:
+        return False
+    return True
+
+
+def _wrapped(lon_deg: float) -> float:
+    """A longitude in -180..180; values inside are returned unchanged."""
+    return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
+
+
+def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
+    """Parts of a route, in order, whose search bands each fit a sheet.
+
+    The route is divided at waypoints, each part as long as possible. A leg too long for a sheet is
+    divided into equal pieces on the great circle. Each part begins at the end of the previous one.
+    Parts are named sheet-1, sheet-2 and so on. Raises `AreaError`, also for more than
+    `MAX_ROUTE_SHEETS` parts.
+    """
+    bands_m = route.bands_m(band_m)
+    if bands_m is None or _route_fits(route, band_m):
+        Area.from_route(route, band_m)  # raises if a band is missing
+        return [route]
+    if max(bands_m) >= MAX_SHEET_M:
+        raise AreaError(
+            f"search band of {max(bands_m):.0f} m is as wide as a sheet, {MAX_SHEET_M:.0f} m"
+        )
+    cut = _with_short_legs(route, bands_m)
+    parts: list[Route] = []
+    first = 0
+    while first < cut.legs:
+        if len(parts) == MAX_ROUTE_SHEETS:
+            raise _route_too_long(f"more than {MAX_ROUTE_SHEETS}")
+        last = _last_that_fits(cut, first, band_m)
+        parts.append(cut.part(first, last, f"sheet-{len(parts) + 1}"))
+        first = last
+    return parts
+
+
+def _route_fits(route: Route, band_m: float | None) -> bool:
+    try:
+        Area.from_route(route, band_m)
+    except AreaError:
+        return False
+    return True
+
+
+def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
+    """The last waypoint for which the legs from `first` fit a sheet; at least one leg."""
+    step, last = 1, first + 1
+    while last + step < len(route.waypoints) and _route_fits(
+        route.part(first, last + step), band_m
+    ):
+        last += step
+        step *= 2
+    while step > 0:
+        if last + step < len(route.waypoints) and _route_fits(
+            route.part(first, last + step), band_m
+        ):
+            last += step
+        step //= 2
+    return last
+
+
+def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
+    """The same route with more waypoints, so that each leg fits a sheet."""
+    waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
+    leg_bands: list[float | None] = []
+    lengths_m = leg_lengths_m(route)
+    divided = 0
+    for leg, (start, end) in enumerate(zip(route.waypoints, route.waypoints[1:], strict=False)):
+        pieces = math.ceil(lengths_m[leg] / (0.99 * (MAX_SHEET_M - bands_m[leg])))
+        if pieces <= 1 or _route_fits(Route((start, end)), bands_m[leg]):
+            pieces = 1  # most legs
+        divided += pieces if pieces > 1 else 0
+        if divided > MAX_ROUTE_SHEETS:
+            raise _route_too_long(f"{divided:,} or more")
+        shares = [number / pieces for number in range(1, pieces)]
+        waypoints += [*_on_great_circle(start, end, shares), end]
+        if route.heights:
+            below, above = route.heights[leg], route.heights[leg + 1]
+            heights += [*(_between(below, above, share) for share in shares), above]
+        if route.leg_bands_m:
+            leg_bands += [route.leg_bands_m[leg]] * pieces
+    return replace(
+        route, waypoints=tuple(waypoints), heights=tuple(heights), leg_bands_m=tuple(leg_bands)
+    )
+
+
+def _between(below: Height | None, above: Height | None, share: float) -> Height | None:
+    if below is None or above is None or below.frame != above.frame:
+        return None
+    return Height(below.height_m + share * (above.height_m - below.height_m), below.frame)
+
+
+def _on_great_circle(
+    start: tuple[float, float], end: tuple[float, float], shares: list[float]
+) -> Iterator[tuple[float, float]]:
+    one, other = _direction(start), _direction(end)
+    angle = math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
+    if shares and math.sin(angle) < 1e-6:
+        raise AreaError(f"leg from {start} to {end} spans half of the Earth: add waypoints")
+    for share in shares:
+        x, y, z = math.sin((1 - share) * angle) * one + math.sin(share * angle) * other
+        yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
+
+
+def _direction(place: tuple[float, float]) -> NDArray[np.float64]:
+    lat, lon = (math.radians(value) for value in place)
+    return np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+
+
+def _route_too_long(sheets: str) -> AreaError:
+    return AreaError(
+        f"route needs {sheets} sheets, at most {MAX_ROUTE_SHEETS} are planned at once; plan it in "
+        "parts, or with a narrower search band"
+    )
+
+
+def _too_many(count: int) -> AreaError:
+    return AreaError(f"area needs {count:,} sheets, more than the limit of {MAX_SHEETS:,}")

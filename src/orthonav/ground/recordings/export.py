@@ -1,0 +1,306 @@
+"""Camera positions of a flight for other programs: tables, maps, photogrammetry, trajectories.
+
+Only confident positions are written: photogrammetry takes what it is given as measured.
+"""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import VariantError
+from orthonav.core.files import write_text
+from orthonav.core.geo.camera import enu_from_camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.ground import TerrainHeights
+from orthonav.core.records import MAP_STD_M, Fix, ViewResult
+
+_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
+_YEAR_2000_NS = 946_684_800 * 10**9
+"""Earlier times count from something else than 1970."""
+CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
+
+
+@dataclass(frozen=True)
+class CameraPosition:
+    """Where a picture was taken.
+
+    `lat_deg`, `lon_deg`: WGS84. `height_m`: above mean sea level, NaN without a terrain. `agl_m`:
+    above ground. `heading_deg`: of the top of the picture, clockwise from north. `std_m`: standard
+    deviation of the position along its worst axis, the displacement of the map included.
+    `confidence`: probability in 0..1. `time_ns`: exposure. `pitch_deg`, `roll_deg`: of the camera,
+    NaN where unknown.
+    """
+
+    frame: str
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    agl_m: float
+    heading_deg: float
+    std_m: float
+    confidence: float
+    time_ns: int = 0
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+
+
+def camera_positions(
+    results: Sequence[ViewResult], terrain: TerrainHeights | None
+) -> list[CameraPosition]:
+    """The confident positions of a flight; heights above sea by the ground of `terrain`."""
+    found = []
+    for result in results:
+        fix = result.outcome
+        if not isinstance(fix, Fix) or not result.is_confident:
+            continue
+        ground_m = math.nan
+        if terrain is not None:
+            ground_m = float(terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
+        worst = max(float(np.linalg.eigvalsh(fix.cov_en_m2)[-1]), 0.0)
+        if result.state is None:  # that of a track has it already
+            worst += MAP_STD_M**2
+        found.append(
+            CameraPosition(
+                result.frame,
+                fix.lat_deg,
+                fix.lon_deg,
+                ground_m + fix.agl_m,
+                fix.agl_m,
+                fix.heading_deg,
+                math.sqrt(worst),
+                fix.confidence,
+                result.time_ns,
+                fix.pitch_deg,
+                fix.roll_deg,
+            )
+        )
+    return found
+
+
+def export_of(text: str) -> tuple[str, Path]:
+    """Format and path of `FORMAT=PATH`; raises `VariantError`."""
+    name, _, path = text.partition("=")
+    if name not in FORMATS or not path:
+        raise VariantError(
+            f"an export is one of {', '.join(FORMATS)} with a path, such as odm-geo=geo.txt, "
+            f"got '{text}'"
+        )
+    return name, Path(path)
+
+
+def export(path: Path, name: str, positions: Sequence[CameraPosition]) -> None:
+    """Write positions in the format `name`, replacing an existing file atomically."""
+    write_text(path, FORMATS[name](positions))
+
+
+def export_all(
+    exports: Sequence[tuple[str, Path]],
+    results: Sequence[ViewResult],
+    terrain: TerrainHeights | None,
+) -> None:
+    """Write the camera positions of a flight in formats and to paths of `export_of`."""
+    positions = camera_positions(results, terrain) if exports else []
+    for name, path in exports:
+        export(path, name, positions)
+
+
+def _csv(positions: Sequence[CameraPosition]) -> str:
+    rows = [
+        [
+            each.frame,
+            f"{each.lat_deg:.8f}",
+            f"{each.lon_deg:.8f}",
+            *(
+                "" if math.isnan(value) else f"{value:.3f}"
+                for value in (each.height_m, each.agl_m, each.heading_deg, each.std_m)
+            ),
+        ]
+        for each in positions
+    ]
+    return _table([CSV_COLUMNS, *rows])
+
+
+def _geojson(positions: Sequence[CameraPosition]) -> str:
+    """Points (RFC 7946), with heights above sea where they are known."""
+    features = []
+    for each in positions:
+        point = [round(each.lon_deg, 8), round(each.lat_deg, 8)]
+        if not math.isnan(each.height_m):
+            point.append(round(each.height_m, 3))
+        about: dict[str, Any] = {
+            "frame": each.frame,
+            "agl_m": round(each.agl_m, 3),
+            "heading_deg": round(each.heading_deg, 3),
+            "std_m": round(each.std_m, 3),
+            "confidence": round(each.confidence, 4),
+        }
+        about = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in about.items()
+        }
+        geometry = {"type": "Point", "coordinates": point}
+        features.append({"type": "Feature", "geometry": geometry, "properties": about})
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+
+
+def _odm_geo(positions: Sequence[CameraPosition]) -> str:
+    """OpenDroneMap's image geolocation file, https://docs.opendronemap.org/geo.
+
+    Accuracy follows angles, and angles follow the height: without a height it is left out. Angles
+    are 0, which means not available. Names must have no spaces.
+    """
+    lines = ["EPSG:4326"]
+    for each in positions:
+        if any(character.isspace() for character in each.frame):
+            raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.frame!r}")
+        line = f"{each.frame} {each.lon_deg:.8f} {each.lat_deg:.8f}"
+        if not math.isnan(each.height_m):
+            line += f" {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def _exif(positions: Sequence[CameraPosition]) -> str:
+    """A table that ExifTool writes into photographs (`exiftool -csv=TABLE FOLDER`)."""
+    header = (
+        *("SourceFile", "GPSLatitude", "GPSLatitudeRef", "GPSLongitude", "GPSLongitudeRef"),
+        *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
+        *("GPSHPositioningError", "GPSMapDatum"),
+    )
+    rows = []
+    for each in positions:
+        height = ["", ""]
+        if not math.isnan(each.height_m):
+            height = [
+                f"{abs(each.height_m):.3f}",
+                "Above Sea Level" if each.height_m >= 0 else "Below Sea Level",
+            ]
+        heading = ["", ""]
+        if not math.isnan(each.heading_deg):
+            heading = [f"{each.heading_deg:.2f}", "True North"]
+        rows.append(
+            [
+                each.frame,
+                f"{abs(each.lat_deg):.8f}",
+                "North" if each.lat_deg >= 0 else "South",
+                f"{abs(each.lon_deg):.8f}",
+                "East" if each.lon_deg >= 0 else "West",
+                *height,
+                *heading,
+                f"{each.std_m:.3f}",
+                "WGS-84",
+            ]
+        )
+    return _table([header, *rows])
+
+
+def _tum(positions: Sequence[CameraPosition]) -> str:
+    """A trajectory as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
+
+    East, north and up of the first position; the quaternion turns camera axes (x to the right of
+    the image, y down the image, z along the optical axis) to these. Unknown angles count as 0.
+    Heights are above sea where all are known, else above ground.
+    """
+    if not positions:
+        return ""
+    origin = positions[0].lat_deg, positions[0].lon_deg
+    plane, above_sea = LocalFrame(*origin), _are_above_sea(positions)
+    lines = [f"# east, north, up (m) of {origin[0]:.8f}, {origin[1]:.8f} (WGS84)"]
+    for each in positions:
+        east, north = plane.en_from_latlon(each.lat_deg, each.lon_deg).tolist()
+        up = each.height_m if above_sea else each.agl_m
+        angles = np.nan_to_num([each.heading_deg, each.pitch_deg, each.roll_deg]).tolist()
+        numbers = " ".join(f"{value:.9f}" for value in _quaternion(enu_from_camera(*angles)))
+        lines.append(
+            f"{Decimal(each.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation (3, 3)."""
+    vector, _ = cv2.Rodrigues(rotation)
+    angle = float(np.linalg.norm(vector))
+    x, y, z = (vector.ravel() * (math.sin(angle / 2) / angle if angle else 0.0)).tolist()
+    return x, y, z, math.cos(angle / 2)
+
+
+def _are_above_sea(positions: Sequence[CameraPosition]) -> bool:
+    return all(math.isfinite(each.height_m) for each in positions)
+
+
+def _kml(positions: Sequence[CameraPosition]) -> str:
+    """The track and a place for each picture; heights are absolute where all are above sea."""
+    above_sea = _are_above_sea(positions)
+    mode = "absolute" if above_sea else "relativeToGround"
+    points = [
+        f"{each.lon_deg:.8f},{each.lat_deg:.8f},{each.height_m if above_sea else each.agl_m:.2f}"
+        for each in positions
+    ]
+
+    def placemark(name: str, about: str, kind: str, coordinates: str) -> str:
+        return (
+            f"<Placemark><name>{escape(name)}</name><description>{about}</description>"
+            f"<{kind}><altitudeMode>{mode}</altitudeMode><coordinates>{coordinates}</coordinates>"
+            f"</{kind}></Placemark>"
+        )
+
+    marks = [placemark("track", f"{len(points)} positions", "LineString", " ".join(points))]
+    marks += [
+        placemark(each.frame, f"std {each.std_m:.1f} m", "Point", point)
+        for each, point in zip(positions, points, strict=True)
+    ]
+    body = "\n".join(marks)
+    return (
+        f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n{body}\n</Document></kml>\n'
+    )
+
+
+def _gpx(positions: Sequence[CameraPosition]) -> str:
+    """A track (GPX 1.1); with heights above sea where known, and times that are dates."""
+    lines = []
+    for each in positions:
+        height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
+        time = ""
+        if each.time_ns >= _YEAR_2000_NS:
+            seconds = datetime.fromtimestamp(each.time_ns // 10**9, UTC).strftime(
+                "%Y-%m-%dT%H:%M:%S"
+            )
+            time = f"<time>{seconds}.{each.time_ns % 10**9 // 10**6:03d}Z</time>"
+        place = f'lat="{each.lat_deg:.8f}" lon="{each.lon_deg:.8f}"'
+        lines.append(f"<trkpt {place}>{height}{time}<name>{escape(each.frame)}</name></trkpt>")
+    body = "\n".join(lines)
+    return (
+        f'{_XML}<gpx version="1.1" creator="orthonav" xmlns="http://www.topografix.com/GPX/1/1">'
+        f"<trk><trkseg>\n{body}\n</trkseg></trk></gpx>\n"
+    )
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
+
+
+FORMATS: dict[str, Callable[[Sequence[CameraPosition]], str]] = {
+    "csv": _csv,
+    "geojson": _geojson,
+    "odm-geo": _odm_geo,
+    "exif": _exif,
+    "tum": _tum,
+    "kml": _kml,
+    "gpx": _gpx,
+}
+"""Writers by the name of their format."""

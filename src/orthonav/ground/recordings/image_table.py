@@ -1,0 +1,307 @@
+"""A table of images by file name: CSV, as people and programs write them beside a folder of images.
+
+Columns are found by their names, in many spellings. A pitch near -90 is that of a gimbal as DJI
+counts it, where -90 looks straight down; any other is in the convention of orthonav.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.folder import number_of
+from orthonav.core.flight.telemetry_track import measured
+from orthonav.core.geo.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
+    enu_from_gimbal_camera,
+)
+from orthonav.core.geo.camera import attitude_of
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
+
+MAX_BYTES = 100_000_000
+_SYNONYMS = {
+    "file": "file filename image imagename imagefile img photo photoname picture sourcefile frame "
+    "label imagepath path name",
+    "yaw": "gimbalyaw camerayaw yaw cameraheading heading hdg azimuth compass flightyaw droneyaw",
+    "pitch": "gimbalpitch camerapitch pitch",
+    "roll": "gimbalroll cameraroll roll",
+    "agl": "agl heightagl aglheight altitudeagl altagl aglaltitude heightaboveground aboveground "
+    "height",
+    "home": "home relalt relativealtitude relativeheight heightabovetakeoff heightabovehome",
+    "amsl": "amsl msl altitudeamsl altamsl altitudemsl heightamsl",
+    "hae": "hae altitudehae ellipsoidalheight heightellipsoid",
+    "alt": "altitude alt gpsaltitude absolutealtitude absalt elevation z",
+    "lat": "lat latitude gpslatitude",
+    "lon": "lon lng long longitude gpslongitude",
+    "time": "timestamp datetime datetimeoriginal time utc utctime timeutc captured gpstime",
+    "date": "date day gpsdate",
+}
+_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
+_FEET = ("ft", "feet", "foot")
+_UNITS = ("deg", "degree", "degrees", "m", "meter", "meters", "metre", "metres", "s", *_FEET)
+_EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
+_HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
+_GIMBAL_DEG = -45.0
+"""A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
+_DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
+_COMPACT = re.compile(r"(19|20)\d{12}")
+"""A date and time in 14 digits."""
+_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
+_LARGEST_S = 9e9
+
+
+@dataclass(frozen=True)
+class ImageRow:
+    """What a table says of an image; NaN and None where it says nothing.
+
+    Angles are in the convention of orthonav. `order`: number of the row. `alt_m`: altitude whose
+    reference is not stated.
+    """
+
+    order: int
+    time_ns: int | None = None
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+    tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
+    agl_m: float = math.nan
+    home_m: float = math.nan
+    amsl_m: float = math.nan
+    hae_m: float = math.nan
+    alt_m: float = math.nan
+    latlon_deg: tuple[float, float] | None = None
+
+    @property
+    def has_height(self) -> bool:
+        """Whether it says any height."""
+        heights = (self.agl_m, self.home_m, self.amsl_m, self.hae_m, self.alt_m)
+        return any(map(math.isfinite, heights))
+
+
+@dataclass(frozen=True)
+class ImageTable:
+    """The rows of a table by the names of images, and warnings about them."""
+
+    path: Path
+    rows: Mapping[str, ImageRow]
+    warnings: tuple[str, ...]
+
+    def row(self, name: str) -> ImageRow | None:
+        """The row of an image: by the end of its path below the folder, or by its name without a
+        suffix. An image without a folder is that of a row with one too."""
+        parts = PurePosixPath(name.lower()).parts
+        ends = ["/".join(parts[first:]) for first in range(len(parts))]
+        stem = PurePosixPath(parts[-1]).stem
+        keys = [*ends, stem] + [f"/{parts[-1]}", f"/{stem}"] * (len(parts) == 1)
+        return next((self.rows[key] for key in keys if key in self.rows), None)
+
+
+def is_image_table(path: Path) -> bool:
+    """Whether a file is a CSV with a column of file names and others that a view needs."""
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt") or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        header = stream.readline(MAX_LINE_CHARS).decode("utf-8-sig", errors="replace")
+    found = _columns([name.strip().strip('"') for name in re.split(r"[,;\t]", header)])
+    return "file" in found and len(found) > 1
+
+
+def read_image_table(path: Path) -> ImageTable:
+    """The table of a CSV with comma, semicolon or tab. Raises `FlightError`, with the line."""
+    if path.stat().st_size > MAX_BYTES:
+        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            header = stream.readline(MAX_LINE_CHARS)
+            stream.seek(0)
+            delimiter = max(",;\t", key=header.count)
+            table = TableRows(stream, delimiter=delimiter)
+            columns = _columns(table.columns)
+            if "file" not in columns or len(columns) == 1:
+                held = ", ".join(table.columns)
+                raise FlightError(
+                    "table needs a column of file names (file, image, filename) and others, such "
+                    f"as yaw, pitch, roll, agl, lat, lon, time; it has {held:.200}: {path}"
+                )
+            lines = [(table.line, _texts(row, columns)) for row in table]
+    except TableError as error:
+        raise FlightError(f"{error}: {path}") from error
+    comma = delimiter != ","
+    numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
+    gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
+    rows = [
+        (texts["file"], _row(order, values, _time_ns(_moment(texts), line, path), gimbal))
+        for order, (line, texts, values) in enumerate(numbers)
+        if texts["file"]
+    ]
+    if not rows:
+        raise FlightError(f"table names no image: {path}")
+    warnings = _missing(columns, path)
+    if gimbal and "gimbal" not in columns["pitch"][0].lower():
+        warnings.append(
+            f"pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight "
+            f"down: {path}"
+        )
+    return ImageTable(path, _by_name(rows, path), tuple(warnings))
+
+
+def _texts(
+    row: Mapping[str, str | None], columns: Mapping[str, tuple[str, float]]
+) -> dict[str, str]:
+    return {field: (row.get(name) or "").strip() for field, (name, _) in columns.items()}
+
+
+def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
+    """Name of the column of each field that is there, and the metres of its unit."""
+    spelt = {_plain(name): name for name in reversed(names)}
+    found = {}
+    for field, synonyms in _SYNONYMS.items():
+        name = next((spelt[each] for each in synonyms.split() if each in spelt), None)
+        if name is not None:
+            found[field] = name, 0.3048 if _unit(name) in _FEET else 1.0
+    return found
+
+
+def _plain(name: str) -> str:
+    """A name of a column without unit, case and separators."""
+    words = re.findall(r"[a-z0-9]+", _BRACKETS.sub("", name.lower()))
+    if len(words) > 1 and words[-1] in _UNITS:
+        words.pop()
+    return re.sub(r"(?<=.)degrees?$", "", "".join(words))
+
+
+def _unit(name: str) -> str:
+    bracket = _BRACKETS.search(name.lower())
+    words = re.findall(r"[a-z]+", bracket[1] if bracket else name.lower())
+    return words[-1] if words else ""
+
+
+def _numbers(
+    texts: Mapping[str, str],
+    columns: Mapping[str, tuple[str, float]],
+    line: int,
+    comma: bool,
+    path: Path,
+) -> dict[str, float]:
+    """The numbers of a row, in metres and degrees; raises `FlightError` for other text."""
+    values = {}
+    for field, (name, metres) in columns.items():
+        text = texts[field]
+        if field in ("file", "time", "date") or text.lower() in _EMPTY:
+            continue
+        if comma and "." not in text:
+            text = text.replace(",", ".")
+        value = number_of(text)
+        if not math.isfinite(value):
+            raise FlightError(f"line {line}: {name} is not a number, got {text!r:.40}: {path}")
+        values[field] = measured(metres * value) if field in _HEIGHTS else value
+    lat, lon = values.get("lat", math.nan), values.get("lon", math.nan)
+    if abs(lat) > 90 or abs(lon) > 360:
+        hint = swapped_hint(lat, lon)
+        raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
+    return values
+
+
+def _is_gimbal(
+    columns: Mapping[str, tuple[str, float]], rows: Sequence[Mapping[str, float]]
+) -> bool:
+    """Whether the pitch counts from the horizon, as that of a gimbal does."""
+    if "pitch" not in columns:
+        return False
+    known = [values["pitch"] for values in rows if "pitch" in values]
+    return "gimbal" in columns["pitch"][0].lower() or (
+        bool(known) and float(np.median(known)) <= _GIMBAL_DEG
+    )
+
+
+def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: bool) -> ImageRow:
+    yaw, pitch = values.get("yaw", math.nan), values.get("pitch", math.nan)
+    roll = values.get("roll", math.nan if math.isnan(pitch) else 0.0)
+    if gimbal and math.isfinite(pitch):
+        known = math.isfinite(yaw)
+        turned = attitude_of(enu_from_gimbal_camera((yaw if known else 0.0, pitch, roll)))
+        yaw, pitch, roll = (turned[0] if known else math.nan), turned[1], turned[2]
+    placed = "lat" in values and "lon" in values and (values["lat"] or values["lon"])
+    return ImageRow(
+        order,
+        time_ns,
+        yaw % 360,
+        pitch,
+        roll,
+        GIMBAL_TILT_STD_DEG if gimbal else AUTOPILOT_TILT_STD_DEG,
+        **{f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS},
+        latlon_deg=(values["lat"], values["lon"]) if placed else None,
+    )
+
+
+def _moment(texts: Mapping[str, str]) -> str:
+    """The time of a row, with the date where that is in a column of its own."""
+    time, date = texts.get("time", ""), texts.get("date", "")
+    return f"{date} {time}".strip() if _CLOCK.fullmatch(time) else time or date
+
+
+def _time_ns(text: str, line: int, path: Path) -> int | None:
+    """Nanoseconds of seconds, or of ms, us or ns since 1970, of a time of day, or of a date with
+    time; UTC where no zone."""
+    if text.lower() in _EMPTY:
+        return None
+    if _COMPACT.fullmatch(text):
+        text = f"{text[:8]}T{text[8:]}"
+    number = number_of(text)
+    if math.isfinite(number):
+        seconds = Decimal(text)
+        while abs(seconds) > _LARGEST_S:
+            seconds /= 1000
+        return round(seconds * 10**9)
+    if clock := _CLOCK.fullmatch(text):
+        hours, minutes, seconds = map(Decimal, clock.groups())
+        return round((hours * 3600 + minutes * 60 + seconds) * 10**9)
+    try:
+        moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
+    except ValueError as error:
+        raise FlightError(
+            f"line {line}: time must be seconds or a date such as 2024-05-01T10:00:00Z, got "
+            f"{text!r:.40}: {path}"
+        ) from error
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    whole = moment.replace(microsecond=0)
+    return round(whole.timestamp()) * 10**9 + moment.microsecond * 1000
+
+
+def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
+    """A warning that names the values a view needs and the table has not."""
+    lacks = [
+        f"{what} ({spelt})"
+        for what, spelt, fields in (
+            ("heading", "yaw or heading", ("yaw",)),
+            ("height", "agl or height", _HEIGHTS),
+        )
+        if not set(fields) & columns.keys()
+    ]
+    if not lacks:
+        return []
+    return [f"table has no column of {' and of '.join(lacks)}: {path}"]
+
+
+def _by_name(rows: Sequence[tuple[str, ImageRow]], path: Path) -> dict[str, ImageRow]:
+    """Rows by path, by name and by name without suffix, as far as these are of one row only; names
+    of rows with a folder begin with a slash."""
+    found: dict[str, ImageRow] = {}
+    short: dict[str, ImageRow | None] = {}
+    for text, row in rows:
+        pure = PurePosixPath(text.replace("\\", "/").lower())
+        if str(pure) in found:
+            raise FlightError(f"table names {text!r:.80} twice: {path}")
+        found[str(pure)] = row
+        slash = "/" if len(pure.parts) > 1 else ""
+        for name in {slash + pure.name, slash + pure.stem}:
+            short[name] = None if name in short else row
+    return {name: row for name, row in short.items() if row is not None} | found

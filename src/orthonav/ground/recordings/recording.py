@@ -1,0 +1,235 @@
+"""A recorded flight that is read view by view."""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.recording import LONG_GAP_NS, fitted
+from orthonav.core.flight.source_options import SourceOptions
+from orthonav.core.flight.telemetry_track import RecordedTrack, measured
+from orthonav.core.geo.attitude import ASSUMED_TILT_STD_DEG
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera_files import read_camera_file
+from orthonav.core.geo.frames import distances_m
+from orthonav.core.records import Prior, Telemetry
+
+Grey = NDArray[np.uint8]
+DECIMALS = 8
+JUMP_M, JUMP_MPS = 500.0, 150.0
+"""Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
+that this program is for flies slower, and logs round positions to some metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class SourceView:
+    """One view of a recording: a `RecordedView` that can also be written to a flight folder."""
+
+    frame: str
+    """Name, with the suffix of the format that its image is written in."""
+    telemetry: Telemetry
+    """Telemetry of the exposure."""
+    truth_latlon_deg: tuple[float, float] | None
+    """True position, where it is known."""
+    where: str
+    """Location of the image, for messages."""
+    load: Callable[[], Grey]
+    """Decodes the image."""
+    data: Callable[[], bytes] | None = None
+    """Returns the image as it was encoded; None where it was recorded unencoded."""
+
+    def grey(self) -> Grey:
+        """Grey levels (H, W) uint8. Raises `FlightError` where it cannot be decoded."""
+        return self.load()
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """An open recording: an `orthonav.core.flight.Flight`, with `warnings` for people."""
+
+    kind: str
+    path: Path
+    camera: Camera
+    note: str
+    expected: int
+    stream: Callable[[], Iterator[SourceView]]
+    warnings: tuple[str, ...] = ()
+    take_off_latlon_deg: tuple[float, float] | None = None
+    """First position of its track, where heights above take-off count from; None: unknown."""
+
+    @property
+    def views(self) -> Iterator[SourceView]:
+        """The views in order; each is read when its turn comes."""
+        return self.stream()
+
+
+def with_options(
+    telemetry: Telemetry, truth_latlon_deg: tuple[float, float] | None, options: SourceOptions
+) -> Telemetry:
+    """The telemetry with the prior and the level camera that the options ask for.
+
+    A height above ground of 0 was not measured.
+    """
+    agl_m = telemetry.agl_m if options.agl_m is None else options.agl_m
+    telemetry = replace(telemetry, agl_m=measured(agl_m))
+    if options.prior_std_m is not None and truth_latlon_deg is not None:
+        prior = Prior(*truth_latlon_deg, options.prior_std_m)
+        telemetry = replace(telemetry, prior=prior)
+    if options.looks_down and math.isnan(telemetry.pitch_deg + telemetry.roll_deg):
+        telemetry = replace(
+            telemetry, pitch_deg=0.0, roll_deg=0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG
+        )
+    return telemetry
+
+
+def rounded(telemetry: Telemetry) -> Telemetry:
+    """The telemetry at the precision of a flight folder, so that import changes no result."""
+    prior, velocity = telemetry.prior, telemetry.vel_en_mps
+    return replace(
+        telemetry,
+        yaw_deg=round(telemetry.yaw_deg, DECIMALS),
+        pitch_deg=round(telemetry.pitch_deg, DECIMALS),
+        roll_deg=round(telemetry.roll_deg, DECIMALS),
+        agl_m=round(telemetry.agl_m, DECIMALS),
+        yaw_std_deg=_rounded(telemetry.yaw_std_deg),
+        agl_std_m=_rounded(telemetry.agl_std_m),
+        prior=prior and Prior(*(round(number, DECIMALS) for number in astuple(prior))),
+        vel_en_mps=velocity and (round(velocity[0], DECIMALS), round(velocity[1], DECIMALS)),
+        home_m=_rounded(telemetry.home_m),
+        amsl_m=_rounded(telemetry.amsl_m),
+        hae_m=_rounded(telemetry.hae_m),
+    )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, DECIMALS)
+
+
+def known_at(
+    track: RecordedTrack, time_ns: int, options: SourceOptions
+) -> tuple[Telemetry, tuple[float, float] | None]:
+    """Telemetry and true position at a time of the track's own clock."""
+    truth = track.latlon_deg(time_ns)
+    telemetry = track.telemetry(time_ns, options.ground_alt_m)
+    return rounded(with_options(telemetry, truth, options)), truth
+
+
+def with_mean_velocities(views: Iterable[SourceView], track: RecordedTrack) -> Iterator[SourceView]:
+    """Views, in order; the velocity of each that follows another after `LONG_GAP_NS` is the mean
+    since that one, by the track."""
+    before_ns = None
+    for view in views:
+        now = view.telemetry
+        if before_ns is not None and now.vel_en_mps and now.time_ns - before_ns > LONG_GAP_NS:
+            mean = track.mean_velocity_en_mps(before_ns, now.time_ns)
+            view = replace(view, telemetry=rounded(replace(now, vel_en_mps=mean)))
+        before_ns = now.time_ns
+        yield view
+
+
+def jump_warnings(
+    positions: Sequence[tuple[int, tuple[float, float] | None]],
+) -> list[str]:
+    """Warning about jumps of a recorded position, at times in ns; empty without one."""
+    known = [(time_ns, place) for time_ns, place in positions if place is not None]
+    if len(known) < 2:
+        return []
+    seconds = np.diff([time_ns / 1e9 for time_ns, _ in known])
+    places = np.array([place for _, place in known])
+    apart_m = distances_m(places[:-1], places[1:])
+    jumps = np.flatnonzero((apart_m > JUMP_M) & (apart_m > JUMP_MPS * seconds))
+    if not len(jumps):
+        return []
+    first = int(jumps[0])
+    return [
+        f"recorded position jumps {len(jumps)} times, the first by {apart_m[first] / 1000:.1f} km "
+        f"{seconds[: first + 1].sum():.1f} s after the beginning: check it before it is used"
+    ]
+
+
+def time_warnings(times_ns: Iterable[int]) -> list[str]:
+    """Warning about views that have the time of another one; empty without one."""
+    counted = Counter(times_ns)
+    equal = sum(count for count in counted.values() if count > 1)
+    if not equal:
+        return []
+    return [
+        f"{equal} of {counted.total()} views have the same time as another one: they are in the "
+        "order of their names, and a track over them is of little use, because it needs the time "
+        "of each"
+    ]
+
+
+LEVEL_GROUND = (
+    "height above ground is taken from the height above take-off: level ground is assumed"
+)
+LEVEL_GROUND_IN_GAPS = (
+    "where no height above ground was measured, it is taken from the height above take-off: level "
+    "ground is assumed there"
+)
+
+
+def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
+    """Warnings about a track for people: its own, what its heights are, and jumps."""
+    warnings, series = list(track.warnings), track.position
+    known = bool(track.heights) or track.home is not None
+    altitudes = track.altitude is not None
+    if options.over_terrain and (known or track.amsl is not None or track.hae is not None):
+        pass  # the terrain gives heights above ground
+    elif track.heights and track.home is not None and options.agl_m is None:
+        warnings.append(LEVEL_GROUND_IN_GAPS)
+    else:
+        warnings += height_warnings(track.home is not None, not known and altitudes, options)
+    if series is None:
+        return warnings
+    places = [
+        (int(time_ns), (float(lat), float(lon)))
+        for time_ns, (lat, lon) in zip(series.time_ns, series.values[:, :2], strict=True)
+    ]
+    return [*warnings, *jump_warnings(places)]
+
+
+def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
+    """Assumptions about heights: of those above take-off, or where only altitudes are known."""
+    if options.agl_m is not None:
+        return []
+    if above_home:
+        return [LEVEL_GROUND]
+    if not only_altitudes:
+        return []
+    if options.ground_alt_m is None:
+        return [
+            "no height above ground was recorded, only altitudes, which are not taken for one; "
+            "give --ground-alt-m, in the same reference"
+        ]
+    return [f"height above ground is the recorded altitude minus {options.ground_alt_m:g} m"]
+
+
+def given_camera(
+    options: SourceOptions, width_px: int, height_px: int, where: str
+) -> Camera | None:
+    """The camera of the options for images of this size: of a file, or of a field of view.
+
+    Raises `MissingFileError` or `CameraError`.
+    """
+    if options.camera is not None:
+        return fitted(read_camera_file(options.camera), width_px, height_px, where)
+    if options.fov_deg is None:
+        return None
+    return Camera.from_fov(options.fov_deg, width_px, height_px)
+
+
+def check_overlap(track: RecordedTrack, first_ns: int, last_ns: int, path: Path) -> None:
+    """Raise `FlightError` where images and track do not overlap in time."""
+    span = track.span_ns()
+    if span is None or first_ns > span[1] or last_ns < span[0]:
+        recorded = "none" if span is None else f"{span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
+        raise FlightError(
+            f"images and telemetry do not overlap: images {first_ns / 1e9:.3f} to "
+            f"{last_ns / 1e9:.3f} s, telemetry {recorded}; give --time-offset-s: {path}"
+        )

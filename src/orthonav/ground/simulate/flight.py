@@ -1,0 +1,558 @@
+"""Simulated flights over an orthophoto: images, telemetry with errors, and the true positions.
+
+Positions are arbitrary, never on a tile grid. Images are rendered with the true attitude and
+height; the telemetry differs from these by the requested errors.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import AreaError, CameraError, FlightError
+from orthonav.core.files import replacing_folder, with_paths
+from orthonav.core.flight.gnss import FILE as GNSS_FILE
+from orthonav.core.flight.gnss import GnssSample, write_gnss
+from orthonav.core.flight.writer import FlightWriter
+from orthonav.core.geo.camera import Camera, footprint_en_m
+from orthonav.core.geo.ground import TerrainHeights
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.core.records import Prior, Telemetry
+from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
+from orthonav.ground.planning.spacing import DEFAULT_CAMERA as DEFAULT_CAMERA
+from orthonav.ground.simulate.attitude import camera_attitude, horizon_errors
+from orthonav.ground.simulate.clouds import Clouds
+from orthonav.ground.simulate.imagery import Coverage, GroundImagery
+from orthonav.ground.simulate.motion import (
+    FlownPath,
+    Wind,
+    drifting,
+    rounded,
+    steady_path,
+    windy_path,
+)
+from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.receiver import Good, samples_of, solutions
+from orthonav.ground.simulate.render import ViewEffects, degraded, render_view
+from orthonav.ground.simulate.terrain import (
+    ground_below_m,
+    near_ground_en_m,
+    reported_heights,
+    seen_over,
+    surface_of,
+)
+
+MAX_VIEWS = 1_000_000
+"""Sanity limit."""
+TRIES_PER_VIEW = 400
+"""Random positions tried per view; suffices if 2 % of them are covered by imagery."""
+MAX_PITCH_DEG = 65.0
+MARGIN_PX = 4
+"""Margin of the ground window: radius of the bicubic kernel, and rounding."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the telemetry, and motion of the camera. All default to none.
+
+    Standard deviations, drawn independently for every view; the telemetry reports them:
+
+    - `yaw_std_deg`: reported heading, degrees, 0..180.
+    - `agl_std`: reported height, as a share of it, 0..0.5.
+    - `tilt_std_deg`: reported pitch and roll, degrees, 0..20.
+    - `attitude_std_deg`: true pitch and roll (which are reported), degrees, 0..20.
+    - `prior_std_m`: reported prior position, metres per axis, 0..1e6; None reports no prior.
+
+    Constant biases, which the reported standard deviations do not include:
+
+    - `yaw_bias_deg`: reported minus true heading, degrees, -180..180.
+    - `agl_bias`: reported minus true height, as a share of it, -0.5..0.5.
+    - `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
+
+    Standard deviations of unreported tilt, pitch and roll each, degrees, 0..20:
+
+    - `mount_std_deg`: of the camera mount, drawn once a flight and added to its bias.
+    - `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
+      (`attitude.HORIZON_TIME_S`), at random positions it is independent.
+
+    `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
+    velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
+    """
+
+    yaw_std_deg: float = 0.0
+    agl_std: float = 0.0
+    tilt_std_deg: float = 0.0
+    attitude_std_deg: float = 0.0
+    prior_std_m: float | None = None
+    yaw_bias_deg: float = 0.0
+    agl_bias: float = 0.0
+    pitch_bias_deg: float = 0.0
+    roll_bias_deg: float = 0.0
+    velocity_drift: float | None = None
+    mount_std_deg: float = 0.0
+    horizon_std_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        limits = {
+            "yaw_std_deg": 180.0,
+            "agl_std": 0.5,
+            "tilt_std_deg": 20.0,
+            "attitude_std_deg": 20.0,
+            "prior_std_m": 1e6,
+            "velocity_drift": 0.5,
+            "mount_std_deg": 20.0,
+            "horizon_std_deg": 20.0,
+        }
+        biases = {
+            "yaw_bias_deg": 180.0,
+            "agl_bias": 0.5,
+            "pitch_bias_deg": 20.0,
+            "roll_bias_deg": 20.0,
+        }
+        for name, limit in {**limits, **biases}.items():
+            value, least = getattr(self, name), -limit if name in biases else 0.0
+            if value is not None and not least <= value <= limit:
+                share = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
+                hint = f" (a share of {share}: 0.05 is 5 %)" if share else ""
+                raise FlightError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
+
+    def mount_deg(self, seed: int) -> Array:
+        """Unreported pitch and roll (2,) of the camera in the aircraft."""
+        drawn = np.random.default_rng([seed, 6]).normal(0, 1, 2) * self.mount_std_deg
+        return np.array([self.pitch_bias_deg, self.roll_bias_deg]) + drawn
+
+    @property
+    def reported_tilt_std_deg(self) -> float | None:
+        """`tilt_std_deg` as the telemetry states it: None, unknown, where all tilt error is
+        unreported; 0, exact, where there is none."""
+        biases = self.pitch_bias_deg, self.roll_bias_deg
+        if self.tilt_std_deg == 0 and any((self.mount_std_deg, self.horizon_std_deg, *biases)):
+            return None
+        return self.tilt_std_deg
+
+
+NO_ERRORS = Errors()
+USUAL_EFFECTS = ViewEffects()
+
+
+@dataclass(frozen=True)
+class SimulateRequest:
+    """Parameters of a simulated flight.
+
+    - `orthos`: orthophotos to fly over; earlier ones take precedence.
+    - `out`: flight folder to write.
+    - `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
+    - `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256
+      pixels of the orthophoto. On a route over a terrain it is the height above the ground at the
+      first view, and the altitude is constant.
+    - `spacing_m`: distance between views on a route in still air; None: flown in one second.
+    - `airspeed_mps`: airspeed. In wind, views are `spacing_m / airspeed_mps` seconds apart too.
+    - `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
+    - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
+    - `wind`: None for still air; only on a route.
+    - `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot.
+    - `cloud_share`: share of the views with clouds, 0..1.
+    - `beyond`: whether the route may leave the imagery, which is then mirrored at its border.
+    - `terrain`: heights of the ground or surface above mean sea level. Views are then true
+      perspectives of it, and the telemetry reports heights above sea level and, on a route, above
+      the first view, and no measured one above ground. `terrain_posting_m`: its resolution.
+    - `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
+    - `gnss`: receiver whose solutions are written to `gnss.csv`; only on a route.
+    """
+
+    orthos: Sequence[Path]
+    out: Path
+    route: Route | None = None
+    random: int | None = None
+    agl_m: float | None = None
+    spacing_m: float | None = None
+    airspeed_mps: float = 25.0
+    camera: Camera = DEFAULT_CAMERA
+    errors: Errors = NO_ERRORS
+    effects: ViewEffects = USUAL_EFFECTS
+    seed: int = 0
+    wind: Wind | None = None
+    turn_radius_m: float = 0.0
+    cloud_share: float = 0.0
+    beyond: bool = False
+    terrain: TerrainHeights | None = None
+    terrain_posting_m: float = 5.0
+    camera_pitch_deg: float = 0.0
+    gnss: Good | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.orthos, str | Path):
+            object.__setattr__(self, "orthos", (self.orthos,))
+        with_paths(self, "orthos", "out")
+
+    @property
+    def in_perspective(self) -> bool:
+        """Whether views are rendered ray by ray; else as level ground seen without the horizon."""
+        return self.terrain is not None or self.camera_pitch_deg > 0
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """True pose of the camera at one view.
+
+    `reported_deg`: heading, pitch and roll as reported, but for noise and bias of the telemetry.
+    `reported_en_mps`: reported velocity over ground, None if not reported.
+    `home_m`, `amsl_m`: height above take-off and above sea level, None if not reported.
+    """
+
+    position_en_m: Array
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    agl_m: float
+    time_s: float
+    reported_deg: tuple[float, float, float]
+    reported_en_mps: tuple[float, float] | None = None
+    home_m: float | None = None
+    amsl_m: float | None = None
+
+    @property
+    def attitude(self) -> tuple[float, float, float, float]:
+        """Heading, pitch, roll (deg) and height (m) of the camera."""
+        return self.yaw_deg, self.pitch_deg, self.roll_deg, self.agl_m
+
+
+def simulate_flight(
+    request: SimulateRequest, progress: Callable[[float], None] | None = None
+) -> int:
+    """Write a flight folder to `request.out`, complete or not at all; returns the number of views.
+
+    Raises `FlightError` on impossible parameters, `AreaError` if no view fits into the imagery or
+    the route leaves it, and as `Mosaic.open` does.
+    """
+    _check(request)
+    mosaic = Mosaic.open(request.orthos)
+    outline = mosaic.outline_latlon_deg
+    area = Area.from_outline(outline[:, 0], outline[:, 1])
+    agl_m = _height_m(request, mosaic)
+    west, south, east, north = area.extent_en_m
+    gsd_m = max(mosaic.gsd_m, request.camera.gsd_m(agl_m) * 0.75)
+    raster = mosaic.sheet(
+        area.frame,
+        west_m=west,
+        north_m=north,
+        width_px=math.ceil((east - west) / gsd_m),
+        height_px=math.ceil((north - south) / gsd_m),
+        gsd_m=gsd_m,
+    )
+    with replacing_folder(request.out) as folder, raster:
+        coverage = Coverage(mosaic, area)
+        poses = list(_poses(request, area, agl_m, coverage))
+        ground = _ground(request, raster, (west, north, gsd_m), coverage)
+        surface = None
+        if request.in_perspective:
+            posting_m = request.terrain_posting_m
+            surface = surface_of(request.terrain, area.frame, area.extent_en_m, posting_m)
+        clouds = None
+        if request.cloud_share > 0:
+            clouds = Clouds(len(poses), request.cloud_share, request.seed)
+        note = f"simulated over {mosaic.sources[0].path.name}, seed {request.seed}"
+        writer = FlightWriter(folder, request.camera, note)
+        digits = max(4, len(str(len(poses))))
+        for number, pose in enumerate(poses):
+            rng = np.random.default_rng([request.seed, 1, number])
+            image = _picture(request, ground, surface, clouds, number, pose, rng)
+            lat, lon = area.frame.latlon_from_en(pose.position_en_m)
+            telemetry = _telemetry(request, area, pose, rng)
+            quality = request.effects.jpeg_quality
+            name = f"{number + 1:0{digits}d}.jpg"
+            writer.add(name, image, telemetry, (float(lat), float(lon)), quality)
+            if progress is not None:
+                progress((number + 1) / len(poses))
+        writer.close()
+        if request.gnss is not None:
+            write_gnss(folder / GNSS_FILE, _solutions(request, request.gnss, area, poses))
+    return len(poses)
+
+
+def _solutions(
+    request: SimulateRequest, receiver: Good, area: Area, poses: Sequence[_Pose]
+) -> Iterator[GnssSample]:
+    """Solutions of the receiver along the poses."""
+    times = np.array([pose.time_s for pose in poses])
+    places = np.array([pose.position_en_m for pose in poses])
+    rng = np.random.default_rng([request.seed, 5])
+    made = solutions(receiver, times, places, rng)
+    return samples_of(made, area.frame)
+
+
+def _check(request: SimulateRequest) -> None:
+    """Raise `FlightError` on parameters that are impossible for any imagery."""
+    if (request.route is None) == (request.random is None):
+        raise FlightError("give either a route or a number of random positions")
+    if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
+        raise FlightError(
+            f"number of random positions must be 1 to {MAX_VIEWS}, got {request.random}"
+        )
+    if request.seed < 0:
+        raise FlightError(f"seed must be 0 or more, got {request.seed}")
+    if not 0 <= request.turn_radius_m <= 100_000:
+        raise FlightError(f"turn radius must be 0 to 100,000 m, got {request.turn_radius_m}")
+    if not 0 <= request.cloud_share <= 1:
+        raise FlightError(
+            f"cloud_share must be 0 to 1 (a share of the views), got {request.cloud_share}"
+        )
+    if not 0 <= request.camera_pitch_deg <= MAX_PITCH_DEG:
+        raise FlightError(
+            f"the camera must look 0 to {MAX_PITCH_DEG:g} deg ahead of straight down, "
+            f"got {request.camera_pitch_deg}"
+        )
+    if request.cloud_share and request.camera_pitch_deg:
+        raise FlightError("clouds are simulated below cameras that look straight down only")
+    on_a_route = {
+        "wind": request.wind is not None,
+        "turn_radius_m": request.turn_radius_m > 0,
+        "velocity_drift": request.errors.velocity_drift is not None,
+        "beyond": request.beyond,
+        "gnss": request.gnss is not None,
+    }
+    given = [name for name, value in on_a_route.items() if value]
+    if request.route is None and given:
+        raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
+
+
+def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
+    camera = request.camera
+    if request.agl_m is None:
+        side_m = 256 * mosaic.gsd_m
+        return side_m / min(camera.extent)
+    if not 1 <= request.agl_m <= 50_000:
+        raise FlightError(f"height above ground must be 1 to 50,000 m, got {request.agl_m}")
+    return request.agl_m
+
+
+def _ground(
+    request: SimulateRequest,
+    raster: SheetRaster,
+    corner: tuple[float, float, float],
+    coverage: Coverage,
+) -> GroundImagery:
+    """The raster with `corner` (west, north, pixel size, metres), mirrored if requested."""
+    west_m, north_m, gsd_m = corner
+    if not (request.beyond or request.in_perspective):
+        return GroundImagery(raster, west_m, north_m, gsd_m)
+    west, south, east, north = coverage.box_en_m()
+    box = (
+        math.ceil((west - west_m) / gsd_m),
+        math.ceil((north_m - north) / gsd_m),
+        math.floor((east - west_m) / gsd_m),
+        math.floor((north_m - south) / gsd_m),
+    )
+    return GroundImagery(raster, west_m, north_m, gsd_m, box)
+
+
+def _sees_ground(coverage: Coverage, request: SimulateRequest, pose: _Pose) -> bool:
+    """Whether imagery covers the whole view, or all that it sees from near."""
+    if request.camera_pitch_deg > 0:
+        angles = pose.yaw_deg, pose.pitch_deg, pose.roll_deg
+        outline = near_ground_en_m(request.camera, angles, pose.agl_m)
+        return outline is not None and coverage.whole(pose.position_en_m + outline)
+    try:
+        return coverage.whole(_corners_en_m(request.camera, pose))
+    except CameraError:
+        return False
+
+
+def _poses(
+    request: SimulateRequest, area: Area, agl_m: float, coverage: Coverage
+) -> Iterator[_Pose]:
+    if request.route is not None:
+        yield from _route_poses(request, request.route, area, agl_m, coverage)
+        return
+    west, south, east, north = area.extent_en_m
+    count, seed, errors = request.random or 0, request.seed, request.errors
+    mount_deg = errors.mount_deg(seed)
+    horizon = np.random.default_rng([seed, 7]).normal(0, 1, (count, 2)) * errors.horizon_std_deg
+    for number in range(count):
+        tilt_deg = horizon[number], mount_deg
+        rng = np.random.default_rng([request.seed, 0, number])
+        for _ in range(TRIES_PER_VIEW):
+            place = rng.uniform([west, south], [east, north])
+            yaw_deg = rng.uniform(0, 360)
+            pose = _tilted(request, rng, place, yaw_deg, agl_m, number * 1.0, tilt_deg)
+            if _sees_ground(coverage, request, pose):
+                yield _above_sea(request, area, pose)
+                break
+        else:
+            wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, agl_m), axis=0)
+            raise AreaError(
+                f"found no position where a view of {wide:.0f} x {high:.0f} m lies within the "
+                f"imagery of {east - west:.0f} x {north - south:.0f} m; fly lower (--agl-m)"
+            )
+
+
+def _above_sea(request: SimulateRequest, area: Area, pose: _Pose) -> _Pose:
+    """The pose with its height above sea level, where there is a terrain."""
+    if request.terrain is None:
+        return pose
+    below_m = ground_below_m(request.terrain, area.frame, pose.position_en_m[None])
+    return replace(pose, amsl_m=pose.agl_m + float(below_m[0]))
+
+
+def _route_poses(
+    request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: Coverage
+) -> Iterator[_Pose]:
+    path = _path(request, route.points_en_m(area.frame))
+    velocities = _reported_velocities(request, path)
+    mount_deg = request.errors.mount_deg(request.seed)
+    tilt_rng = np.random.default_rng([request.seed, 7])
+    horizon = horizon_errors(request.errors.horizon_std_deg, path.times_s, tilt_rng)
+    views = zip(path.places_en_m, path.headings_deg, strict=True)
+    ground_m = None
+    if request.terrain is not None:
+        ground_m = ground_below_m(request.terrain, area.frame, path.places_en_m)
+    for number, (place, heading) in enumerate(views):
+        rng = np.random.default_rng([request.seed, 0, number])
+        time_s, velocity = float(path.times_s[number]), velocities[number]
+        tilt_deg = horizon[number], mount_deg
+        above_m = agl_m
+        if ground_m is not None:
+            above_m += float(ground_m[0] - ground_m[number])
+        if not above_m >= 1:
+            raise FlightError(
+                f"view {number + 1} of the route is {above_m:.0f} m above the terrain; fly higher "
+                "(--agl-m)"
+            )
+        pose = _tilted(request, rng, place, float(heading), above_m, time_s, tilt_deg, velocity)
+        if ground_m is not None:
+            pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
+        if not request.beyond and not _sees_ground(coverage, request, pose):
+            lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
+            raise AreaError(
+                f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
+                f"does not lie completely within the imagery{_swapped(area, route)}"
+            )
+        yield pose
+
+
+def _swapped(area: Area, route: Route) -> str:
+    """A hint if a waypoint with latitude and longitude swapped lies within the imagery."""
+
+    def within(lat: float, lon: float) -> bool:
+        return bool(area.contains(area.frame.en_from_latlon([lat], [lon]))[0])
+
+    hints = (swapped_hint(lat, lon, within) for lat, lon in route.waypoints)
+    return next(filter(None, hints), "")
+
+
+def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
+    airspeed_mps = request.airspeed_mps
+    spacing_m = airspeed_mps if request.spacing_m is None else request.spacing_m
+    if not (0 < spacing_m < math.inf and 0 < airspeed_mps < math.inf):
+        raise FlightError("distance between views and airspeed must be above 0")
+    line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
+    length_m = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    if length_m / spacing_m > MAX_VIEWS:
+        raise FlightError(
+            f"route of {length_m / 1000:,.1f} km with a view every {spacing_m:g} m has more than "
+            f"{MAX_VIEWS:,} views; increase the distance between views"
+        )
+    if request.wind is None:
+        path = steady_path(line, spacing_m, airspeed_mps)
+    else:
+        rng = np.random.default_rng([request.seed, 2])
+        path = windy_path(line, spacing_m, airspeed_mps, request.wind, rng, MAX_VIEWS)
+    if len(path.places_en_m) > MAX_VIEWS:
+        raise FlightError(f"route has more than {MAX_VIEWS:,} views; increase their distance")
+    return path
+
+
+def _reported_velocities(
+    request: SimulateRequest, path: FlownPath
+) -> list[tuple[float, float] | None]:
+    drift = request.errors.velocity_drift
+    if drift is None:
+        return [None] * len(path.places_en_m)
+    rng = np.random.default_rng([request.seed, 4])
+    reported = drifting(path.velocities_en_mps, path.times_s, drift, rng)
+    return [(round(float(east), 4), round(float(north), 4)) for east, north in reported]
+
+
+def _tilted(
+    request: SimulateRequest,
+    rng: np.random.Generator,
+    place: Array,
+    yaw_deg: float,
+    agl_m: float,
+    time_s: float,
+    unreported_deg: tuple[Array, Array],
+    reported_en_mps: tuple[float, float] | None = None,
+) -> _Pose:
+    """A pose at a place; `unreported_deg`: pitch and roll (2,) of horizon and of mount."""
+    tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * request.errors.attitude_std_deg
+    pitch_deg = request.camera_pitch_deg + float(tilt[0])
+    reported = (float(yaw_deg), pitch_deg, float(tilt[1]))
+    true = camera_attitude(reported, *unreported_deg)
+    return _Pose(place, *true, agl_m, time_s, reported, reported_en_mps)
+
+
+def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
+    corners = footprint_en_m(camera, pose.yaw_deg, pose.pitch_deg, pose.roll_deg, pose.agl_m)
+    return pose.position_en_m + corners
+
+
+def _picture(
+    request: SimulateRequest,
+    ground: GroundImagery,
+    surface: Raster | None,
+    clouds: Clouds | None,
+    number: int,
+    pose: _Pose,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """The image of the camera (H, W, 3), rendered from the window of imagery under it."""
+    camera, attitude = request.camera, pose.attitude
+    if surface is not None:
+        above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
+        position = np.array([*pose.position_en_m, above_m])
+        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m, MARGIN_PX)
+        cover = None
+        if clouds is not None:
+            cover = clouds.before(number, camera, attitude, pose.position_en_m)
+        return degraded(picture, request.effects, rng, cover)
+    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
+    cover = None
+    if clouds is not None:
+        cover = clouds.before(number, camera, attitude, pose.position_en_m)
+    corner = corner_en_m - pose.position_en_m
+    return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
+
+
+def _telemetry(
+    request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator
+) -> Telemetry:
+    """Telemetry of a pose with its errors."""
+    errors, height = request.errors, 1 + request.errors.agl_bias
+    yaw_deg, pitch_deg, roll_deg = pose.reported_deg
+    yaw_deg += errors.yaw_bias_deg
+    prior = None
+    if errors.prior_std_m is not None:
+        place = pose.position_en_m + rng.normal(0, errors.prior_std_m, 2)
+        lat, lon = area.frame.latlon_from_en(place)
+        prior = Prior(float(lat), float(lon), errors.prior_std_m)
+    telemetry = Telemetry(
+        time_ns=round(pose.time_s * 1e9),
+        yaw_deg=round((yaw_deg + rng.normal(0, 1) * errors.yaw_std_deg) % 360, 3),
+        pitch_deg=round(pitch_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
+        roll_deg=round(roll_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
+        agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
+        yaw_std_deg=errors.yaw_std_deg or None,
+        agl_std_m=errors.agl_std * pose.agl_m or None,
+        tilt_std_deg=errors.reported_tilt_std_deg,
+        prior=prior,
+        vel_en_mps=pose.reported_en_mps,
+    )
+    if pose.amsl_m is None:
+        return telemetry
+    return reported_heights(telemetry, pose.agl_m, pose.home_m, pose.amsl_m)

@@ -1,0 +1,280 @@
+"""The server of the page: read-only, and by default for this computer only.
+
+There is no password: it listens on the loopback. A web site in the same browser could still try to
+reach it, by DNS rebinding, which the check of the Host header refuses, or by cross-site requests,
+which the check of Sec-Fetch-Site refuses; responses never allow other origins to read them.
+"""
+
+import ipaddress
+import json
+import logging
+import re
+import socket
+import socketserver
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from orthonav.core.errors import FlightError, OrthonavError, OutputError
+from orthonav.ground.view.assets import StaticFile
+from orthonav.ground.view.run import AT, Run
+
+log = logging.getLogger(__name__)
+TIMEOUT_S = 60.0
+"""An idle connection is closed after this time."""
+_CACHED = "private, max-age=86400"
+_NOT_CACHED = "no-store"
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+
+
+@dataclass(frozen=True)
+class Response:
+    """A response to a request."""
+
+    status: HTTPStatus
+    data: bytes = b""
+    media_type: str = "text/plain; charset=utf-8"
+    cache: str = _NOT_CACHED
+
+
+class Pages:
+    """Routes of the server. Safe to share between threads."""
+
+    def __init__(self, run: Run, assets: dict[str, StaticFile]) -> None:
+        self._run, self._assets = run, assets
+        number = r"(\d{1,9})"
+        self._routes: list[tuple[re.Pattern[str], Callable[..., Response]]] = [
+            (re.compile(r"/api/run"), self._summary),
+            (re.compile(r"/api/news"), self._news),
+            (re.compile(rf"/api/views/{number}"), self._view),
+            (re.compile(rf"/api/views/{number}/ground"), self._ground),
+            (re.compile(rf"/api/views/{number}/view\.png"), self._view_png),
+            (re.compile(rf"/api/views/{number}/raw\.jpg"), self._raw_jpeg),
+            (re.compile(rf"/api/views/{number}/map-({'|'.join(AT)})\.png"), self._map_png),
+            (re.compile(rf"/tiles/{number}/{number}/{number}"), self._tile),
+            (re.compile(r"/preview\.jpg"), self._preview),
+        ]
+
+    def answer(self, target: str) -> Response:
+        """The response to a request for `target`, a path with an optional query."""
+        try:
+            asked = urlsplit(target)
+        except ValueError:
+            return _error(HTTPStatus.BAD_REQUEST, "not an address")
+        asset = self._assets.get(asked.path)
+        if asset is not None:
+            return Response(HTTPStatus.OK, asset.data, asset.media_type)
+        for pattern, made in self._routes:
+            match = pattern.fullmatch(asked.path)
+            if match is not None:
+                return self._made(made, match.groups(), asked.query)
+        return _error(HTTPStatus.NOT_FOUND, "not found")
+
+    def _made(self, made: Callable[..., Response], parts: tuple[str, ...], query: str) -> Response:
+        try:
+            return made(*parts, query=query)
+        except (IndexError, FlightError) as error:
+            return _error(HTTPStatus.NOT_FOUND, str(error))
+        except (OrthonavError, OSError) as error:
+            return _error(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        except ValueError as error:  # an invalid query
+            return _error(HTTPStatus.BAD_REQUEST, str(error))
+
+    def _summary(self, query: str) -> Response:
+        return _json(self._run.summary())
+
+    def _news(self, query: str) -> Response:
+        fields = parse_qs(query, max_num_fields=10)
+        asked = [fields.get(name, ["0"])[0] for name in ("generation", "views", "health")]
+        if not all(re.fullmatch(r"\d{1,9}", each) for each in asked):
+            return _error(HTTPStatus.BAD_REQUEST, "generation, views and health are numbers")
+        return _json(self._run.news(*map(int, asked)))
+
+    def _view(self, index: str, query: str) -> Response:
+        return _json(self._run.detail(int(index)))
+
+    def _ground(self, index: str, query: str) -> Response:
+        fields = parse_qs(query, max_num_fields=10)
+        asked = [fields.get(name, [""])[0] for name in ("x", "y")]
+        if not all(re.fullmatch(r"0(\.\d{1,9})?|1(\.0{1,9})?", each) for each in asked):
+            return _error(HTTPStatus.BAD_REQUEST, "x and y are shares, 0 to 1")
+        return _json(self._run.ground(int(index), *map(float, asked)))
+
+    def _view_png(self, index: str, query: str) -> Response:
+        return Response(HTTPStatus.OK, self._run.view_png(int(index)), "image/png")
+
+    def _raw_jpeg(self, index: str, query: str) -> Response:
+        return Response(HTTPStatus.OK, self._run.raw_jpeg(int(index)), "image/jpeg")
+
+    def _map_png(self, index: str, at: str, query: str) -> Response:
+        return Response(HTTPStatus.OK, self._run.map_png(int(index), at), "image/png")
+
+    def _tile(self, level: str, col: str, row: str, query: str) -> Response:
+        found = self._run.sheet.tile(int(level), int(col), int(row))
+        if found is None:
+            return Response(HTTPStatus.NO_CONTENT)
+        return Response(HTTPStatus.OK, *found, cache=_CACHED)
+
+    def _preview(self, query: str) -> Response:
+        if not self._run.sheet.preview:
+            return _error(HTTPStatus.NOT_FOUND, "the map has tiles")
+        return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg", _CACHED)
+
+
+def _json(plain: Any) -> Response:
+    data = json.dumps(plain, allow_nan=False, separators=(",", ":")).encode("ascii")
+    return Response(HTTPStatus.OK, data, "application/json")
+
+
+def _error(status: HTTPStatus, said: str) -> Response:
+    return Response(status, (" ".join(said.split()) + "\n").encode("utf-8", "replace"))
+
+
+class Server(ThreadingHTTPServer):
+    """Listens as soon as it is created; `serve_forever` responds."""
+
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+
+    def __init__(self, pages: Pages, host: str = "127.0.0.1", port: int = 0) -> None:
+        """Port 0 is any free port. Raises `OutputError` where it cannot listen."""
+        try:
+            address = ipaddress.ip_address(host)
+            self.address_family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
+        except ValueError:
+            pass  # a name
+        self.host_name = host.casefold()
+        try:
+            super().__init__((host, port), partial(Handler, pages))
+        except (OSError, OverflowError, UnicodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise OutputError(f"cannot listen at {host} port {port} ({why})") from error
+        self.only_loopback = self._address.is_loopback
+
+    def server_bind(self) -> None:
+        """Bind without the library's look-up of the host name, which may use the network."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = str(self.server_address[0]), self.port
+
+    @property
+    def _address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+        return ipaddress.ip_address(str(self.server_address[0]))
+
+    @property
+    def port(self) -> int:
+        """The port of the server."""
+        return int(self.server_address[1])
+
+    def url(self) -> str:
+        """The URL for a browser on this computer, or for others if the server is public."""
+        address = self._address
+        host = _own_address(address.version) if address.is_unspecified else str(address)
+        return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
+
+    def allows(self, host: str) -> bool:
+        """Whether a request may name this host: addresses and `localhost`, no other names.
+
+        On the loopback only its addresses are allowed. Any port, because tunnels change it.
+        """
+        name = _host_name(host)
+        if name in ("localhost", self.host_name):
+            return True
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return address.is_loopback or not self.only_loopback
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log errors for debugging; connections often end early."""
+        log.debug("request of %s", client_address, exc_info=True)
+
+
+def _own_address(version: int) -> str:
+    """The address of this computer in its network, or the loopback without one.
+
+    Nothing is sent: connecting a datagram socket only looks up the route.
+    """
+    family, far, own = socket.AF_INET, "192.0.2.1", "127.0.0.1"
+    if version == 6:
+        family, far, own = socket.AF_INET6, "2001:db8::1", "::1"
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((far, 9))
+            return str(probe.getsockname()[0])
+    except OSError:
+        return own
+
+
+def _host_name(host: str) -> str:
+    """The name or address in a Host header, without port and brackets."""
+    match = re.fullmatch(r"\[([0-9a-fA-F:.]+)\](?::\d*)?|([^:\[\]/@\s]+)(?::\d*)?", host)
+    return "" if match is None else (match[1] or match[2]).casefold().rstrip(".")
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    server: Server
+    protocol_version = "HTTP/1.1"
+    server_version = "orthonav"
+    sys_version = ""
+    timeout = TIMEOUT_S
+
+    def __init__(self, pages: Pages, *arguments: Any) -> None:
+        self._pages = pages
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        """Respond to a request."""
+        self._send(self._refused() or self._pages.answer(self.path))
+
+    do_HEAD = do_GET  # noqa: N815 - a name of http.server
+
+    def _refused(self) -> Response | None:
+        """The response that refuses a request; None if it is allowed."""
+        hosts = self.headers.get_all("Host", [])
+        if len(hosts) != 1 or not self.server.allows(hosts[0]):
+            return _error(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served")
+        site = self.headers.get("Sec-Fetch-Site", "none")
+        if site not in ("none", "same-origin") and self.path != "/":
+            return _error(HTTPStatus.FORBIDDEN, "cross-site requests are refused")
+        return None
+
+    def _only_reads(self) -> None:
+        self.close_connection = True  # the body is not read
+        reply = self._refused() or _error(HTTPStatus.METHOD_NOT_ALLOWED, "this server is read-only")
+        self._send(reply)
+
+    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _only_reads  # noqa: N815 - names of http.server
+
+    def _send(self, reply: Response) -> None:
+        self.send_response(reply.status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Cache-Control", reply.cache)
+        if reply.status == HTTPStatus.METHOD_NOT_ALLOWED:
+            self.send_header("Allow", "GET, HEAD")
+        if reply.status != HTTPStatus.NO_CONTENT:
+            self.send_header("Content-Type", reply.media_type)
+            self.send_header("Content-Length", str(len(reply.data)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(reply.data)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Log requests for debugging."""
+        log.debug(format, *arguments)

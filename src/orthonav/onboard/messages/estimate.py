@@ -1,0 +1,213 @@
+"""Input of all messages: one position at one exposure, with its accuracy and time.
+
+Unknown values are NaN or None here and are marked as unknown in the message; they never become a
+number that looks like a measurement.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import OrthonavError
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.records import CONFIDENT, Fix, ViewResult
+
+ELLIPSE_95 = math.sqrt(5.991)
+"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
+
+
+class EstimateError(OrthonavError, ValueError):
+    """An estimate is invalid, or the requested message cannot represent it."""
+
+
+class Clock(Enum):
+    """Clock of the timestamps. A link uses one clock: receivers estimate its offset."""
+
+    UTC = "utc"
+    """Since 1970-01-01 UTC."""
+    BOOT = "boot"
+    """Time since boot of the autopilot (from TIMESYNC or the timestamps of its messages)."""
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationEstimate:
+    """Position of the aircraft at one exposure.
+
+    `lat_deg`, `lon_deg`: position, WGS84.
+    `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
+    `confidence`: probability (0 to 1) that the fix is correct; NaN: not known.
+    `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
+    `processing_s`: time from exposure until the message is sent.
+    `agl_m`: height above ground; NaN where not known, as the next three.
+    `alt_amsl_m`, `alt_std_m`: altitude above mean sea level and its standard deviation.
+    `heading_deg`: heading of the top of the image, clockwise from true north.
+    `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
+    `state`: state of the track; None for views that are located one by one.
+    `reset_counter`: 0 to 255; changes when the position jumped.
+    `dead_reckoned`: the view did not show the map, and the position is sent all the same because
+    that was asked for; messages that can mark it do, others are not made.
+
+    Raises `EstimateError` where a value is out of range or no time is given.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    cov_en_m2: NDArray[np.float64]
+    confidence: float
+    utc_ns: int | None = None
+    boot_ns: int | None = None
+    processing_s: float = 0.0
+    agl_m: float = math.nan
+    alt_amsl_m: float = math.nan
+    alt_std_m: float = math.nan
+    vel_en_mps: tuple[float, float] | None = None
+    vel_cov_en: NDArray[np.float64] | None = None
+    heading_deg: float = math.nan
+    state: str | None = None
+    reset_counter: int = 0
+    dead_reckoned: bool = False
+
+    def __post_init__(self) -> None:
+        if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too
+            raise EstimateError(
+                f"a position needs a latitude within 90 and a longitude within 180 degrees, "
+                f"got {self.lat_deg}, {self.lon_deg}"
+            )
+        for name, cov in (("cov_en_m2", self.cov_en_m2), ("vel_cov_en", self.vel_cov_en)):
+            if cov is not None and np.shape(cov) != (2, 2):
+                raise EstimateError(f"{name} must be two by two, got {np.shape(cov)}")
+        if not (math.isnan(self.confidence) or 0 <= self.confidence <= 1):
+            raise EstimateError(f"confidence must be 0 to 1 or NaN, got {self.confidence:g}")
+        if not math.isfinite(self.processing_s):
+            raise EstimateError(f"processing_s must be finite, got {self.processing_s}")
+        if self.alt_std_m < 0:
+            raise EstimateError(f"alt_std_m must not be negative, got {self.alt_std_m:g}")
+        if not 0 <= self.reset_counter <= 255:
+            raise EstimateError(f"reset_counter must be 0 to 255, got {self.reset_counter}")
+        if self.utc_ns is None and self.boot_ns is None:
+            raise EstimateError("the time of exposure is missing: give utc_ns or boot_ns")
+
+    def exposed_ns(self, clock: Clock) -> int:
+        """Time of exposure by `clock`; raises `EstimateError` where it is not known."""
+        time_ns = self.utc_ns if clock is Clock.UTC else self.boot_ns
+        if time_ns is None:
+            raise EstimateError(f"the time of exposure is not known by the clock {clock.value!r}")
+        return time_ns
+
+    def sent_ns(self, clock: Clock) -> int:
+        """Time of sending: exposure plus `processing_s`."""
+        return self.exposed_ns(clock) + round(self.processing_s * 1e9)
+
+    def horizontal_std_m(self, min_std_m: float = 0.0) -> float:
+        """Horizontal standard deviation as one number: that along the worst direction.
+
+        The square root of the larger eigenvalue of the covariance, at least `min_std_m`. Filters
+        that take one number use it for both axes (PX4 squares it into the variance of each), so a
+        smaller value would be too optimistic along the long axis. NaN where the covariance is
+        unknown or invalid.
+        """
+        major = error_ellipse(self.cov_en_m2)[0]
+        return major if math.isnan(major) else max(major, min_std_m)
+
+    def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
+        """Whether this can be reported as a valid position.
+
+        It needs a confidence of at least `min_confidence`, a valid covariance, and the state
+        "tracking" if it comes from a track.
+        """
+        return (
+            self.confidence >= min_confidence  # False for NaN
+            and self.state in (None, "tracking")
+            and not math.isnan(self.horizontal_std_m())
+        )
+
+
+def estimate_from_result(
+    result: ViewResult,
+    *,
+    clock: Clock = Clock.UTC,
+    utc_minus_boot_ns: int | None = None,
+    processing_s: float | None = None,
+    alt_amsl_m: float = math.nan,
+    alt_std_m: float = math.nan,
+    reset_counter: int = 0,
+) -> NavigationEstimate | None:
+    """Estimate of the fix of a view; None where there is no fix.
+
+    `clock`: clock of `result.time_ns`; with `utc_minus_boot_ns` both clocks are filled in.
+    `processing_s`: time from exposure to sending; by default the latency of the fix, without the
+    latency of the camera.
+    `alt_amsl_m`, `alt_std_m`: altitude of the autopilot, to be sent back; a fix has none.
+    The velocity is that of the track.
+    """
+    fix = result.outcome
+    if not isinstance(fix, Fix):
+        return None
+    if processing_s is None:
+        processing_s = result.latency_ms / 1e3 if math.isfinite(result.latency_ms) else 0.0
+    utc_ns, boot_ns = _both_clocks(result.time_ns, clock, utc_minus_boot_ns)
+    return NavigationEstimate(
+        lat_deg=fix.lat_deg,
+        lon_deg=fix.lon_deg,
+        cov_en_m2=fix.cov_en_m2,
+        confidence=fix.confidence,
+        utc_ns=utc_ns,
+        boot_ns=boot_ns,
+        processing_s=processing_s,
+        agl_m=fix.agl_m,
+        alt_amsl_m=alt_amsl_m,
+        alt_std_m=alt_std_m,
+        vel_en_mps=_velocity(fix) if result.state is not None else None,
+        vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
+        heading_deg=fix.heading_deg,
+        state=result.state,
+        reset_counter=reset_counter,
+    )
+
+
+def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
+    """Symmetric covariance with a standard deviation of at least `min_std` in every direction.
+
+    `cov`: covariance (N, N). `min_std`: in the square root of its unit.
+    """
+    values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
+    return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
+
+
+def ellipse_95(cov_en: NDArray[np.float64]) -> dict[str, float] | None:
+    """The 95 % ellipse of a (2, 2) covariance in m^2, as commands and pages write it.
+
+    Semi-axes `major_m` and `minor_m` to a millimetre, `direction_deg` of the major one to a tenth
+    of a degree clockwise from north. None where `error_ellipse` has NaN.
+    """
+    major_m, minor_m, direction_deg = error_ellipse(cov_en)
+    if math.isnan(major_m):
+        return None
+    return {
+        "major_m": round(ELLIPSE_95 * major_m, 3),
+        "minor_m": round(ELLIPSE_95 * minor_m, 3),
+        "direction_deg": round(direction_deg, 1),
+    }
+
+
+def _both_clocks(
+    time_ns: int, clock: Clock, utc_minus_boot_ns: int | None
+) -> tuple[int | None, int | None]:
+    if clock is Clock.UTC:
+        return time_ns, None if utc_minus_boot_ns is None else time_ns - utc_minus_boot_ns
+    return None if utc_minus_boot_ns is None else time_ns + utc_minus_boot_ns, time_ns
+
+
+def _velocity(fix: Fix) -> tuple[float, float] | None:
+    east = fix.evidence.get("vel_east_mps", math.nan)
+    north = fix.evidence.get("vel_north_mps", math.nan)
+    return (east, north) if math.isfinite(east) and math.isfinite(north) else None
+
+
+def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
+    """Covariance from a track, which reports the standard deviation along the worst direction."""
+    std_mps = fix.evidence.get("vel_std_mps", math.nan)
+    return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None

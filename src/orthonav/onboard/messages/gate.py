@@ -1,0 +1,208 @@
+"""Decides which positions are sent, and counts the reasons why others are withheld.
+
+A wrong position leads an autopilot astray; a missing one does not, because the autopilot notices
+it. The gate therefore withholds positions in doubt.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.geo.ellipse import error_ellipse
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import CONFIDENT
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    EstimateError,
+    NavigationEstimate,
+)
+
+FUTURE_S = 0.1
+"""Tolerance for exposures in the future, before the clocks are taken to disagree."""
+JITTER = 0.1
+"""Share of an interval by which a message may be early, so that views with a small jitter all pass
+at their nominal rate."""
+_MOST_NORTH_DEG = 89.8
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GateRules:
+    """Limits of the gate.
+
+    `min_confidence`: lowest confidence that is sent, 0 to 1.
+    `max_std_m`: largest standard deviation along the worst direction, metres.
+    `max_age_s`: longest time since exposure, seconds.
+    `min_interval_s`: shortest time between two messages, by name; others are not limited.
+    `jump_sigmas`: a position that differs from the prediction by more than this many standard
+    deviations plus the possible manoeuvre is a jump.
+    `jump_views`: a jump is withheld until so many views in a row agree on the new place.
+    `send_coasting`: admit dead reckoning of a track too; messages mark it.
+    `velocity_std_mps`: standard deviation of a velocity that has no covariance.
+    `max_accel_mps2`: acceleration of the possible manoeuvre where the velocity is known.
+    `max_speed_mps`: speed of the possible manoeuvre where it is not.
+
+    Raises `EstimateError` for limits that are not positive, or a confidence outside 0 to 1.
+    """
+
+    min_confidence: float = CONFIDENT
+    max_std_m: float = 50.0
+    max_age_s: float = 1.0
+    min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    jump_sigmas: float = 5.0
+    jump_views: int = 3
+    send_coasting: bool = False
+    velocity_std_mps: float = 1.0
+    max_accel_mps2: float = 10.0
+    max_speed_mps: float = 60.0
+
+    def __post_init__(self) -> None:
+        limits = {
+            "max_std_m": self.max_std_m,
+            "max_age_s": self.max_age_s,
+            "jump_sigmas": self.jump_sigmas,
+            **{f"min_interval_s[{key}]": value for key, value in self.min_interval_s.items()},
+        }
+        for name, value in limits.items():
+            if not value > 0:  # NaN too
+                raise EstimateError(f"{name} must be above 0, got {value}")
+        if not 0 <= self.min_confidence <= 1:
+            raise EstimateError(f"min_confidence must be 0 to 1, got {self.min_confidence}")
+
+
+class Gate:
+    """Checks the estimates of one flight in order. Mutable; for one thread.
+
+    `withheld`: counts by reason: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
+    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for dead reckoning,
+    `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a message that
+    would exceed its rate, and the reasons of views that the flight loop does not locate.
+    `sent`: counts of messages by name.
+    `resets`: number of admitted jumps of the position, and of tracks found again.
+    """
+
+    def __init__(self, rules: GateRules | None = None, clock: Clock = Clock.UTC) -> None:
+        """`clock`: clock of `now_ns`, with which times of exposure are compared."""
+        self.rules = rules or GateRules()
+        self.clock = clock
+        self.withheld: Counter[str] = Counter()
+        self.sent: Counter[str] = Counter()
+        self.resets = 0
+        self._last: NavigationEstimate | None = None
+        self._interrupted = False
+        self._jumped_to: list[NavigationEstimate] = []
+        self._due_ns: dict[str, int] = {}
+
+    def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
+        """Return the estimate with its reset counter set, or None where it must not be sent.
+
+        `estimate` is None for a view without a fix. Pass every view, also those that cannot be
+        sent: they show that a track was lost. Raises `EstimateError` where the exposure is not
+        known by the gate's clock.
+        """
+        reason = self._reason(estimate, now_ns)
+        self._watch(estimate)
+        if estimate is None or reason is not None:
+            self.withheld[reason or "no_fix"] += 1
+            return None
+        coasting = estimate.state == "coasting"
+        jumped = self._last is not None and self._jumped(self._last, estimate)
+        if jumped and (coasting or not self._is_confirmed(estimate)):
+            self.withheld["jump"] += 1
+            return None
+        self._jumped_to = []
+        if jumped or (self._last is not None and self._interrupted):
+            self.resets += 1
+        self._interrupted = False
+        made = replace(estimate, reset_counter=self.resets % 256, dead_reckoned=coasting)
+        if not coasting:
+            self._last = made
+        return made
+
+    def _is_confirmed(self, estimate: NavigationEstimate) -> bool:
+        """Whether enough views in a row, this one included, agree on a place after a jump."""
+        if self._jumped_to and self._jumped(self._jumped_to[-1], estimate):
+            self._jumped_to = []
+        self._jumped_to.append(estimate)
+        return len(self._jumped_to) >= self.rules.jump_views
+
+    def due(self, message: str, now_ns: int) -> bool:
+        """Whether the rate of `message` allows sending now; counts it as sent or withheld.
+
+        The long-term rate never exceeds the limit. `now_ns` may be of any steady clock; after a
+        jump back the next message passes.
+        """
+        interval_s = self.rules.min_interval_s.get(message)
+        if interval_s is not None:
+            interval_ns = round(interval_s * 1e9)
+            early_ns = round(interval_ns * JITTER)
+            due_ns = self._due_ns.get(message, now_ns)
+            if now_ns < due_ns - interval_ns - early_ns:  # before the last message
+                due_ns = now_ns
+            if now_ns < due_ns - early_ns:
+                self.withheld[f"rate:{message}"] += 1
+                return False
+            self._due_ns[message] = max(due_ns, now_ns - early_ns) + interval_ns
+        self.sent[message] += 1
+        return True
+
+    def _reason(self, estimate: NavigationEstimate | None, now_ns: int) -> str | None:
+        """Reason why the estimate must not be sent; None if it can be sent."""
+        if estimate is None:
+            return "no_fix"
+        exposed_ns, std_m = estimate.exposed_ns(self.clock), estimate.horizontal_std_m()
+        age_s = (now_ns - exposed_ns) / 1e9
+        behind_s = math.nan
+        if self._last is not None:
+            behind_s = (self._last.exposed_ns(self.clock) - exposed_ns) / 1e9
+        refusals = {
+            "coasting": estimate.state == "coasting" and not self.rules.send_coasting,
+            "not_tracking": estimate.state not in (None, "tracking", "coasting"),
+            "low_confidence": estimate.state != "coasting"
+            and not estimate.confidence >= self.rules.min_confidence,  # NaN too
+            "no_covariance": math.isnan(std_m),
+            "too_uncertain": std_m > self.rules.max_std_m,
+            "from_the_future": age_s < -FUTURE_S,
+            "stale": age_s > self.rules.max_age_s,
+            # Farther behind, and not stale: the clock was set back.
+            "out_of_order": 0 <= behind_s <= self.rules.max_age_s + FUTURE_S,
+        }
+        return next((reason for reason, applies in refusals.items() if applies), None)
+
+    def _watch(self, estimate: NavigationEstimate | None) -> None:
+        """Note the loss of a track: a view without a fix, searching or lost, after tracking."""
+        tracked = self._last is not None and self._last.state == "tracking"
+        if tracked and (estimate is None or estimate.state not in ("tracking", "coasting")):
+            self._interrupted = True
+
+    def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:
+        """Whether two positions differ by more than their errors and the motion allow."""
+        seconds = (now.exposed_ns(self.clock) - before.exposed_ns(self.clock)) / 1e9
+        if seconds <= 0:
+            return True
+        velocities = [e.vel_en_mps for e in (before, now) if e.vel_en_mps is not None]
+        moved = _moved_en_m(before, now)
+        cov = np.asarray(before.cov_en_m2) + now.cov_en_m2
+        if velocities:
+            moved = moved - np.mean(velocities, axis=0) * seconds
+            known = now.vel_cov_en if now.vel_cov_en is not None else before.vel_cov_en
+            spread = np.eye(2) * self.rules.velocity_std_mps**2 if known is None else known
+            cov = cov + np.asarray(spread) * seconds**2
+            free_m = self.rules.max_accel_mps2 * seconds**2 / 2
+        else:
+            free_m = self.rules.max_speed_mps * seconds
+        allowed_m = self.rules.jump_sigmas * error_ellipse(cov)[0] + free_m
+        return not float(np.hypot(*moved)) <= allowed_m  # true for an invalid covariance, too
+
+
+def _moved_en_m(before: NavigationEstimate, now: NavigationEstimate) -> Array:
+    """Metres east and north from one position to another."""
+    limited = min(max(before.lat_deg, -_MOST_NORTH_DEG), _MOST_NORTH_DEG)
+    frame = LocalFrame(limited, before.lon_deg)
+    start = frame.en_from_latlon(before.lat_deg, before.lon_deg)
+    return np.asarray(frame.en_from_latlon(now.lat_deg, now.lon_deg) - start)

@@ -1,0 +1,235 @@
+"""MAVLink messages in the autopilot's local frame: ODOMETRY, VISION_POSITION_ESTIMATE, its origin.
+
+They need more than a map provides: height, attitude and, in part, a 3D velocity. These are the
+autopilot's own values at the exposure (`LocalPose`), sent back to complete the message; its filter
+must fuse the horizontal position only (docs/autopilots.md).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.records import CONFIDENT
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate, floored
+from orthonav.onboard.messages.local import Autopilot, Origin, ardupilot_variance, north_east_m
+from orthonav.onboard.messages.mavlink import (
+    Message,
+    clamped,
+    deg_e7,
+    dialect,
+    float32,
+    microseconds,
+    require_confident,
+)
+
+_LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
+_ESTIMATOR_VISION = 2
+_INT32_MIN, _INT32_MAX = -(2**31), 2**31 - 1
+_NAN3 = (math.nan, math.nan, math.nan)
+Triple = tuple[float, float, float]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LocalPose:
+    """State that the autopilot reported for the exposure, in its local frame. NaN: not known.
+
+    `origin`: origin of the local frame.
+    `down_m`, `down_std_m`: distance below the origin; needed where the estimate has no altitude.
+    `attitude_rad`, `attitude_std_rad`: roll, pitch, yaw of the body from NED (rotations ZYX).
+    `vel_down_mps`, `vel_down_std_mps`: velocity downwards.
+    """
+
+    origin: Origin
+    down_m: float = math.nan
+    down_std_m: float = math.nan
+    attitude_rad: Triple = _NAN3
+    attitude_std_rad: Triple = _NAN3
+    vel_down_mps: float = math.nan
+    vel_down_std_mps: float = math.nan
+
+
+def odometry(
+    estimate: NavigationEstimate,
+    pose: LocalPose,
+    autopilot: Autopilot,
+    *,
+    clock: Clock = Clock.UTC,
+    min_std_m: float = 0.0,
+    min_confidence: float = CONFIDENT,
+) -> Message:
+    """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
+
+    PX4: pose and velocity in MAV_FRAME_LOCAL_NED; attitude and velocity are NaN where not known.
+    ArduPilot: MAV_FRAME_LOCAL_FRD with its x axis north and the velocity in MAV_FRAME_BODY_FRD, the
+    only pair that it accepts; it always reads attitude and velocity, so they must be known.
+    `quality` is the confidence in per cent. Raises `EstimateError` where a needed value is not
+    known, or the estimate is of low confidence.
+    """
+    require_confident(estimate, min_confidence, "ODOMETRY")
+    position, variance = _position(estimate, pose, autopilot, min_std_m, "ODOMETRY")
+    velocity_ned = _velocity_ned(estimate, pose)
+    frames = (_LOCAL_NED, _LOCAL_NED)
+    velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
+    if autopilot is Autopilot.ARDUPILOT:
+        body_from_ned = _body_from_ned(pose.attitude_rad)
+        frames = (_LOCAL_FRD, _BODY_FRD)
+        velocity = body_from_ned @ velocity_ned
+        velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
+        if not np.isfinite(velocity).all():
+            raise EstimateError(
+                "ODOMETRY to ArduPilot needs attitude and velocity, and they are not all known: "
+                "send VISION_POSITION_ESTIMATE"
+            )
+    return dialect().MAVLink_odometry_message(
+        time_usec=microseconds(estimate.exposed_ns(clock)),
+        frame_id=frames[0],
+        child_frame_id=frames[1],
+        x=float32(position[0]),
+        y=float32(position[1]),
+        z=float32(position[2]),
+        q=[float32(value) for value in _quaternion(pose.attitude_rad)],
+        vx=float32(velocity[0]),
+        vy=float32(velocity[1]),
+        vz=float32(velocity[2]),
+        rollspeed=math.nan,
+        pitchspeed=math.nan,
+        yawspeed=math.nan,
+        pose_covariance=_triangle(variance, pose.attitude_std_rad),
+        velocity_covariance=_triangle(velocity_cov, _NAN3),
+        reset_counter=estimate.reset_counter,
+        estimator_type=_ESTIMATOR_VISION,
+        quality=clamped(estimate.confidence * 100, 1, 100),
+    )
+
+
+def vision_position_estimate(
+    estimate: NavigationEstimate,
+    pose: LocalPose,
+    autopilot: Autopilot,
+    *,
+    clock: Clock = Clock.UTC,
+    min_std_m: float = 0.0,
+    min_confidence: float = CONFIDENT,
+) -> Message:
+    """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
+
+    Raises `EstimateError` where height or attitude is not known (the message cannot mark that), or
+    the estimate is of low confidence.
+    """
+    require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
+    (x, y, z), variance = _position(estimate, pose, autopilot, min_std_m, "this message")
+    if not all(map(math.isfinite, pose.attitude_rad)):
+        raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
+    roll, pitch, yaw = pose.attitude_rad
+    return dialect().MAVLink_vision_position_estimate_message(
+        usec=microseconds(estimate.exposed_ns(clock)),
+        x=float32(x),
+        y=float32(y),
+        z=float32(z),
+        roll=roll,
+        pitch=pitch,
+        yaw=yaw,
+        covariance=_triangle(variance, pose.attitude_std_rad),
+        reset_counter=estimate.reset_counter,
+    )
+
+
+def set_gps_global_origin(
+    origin: Origin, *, target_system: int = 1, time_ns: int | None = None
+) -> Message:
+    """SET_GPS_GLOBAL_ORIGIN (message 48): origin of the local frame.
+
+    Autopilots accept it once. `target_system` must be theirs: PX4 refuses 0. `time_ns`: time of
+    sending by the clock of the link.
+    """
+    return dialect().MAVLink_set_gps_global_origin_message(
+        target_system=target_system,
+        latitude=deg_e7(origin.lat_deg),
+        longitude=deg_e7(origin.lon_deg),
+        altitude=clamped(origin.alt_amsl_m * 1000, _INT32_MIN, _INT32_MAX),
+        time_usec=0 if time_ns is None else microseconds(time_ns),
+    )
+
+
+def _position(
+    estimate: NavigationEstimate,
+    pose: LocalPose,
+    autopilot: Autopilot,
+    min_std_m: float,
+    message: str,
+) -> tuple[Triple, Array]:
+    """North, east, down in metres and their (3, 3) covariance, all of them known.
+
+    ArduPilot makes one standard deviation of the covariance; it gets the one that comes out as the
+    horizontal standard deviation.
+    """
+    north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
+    down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
+    if not math.isfinite(down):
+        down, down_std = pose.down_m, pose.down_std_m
+    if not (math.isfinite(down) and math.isfinite(down_std)):
+        raise EstimateError(
+            f"{message} needs the autopilot's height and its standard deviation; without them "
+            "receivers drop the position or its accuracy"
+        )
+    if autopilot is Autopilot.ARDUPILOT:
+        std_m = estimate.horizontal_std_m(min_std_m)
+        return (north, east, down), np.eye(3) * ardupilot_variance(std_m)
+    variance = np.zeros((3, 3))
+    variance[:2, :2] = floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
+    variance[2, 2] = down_std**2
+    return (north, east, down), variance
+
+
+def _velocity_ned(estimate: NavigationEstimate, pose: LocalPose) -> Array:
+    east, north = estimate.vel_en_mps or (math.nan, math.nan)
+    return np.array([north, east, pose.vel_down_mps])
+
+
+def _velocity_covariance(estimate: NavigationEstimate, pose: LocalPose) -> Array:
+    cov = np.full((3, 3), math.nan)
+    if estimate.vel_cov_en is not None and math.isfinite(pose.vel_down_std_mps):
+        cov[:] = 0.0
+        cov[:2, :2] = estimate.vel_cov_en[::-1, ::-1]
+        cov[2, 2] = pose.vel_down_std_mps**2
+    return cov
+
+
+def _triangle(upper: Array, lower_std: Triple) -> list[float]:
+    """Upper right triangle, by rows, of a (6, 6) covariance: `upper` (3, 3), then three
+    independent values; all NaN where the first is not known, as the definition requires."""
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = upper
+    cov[3:, 3:] = np.diag(np.square(lower_std))
+    if not math.isfinite(cov[0, 0]):
+        cov[:] = math.nan
+    return [float32(value) for value in cov[np.triu_indices(6)].tolist()]
+
+
+def _quaternion(attitude_rad: Triple) -> tuple[float, float, float, float]:
+    """Quaternion w, x, y, z of the rotation from body to NED; NaN where not known."""
+    roll, pitch, yaw = (angle / 2 for angle in attitude_rad)
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _body_from_ned(attitude_rad: Triple) -> Array:
+    """Rotation matrix (3, 3) from NED to forward, right, down."""
+    w, x, y, z = _quaternion(attitude_rad)
+    ned_from_body = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return ned_from_body.T

@@ -1,5 +1,0 @@
-"""Map building on the workstation: from orthophotos to the map that flies."""
-
-from orthonav.prepare.build import BuildRequest, BuildResult, build_map
-
-__all__ = ["BuildRequest", "BuildResult", "build_map"]

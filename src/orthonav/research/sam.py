@@ -1,0 +1,343 @@
+"""Boundaries of Segment Anything masks (Kirillov et al., ICCV 2023) as binary edge maps.
+
+Di Piazza et al. 2024, section 4: Segment Anything is applied to each picture, and its masks are
+turned into one binary map of all their boundaries; Base does as well as Large and Huge. Masks come
+from the automatic mask generator of the paper's appendix B: a grid of points prompts the network,
+which returns three masks each. Masks with a low expected IoU or a low stability are dropped, then
+near duplicates. The network is that of the `transformers` library (Apache-2.0); its weights are
+given by path and never downloaded. This module needs PyTorch and seconds to minutes per picture; it
+never flies.
+"""
+
+import hashlib
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import VariantError
+from orthonav.core.extras import missing_extra
+from orthonav.research.sam_cache import cache_folder, cached, keep
+from orthonav.research.sam_weights import WHERE, network, weights_digest
+from orthonav.research.superpoint import chosen_device, require_device, weights_stamp
+
+try:
+    import torch
+except ImportError as error:
+    raise missing_extra("a neural network", "train", "torch", error) from error
+
+PER = ("sheet", "tile")
+PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+CACHE_FORMAT = b"orthonav sam boundaries 1"
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in training
+_CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
+"""Pixels of masks scaled at once. On a CPU, small chunks reuse memory of the process: 0.57 s per
+window against 1.18 s at 1 << 24 (small network)."""
+
+WEIGHTS_VARIABLE = "ORTHONAV_SAM_WEIGHTS"
+Grey = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
+"""Points (P, 2), x and y in pixels of the network, to logits (P, 3, h, w) and IoU (P, 3)."""
+
+
+@dataclass(frozen=True)
+class SamBoundaries:
+    """Binary map of the boundaries of all automatic Segment Anything masks of a picture.
+
+    Defaults of `grid`, `iou`, `stability`, `offset` and `overlap` are those of the original
+    generator.
+
+    - `weights`: path of a Hugging Face folder or of an original `.pth` checkpoint (Base, Large or
+      Huge); by default ORTHONAV_SAM_WEIGHTS.
+    - `grid`: points along one side of a window, 1 to 256.
+    - `iou`: smallest IoU with the truth that the network may expect of a mask, 0 to 1.
+    - `stability`: smallest IoU between the masks cut at logits `offset` above and below zero, 0 to
+      1.
+    - `offset`: offset of the logits for `stability`, above 0.
+    - `overlap`: IoU of boxes above which the mask with the lower expected IoU is dropped, 0 to 1.
+    - `window`: side of the windows into which larger pictures are cut, 16 to 4096 px, so that point
+      spacing and magnification are those of a tile; 0: no windows.
+    - `per`: "sheet": a sheet is segmented once, in windows, and tiles are cut out of its
+      boundaries; "tile": every reference tile is segmented by itself, as a view is and as in the
+      paper, some 64 times the work at an overlap of 87.5 %.
+    - `prompts`: points per call of the network, 1 to 4096.
+    - `device`: "auto", "cpu" or "cuda".
+    - `precision`: "fp32", or "bf16" or "fp16" for the two transformers.
+    - `cache`: folder of finished windows, "none" for no cache; by default ORTHONAV_CACHE or the
+      user's cache folder.
+    """
+
+    weights: str = ""
+    grid: int = 32
+    iou: float = 0.88
+    stability: float = 0.95
+    offset: float = 1.0
+    overlap: float = 0.7
+    window: int = 256
+    per: str = "sheet"
+    prompts: int = 64
+    device: str = "auto"
+    precision: str = "fp32"
+    cache: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise VariantError(f"sam needs weights=PATH, or {WEIGHTS_VARIABLE}: {WHERE}")
+        for name, least, most in (("grid", 1, 256), ("prompts", 1, 4096)):
+            if not least <= getattr(self, name) <= most:
+                raise VariantError(
+                    f"sam {name} must be {least} to {most}, got {getattr(self, name)}"
+                )
+        for name in ("iou", "stability", "overlap"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise VariantError(f"sam {name} must be 0 to 1, got {getattr(self, name)}")
+        if not self.offset > 0:
+            raise VariantError(f"sam offset must be above 0, got {self.offset}")
+        if self.window and not 16 <= self.window <= 4096:
+            raise VariantError(f"sam window must be 0 or 16 to 4096 px, got {self.window}")
+        if self.per not in PER:
+            raise VariantError(f"sam per must be {' or '.join(PER)}, got '{self.per}'")
+        if self.precision not in PRECISIONS:
+            raise VariantError(
+                f"sam precision must be {', '.join(PRECISIONS)}, got '{self.precision}'"
+            )
+        require_device(self.device)
+
+    @property
+    def path(self) -> str:
+        """Path of the weights: `weights`, else ORTHONAV_SAM_WEIGHTS.
+
+        Maps do not store it: it is a path of the machine that built them.
+        """
+        return self.weights or os.environ.get(WEIGHTS_VARIABLE, "")
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C."""
+        return 1
+
+    @property
+    def margin_px(self) -> int:
+        """Always 0: a mask depends on the whole window, and no margin would change that."""
+        return 0
+
+    def __call__(self, grey: Grey, valid: Mask) -> NDArray[np.float32]:
+        """Boundaries (1, H, W), 1 on a boundary, else 0; none along the border of `valid`.
+
+        Values of invalid pixels have no influence. Raises `MissingFileError` or
+        `VariantError` where the weights are missing or not Segment Anything's.
+        """
+        out = np.zeros((1, *grey.shape), dtype=np.float32)
+        for part in _windows(grey.shape, self.window):
+            if valid[part].any():
+                out[0][part] = np.maximum(out[0][part], self._window(grey[part], valid[part]))
+        if not valid.all():
+            inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
+            out[0][inner.reshape(valid.shape) == 0] = 0
+        return out
+
+    def batch(
+        self,
+        greys: NDArray[np.uint8],
+        valid: NDArray[np.bool_],
+        report: Callable[[float], None] = lambda share: None,
+    ) -> NDArray[np.float32]:
+        """Boundaries (N, 1, H, W) of pictures (N, H, W); `report` receives the share done."""
+        out = np.zeros((len(greys), 1, *greys.shape[1:]), dtype=np.float32)
+        for index, (grey, seen) in enumerate(zip(greys, valid, strict=True)):
+            out[index] = self(grey, seen)
+            report((index + 1) / len(greys))
+        return out
+
+    def _window(self, grey: Grey, valid: Mask) -> Mask:
+        """Boundaries (H, W) of one window, from the cache where it is there."""
+        filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+        stamp = weights_stamp(self.path, WHERE)
+        folder = cache_folder(self.cache)
+        path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
+        edges = cached(path, grey.shape) if path else None
+        if edges is None:
+            device = chosen_device(self.device)
+            model = _model(self.path, stamp, str(device))
+            predict = _predictor(model, filled, PRECISIONS[self.precision])
+            side = int(model.config.vision_config.image_size)
+            edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
+            if path:
+                keep(path, edges)
+        return edges
+
+    def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
+        """Cache key of a window: digest of its pixels, the weights and the settings."""
+        rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
+        digest = hashlib.sha256(CACHE_FORMAT)
+        digest.update(repr((filled.shape, rules, weights_digest(self.path, stamp))).encode())
+        digest.update(filled.tobytes())
+        return digest.hexdigest()
+
+
+def _windows(shape: tuple[int, ...], window: int) -> Iterator[tuple[slice, slice]]:
+    """Evenly spaced windows of at most `window` px that cover a picture (H, W)."""
+    sides = []
+    for size in shape:
+        length = min(size, window or size)
+        starts = np.linspace(0, size - length, -(-size // length)).round().astype(int)
+        sides.append([slice(int(start), int(start) + length) for start in starts])
+    yield from itertools.product(*sides)
+
+
+class _Box(NamedTuple):
+    """An accepted mask: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
+
+    bits: NDArray[np.uint8]
+    corners: NDArray[np.int64]
+    iou: float
+
+
+def automatic_masks(
+    predict: Predict, shape: tuple[int, ...], side: int, rules: SamBoundaries
+) -> Iterator[Mask]:
+    """Accepted masks (H, W) of a grid of points, highest expected IoU first.
+
+    `side` is the side of the network's square input in pixels; the longer side of the picture is
+    scaled to it.
+    """
+    height, width = shape
+    centres = (np.arange(rules.grid) + 0.5) / rules.grid
+    x, y = np.meshgrid(centres, centres)
+    resized = _resized_shape(shape, side)
+    points = np.stack([x.ravel() * resized[1], y.ravel() * resized[0]], axis=1).astype(np.float32)
+    found: list[_Box] = []
+    for start in range(0, len(points), rules.prompts):
+        logits, iou = predict(points[start : start + rules.prompts])
+        found += _trusted(logits.flatten(0, 1), iou.flatten(), shape, side, rules)
+    if not found:
+        return
+    corners = np.stack([mask.corners for mask in found])
+    for index in suppressed(corners, np.array([mask.iou for mask in found]), rules.overlap):
+        bits = np.unpackbits(found[index].bits, count=height * width)
+        yield bits.reshape(height, width).astype(bool)
+
+
+def _trusted(
+    logits: torch.Tensor, iou: torch.Tensor, shape: tuple[int, ...], side: int, rules: SamBoundaries
+) -> Iterator[_Box]:
+    """Masks (M, h, w) whose expected IoU (M,) and stability reach the limits of `rules`."""
+    good = iou > rules.iou
+    logits, iou = logits[good], iou[good]
+    resized = _resized_shape(shape, side)
+    pixels = _CHUNK_PIXELS.get(logits.device.type, _CHUNK_PIXELS["cpu"])
+    chunk = max(1, pixels // max(side * side, shape[0] * shape[1]))
+    for start in range(0, len(logits), chunk):
+        part = logits[start : start + chunk, None].float()
+        part = _scaled(part, (side, side))[..., : resized[0], : resized[1]]
+        full = _scaled(part, (shape[0], shape[1]))[:, 0]
+        inner = (full > rules.offset).sum(dim=(1, 2))
+        outer = (full > -rules.offset).sum(dim=(1, 2))
+        stable = (inner >= rules.stability * outer) & (outer > 0)
+        masks = (full[stable] > 0).cpu().numpy()
+        for mask, trust in zip(masks, iou[start : start + chunk][stable].tolist(), strict=True):
+            if mask.any():
+                yield _Box(np.packbits(mask), _corners(mask), trust)
+
+
+def _scaled(logits: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
+    return torch.nn.functional.interpolate(logits, shape, mode="bilinear", align_corners=False)
+
+
+def _corners(mask: Mask) -> NDArray[np.int64]:
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.int64)
+
+
+def suppressed(
+    corners: NDArray[np.int64], scores: NDArray[np.floating[Any]], overlap: float
+) -> list[int]:
+    """Indices of boxes after non-maximum suppression, best score first.
+
+    `corners` (N, 4) are x0, y0, x1, y1. A box is dropped if its IoU with a better accepted box is
+    above `overlap`. As in the original generator, a box reaches from the index of its first pixel
+    to that of its last, so a box one pixel wide has no area and is never dropped.
+    """
+    order = np.argsort(-scores, kind="stable")
+    areas = (corners[:, 2:] - corners[:, :2]).prod(axis=1)
+    accepted = []
+    while len(order):
+        best, order = order[0], order[1:]
+        accepted.append(int(best))
+        first = np.maximum(corners[best, :2], corners[order, :2])
+        last = np.minimum(corners[best, 2:], corners[order, 2:])
+        common = (last - first).clip(min=0).prod(axis=1)
+        union = areas[best] + areas[order] - common
+        order = order[common <= overlap * union]
+    return accepted
+
+
+def boundary_map(masks: Iterable[Mask], shape: tuple[int, ...]) -> Mask:
+    """Pixels (H, W) of any mask that touch a pixel outside it within the picture."""
+    edges = np.zeros(shape, dtype=bool)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for mask in masks:
+        inside = cv2.erode(mask.astype(np.uint8), cross, borderValue=1).reshape(shape)
+        edges |= mask & (inside == 0)
+    return edges
+
+
+def _resized_shape(shape: tuple[int, ...], side: int) -> tuple[int, int]:
+    """Height and width of a picture (H, W) with its longer side as long as the network's."""
+    height, width = (max(1, int(size * side / max(shape) + 0.5)) for size in shape)
+    return height, width
+
+
+def network_pixels(grey: Grey, side: int) -> torch.Tensor:
+    """Network input (1, 3, side, side) for a grey picture (H, W), padded with zeros."""
+    height, width = _resized_shape(grey.shape, side)
+    pixels = torch.from_numpy(np.array(grey, dtype=np.float32))[None, None]
+    pixels = torch.nn.functional.interpolate(
+        pixels, (height, width), mode="bilinear", align_corners=False, antialias=True
+    )
+    mean, deviation = (torch.tensor(values).reshape(3, 1, 1) for values in (_MEAN, _DEVIATION))
+    pixels = (pixels.round().clamp(0, 255) / 255 - mean) / deviation
+    return torch.nn.functional.pad(pixels, (0, side - width, 0, side - height))
+
+
+def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
+    """Function that prompts the network with points of one picture, encoded once.
+
+    Positions are always encoded in float32: half precision would lose their phases.
+    """
+    device = model.device
+    half = (
+        nullcontext()
+        if dtype == torch.float32
+        else torch.autocast(device_type=device.type, dtype=dtype)
+    )
+    pixels = network_pixels(grey, int(model.config.vision_config.image_size)).to(device)
+    with torch.inference_mode():
+        with half:
+            encoded = model.get_image_embeddings(pixels).float()
+        places = model.get_image_wide_positional_embeddings()
+
+    def predict(points: NDArray[np.float32]) -> tuple[torch.Tensor, torch.Tensor]:
+        prompt = torch.from_numpy(points).to(device)[None, :, None]
+        labels = torch.ones(prompt.shape[:-1], dtype=torch.int, device=device)
+        with torch.inference_mode():
+            sparse, dense = model.prompt_encoder(prompt, labels, None, None)
+            with half:
+                logits, iou = model.mask_decoder(encoded, places, sparse, dense, True)
+        return logits[0], iou[0].float()
+
+    return predict
+
+
+@lru_cache(maxsize=1)
+def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
+    del stamp  # part of the key only: files may change
+    return network(weights).to(device)

@@ -1,0 +1,160 @@
+"""Learns a bag of visual words: k-means of the features of reference pictures.
+
+Needs faiss, and PyTorch for SuperPoint. The embedder that flies is `orthonav.core.tiles.words`.
+"""
+
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import VariantError
+from orthonav.core.extras import needed
+from orthonav.core.tiles.words import (
+    DIMS,
+    Array,
+    Detector,
+    Grey,
+    Mask,
+    WordsEmbedder,
+    WordsRecipe,
+    describe,
+)
+
+SAMPLES_PER_WORD = 40
+"""Descriptors per word: faiss warns below 39, as fewer make empty clusters."""
+MIN_SAMPLES = 100_000
+"""Descriptors that are clustered at least, if the pictures have that many."""
+ITERATIONS = 20
+"""Iterations of k-means; faiss's own default is 25."""
+SUPERPOINT_RADIUS_PX = 8.0
+"""A SuperPoint feature covers its own cell of 8 px and the neighbouring cells."""
+
+
+@dataclass(frozen=True)
+class SuperPointDetector:
+    """SuperPoint features: `weights` is the path of the network, `most` the number of features."""
+
+    weights: str
+    most: int
+
+    def __call__(self, grey: Grey) -> tuple[Array, Array, Array]:
+        """Points (N, 2) from the outer corner, radii (N,) and unit descriptors (N, 256)."""
+        from orthonav.research.superpoint import SuperPoint  # only here is PyTorch needed
+
+        points, descriptors = SuperPoint(self.weights, max_points=self.most).describe(grey)
+        radii = np.full(len(points), SUPERPOINT_RADIUS_PX, dtype=np.float32)
+        return points, radii, descriptors
+
+
+def detector_of(recipe: WordsRecipe) -> Detector | None:
+    """Feature detector of a recipe; None for SIFT, which is built in."""
+    if recipe.features == "sift":
+        return None
+    return SuperPointDetector(recipe.weights, recipe.max_features)
+
+
+class _Sample:
+    """Uniform random sample of a stream of rows of unknown length (reservoir sampling)."""
+
+    def __init__(self, size: int, seed: int) -> None:
+        self.size = size
+        self._random = np.random.default_rng(seed)
+        self._rows: list[NDArray[Any]] = []
+        self._tickets: list[NDArray[np.float64]] = []
+        self._count = 0
+
+    def put(self, rows: NDArray[Any]) -> None:
+        """Add rows (N, ..)."""
+        self._rows.append(rows)
+        self._tickets.append(self._random.random(len(rows)))
+        self._count += len(rows)
+        if self._count >= 2 * self.size:
+            self._draw()
+
+    def rows(self) -> NDArray[Any]:
+        """The sample, in the order of arrival."""
+        self._draw()
+        return self._rows[0]
+
+    def _draw(self) -> None:
+        """Keep the rows with the lowest tickets."""
+        rows, tickets = np.concatenate(self._rows), np.concatenate(self._tickets)
+        if len(rows) > self.size:
+            drawn = np.sort(np.argsort(tickets, kind="stable")[: self.size])
+            rows, tickets = rows[drawn], tickets[drawn]
+        self._rows, self._tickets, self._count = [rows], [tickets], len(rows)
+
+
+def learn_words(
+    recipe: WordsRecipe,
+    pictures: Iterable[tuple[Grey, Mask]],
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> WordsEmbedder:
+    """Embedder learned from pictures (S, S) uint8, each with its valid pixels (S, S).
+
+    k-means of at most 40 descriptors per word, and at least 100000, drawn evenly from all; the
+    same seed gives the same words. With `tfidf`, a word found in n of N pictures weighs
+    log((N + 1) / n), counted on the descriptors drawn. `progress` is called with the share of
+    k-means done. Raises `VariantError` if there are fewer descriptors than words,
+    `MissingExtraError` without faiss.
+    """
+    faiss, detector = _faiss(), detector_of(recipe)
+    sample = _Sample(max(MIN_SAMPLES, SAMPLES_PER_WORD * recipe.words), seed)
+    owners = _Sample(sample.size, seed)  # draws the same tickets: the picture of each row
+    stored = np.uint8 if recipe.features == "sift" else np.float16
+    count = 0
+    for grey, valid in pictures:
+        rows = describe(recipe, grey, valid, detector).astype(stored)
+        sample.put(rows)
+        owners.put(np.full(len(rows), count, dtype=np.int64))
+        count += 1
+    drawn = sample.rows() if count else np.zeros((0, DIMS[recipe.features]), stored)
+    if len(drawn) < recipe.words:
+        raise VariantError(
+            f"{recipe.words} words cannot be learned from {len(drawn)} features in {count} "
+            "pictures; use fewer words or more imagery"
+        )
+    centres = _clustered(faiss, drawn.astype(np.float32), recipe.words, seed, progress)
+    vocabulary = np.rint(centres).clip(0, 255) if recipe.features == "sift" else centres
+    plain = replace(recipe, tfidf=0)
+    nothing = np.zeros(0, dtype=np.float32)
+    embedder = WordsEmbedder(plain, vocabulary.astype(stored), nothing, detector)
+    if not recipe.tfidf:
+        return embedder
+    pairs = np.unique(np.stack([embedder.assigned(drawn), owners.rows()]), axis=1)
+    pictures_with = np.bincount(pairs[0], minlength=recipe.words)
+    idf = np.log((count + 1) / np.maximum(1, pictures_with)).astype(np.float32)
+    return WordsEmbedder(recipe, embedder.vocabulary, idf, detector)
+
+
+def _clustered(
+    faiss: Any, drawn: Array, words: int, seed: int, progress: Callable[[float], None]
+) -> Array:
+    """Centres (words, D) of k-means, one iteration of faiss at a time to show progress."""
+    centres: Array | None = None
+    for done in range(ITERATIONS):
+        kmeans = faiss.Kmeans(
+            drawn.shape[1],
+            words,
+            niter=1,
+            seed=seed,
+            min_points_per_centroid=1,
+            max_points_per_centroid=-(-len(drawn) // words),
+        )
+        kmeans.train(drawn, init_centroids=centres)
+        centres = np.asarray(kmeans.centroids, dtype=np.float32)
+        progress((done + 1) / ITERATIONS)
+    assert centres is not None
+    return centres
+
+
+def _faiss() -> Any:
+    with warnings.catch_warnings():
+        # SWIG's types, at import, in some versions
+        warnings.filterwarnings("ignore", "builtin type .* has no __module__", DeprecationWarning)
+        return needed("faiss", "train", "learning visual words")

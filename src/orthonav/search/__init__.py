@@ -1,1 +1,0 @@
-"""Search: which stored embeddings are most like the one of a view."""
