@@ -14,7 +14,7 @@ MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
 MIN_VIEW_PX = 24.0
 """Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
-that views are finished at (docs/decisions/registration.md, 2)."""
+that views are finished at (docs/decisions/registration.md)."""
 MIN_TILT_COS = 0.5
 """Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
 MAX_COARSER = 4.0

@@ -21,7 +21,7 @@ def places_of(
 
     A search of only a share of the map finds fewer rivals, and chance is lower: the log odds are
     those within the area searched times `searched_share`, or, if less, those of a search of the
-    whole map whose rivals are what chance makes (docs/decisions/tracking.md, 9).
+    whole map whose rivals are what chance makes (docs/decisions/tracking.md).
     """
     best, chances = found.evidence(), confidence.chances
     least = {

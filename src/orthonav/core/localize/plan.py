@@ -78,14 +78,14 @@ class SearchPlan:
 
     turn_step_rad: float = math.radians(8.0)
     """Spacing of headings at the coarse level and for tiles, whose candidates are refined there
-    first; docs/decisions/registration.md, 6."""
+    first; docs/decisions/registration.md."""
     scale_step: float = 0.13
-    """Spacing of log scales there; docs/decisions/registration.md, 6."""
+    """Spacing of log scales there; docs/decisions/registration.md."""
     judged_turn_step_rad: float = math.radians(6.0)
     """Spacing of headings at the judged level: 8 deg lose 2 to 6 points of views there;
-    docs/decisions/registration.md, 6."""
+    docs/decisions/registration.md."""
     judged_scale_step: float = 0.09
-    """Spacing of log scales at the judged level; docs/decisions/registration.md, 6."""
+    """Spacing of log scales at the judged level; docs/decisions/registration.md."""
     final_turn_step_rad: float = math.radians(3.0)
     """Spacing of headings at the final level, half of that at the judged one."""
     final_scale_step: float = 0.045
@@ -99,34 +99,34 @@ class SearchPlan:
     """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
     likely_nats: float = 1.0
     """With an unknown heading, poses within so many nats come first at the coarse level and for
-    tiles: their scales are those of nine views in ten; docs/decisions/registration.md, 19."""
+    tiles: their scales are those of nine views in ten; docs/decisions/registration.md."""
     last_stage_ms: float = 60.0
     """The last stage, poses that one view in seven has, is left out where it would cost more and
-    the coarse level has tried them; docs/decisions/registration.md, 18."""
+    the coarse level has tried them; docs/decisions/registration.md."""
     candidates: int = 24
     """Candidates of a search by FFT at the coarse level."""
     far_candidates: int = 400
     """Candidates of a search by FFT one level above the coarse one;
-    docs/decisions/registration.md, 15."""
+    docs/decisions/registration.md."""
     far_reach_px: float = 1.5
     """Their place is sought within so many pixels of that level."""
     stage_candidates: int = 24
-    """Candidates of one stage at the judged level; docs/decisions/registration.md, 13."""
+    """Candidates of one stage at the judged level; docs/decisions/registration.md."""
     final_candidates: int = 2
     """Candidates of a search at the final level: each is finished."""
     tile_candidates: tuple[int, int] = (20, 400)
-    """Least and largest number of candidates from tiles; docs/decisions/registration.md, 15."""
+    """Least and largest number of candidates from tiles; docs/decisions/registration.md."""
     tiles_per_candidate: int = 200
     """Between these, one candidate for so many tiles: the right one ranks lower among more."""
     tile_share_per_nat: float = 0.03
     """Share of its similarity that a tile loses with every nat by which the telemetry contradicts
-    its pose; docs/decisions/registration.md, 14."""
+    its pose; docs/decisions/registration.md."""
     tile_reach_strides: float = 1.1
     """The place of a candidate from tiles is sought within so many strides of the tile grid."""
     nearby_log_scales: tuple[float, ...] = (-0.13, 0.0, 0.13)
     """Candidates from tiles and from above the coarse level are compared there under their log
     scale plus each of these, the best of which counts: their scale is hardly known;
-    docs/decisions/registration.md, 15."""
+    docs/decisions/registration.md."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Least and largest side of a view, in tiles, for which tiles are asked: below, most of a tile
     is missing; above, most of the view is unused."""
@@ -136,7 +136,7 @@ class SearchPlan:
     """Weaker candidates than this share of the best are dropped."""
     clear: ClearMargin = CLEAR
     """The search ends with a place that stands out so far. Views of other places reach a ratio of
-    1.4, rarely 1.6; docs/decisions/registration.md, 10."""
+    1.4, rarely 1.6; docs/decisions/registration.md."""
     clear_at_judged: ClearMargin = CLEAR_AT_JUDGED
     """The same once the judged level was searched, if only in part: it misses least. Also after
     tiles, where the place is confident as well: there can be more of them than places at the judged
@@ -146,7 +146,7 @@ class SearchPlan:
     finer: tuple[tuple[int, float], ...] = ((3, 25.0), (48, 90.0))
     """Until it is, so many candidates are finished and the best of them compared one level finer,
     with the estimated cost (ms): matches by chance lose more in detail, so that the right place may
-    be far down the list of the judged level; docs/decisions/registration.md, 13."""
+    be far down the list of the judged level; docs/decisions/registration.md."""
     cheap_ms: float = 14.0
     """Up to this cost the judged level is searched at once, and nothing else."""
     last_ms: float = 900.0
@@ -160,13 +160,13 @@ class SearchPlan:
     trials: int = 3
     """Before a search that costs more than a trial, so many of the best candidates are placed on
     the terrain and finished, and compared one level finer where that proves none. The search ends
-    if one is proven; docs/decisions/registration.md, 14 and 18."""
+    if one is proven; docs/decisions/registration.md."""
     trial_doubt: float = 0.002
     """A trial proves a place with a confidence above one minus this: its rivals were not all
     searched. Before the final level they were, and `doubt` counts."""
     trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
     """Where a trial compares only a part of all places, or only a few on the terrain, the place
-    must also stand out so far; docs/decisions/registration.md, 14."""
+    must also stand out so far; docs/decisions/registration.md."""
     trial_ms: float = 25.0
     terrain_trial_ms: float = 60.0
     """Estimated cost of a trial, on level ground and on a terrain."""

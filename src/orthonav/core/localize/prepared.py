@@ -31,7 +31,7 @@ MIN_AGL_STD = 0.03
 """Least standard deviation of the log scale that is searched, whatever the telemetry reports."""
 MAX_AGL_STD = 0.15
 """Largest one: three of them are scales of 0.64 to 1.57, about as far as scores of chance were
-measured to be alike (docs/decisions/registration.md, 1)."""
+measured to be alike (docs/decisions/registration.md)."""
 NEAR_SHARE = 0.6
 """The part of a view far off nadir is judged as one so many times smaller, thus mostly one level
 finer: it is no square, and on its coarse levels too little is left of it

@@ -59,6 +59,6 @@ def even_scale(log_scale: float) -> float:
     """Factor of correlation times root of pixels that makes scores of chance alike at any scale.
 
     A view that is magnified touches more pixels of the map, without more information; on mirrored
-    views chance grows with about the root of the scale (docs/decisions/registration.md, 1).
+    views chance grows with about the root of the scale (docs/decisions/registration.md).
     """
     return math.exp(log_scale / 2)

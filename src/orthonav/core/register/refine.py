@@ -34,7 +34,7 @@ SLACK_PX = 6
 SMALL_STEP_PX = 0.03
 """A step that moves no part of the view by more than this ends the refinement."""
 MAX_STEP_PX = 3.0
-"""Longest step: about the basin of convergence (docs/decisions/registration.md, 6)."""
+"""Longest step: about the basin of convergence (docs/decisions/registration.md)."""
 DAMPING = 1e-3
 """Relative damping of the Gauss-Newton matrix (Levenberg and Marquardt)."""
 MIN_CORRELATION = 0.08

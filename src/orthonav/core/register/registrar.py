@@ -26,10 +26,10 @@ from orthonav.core.register.template import ViewTemplates
 
 LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across
-(docs/decisions/registration.md, 2)."""
+(docs/decisions/registration.md)."""
 KEPT_TO_LOOK = 200
 """Candidates that pass from the coarse level to the judged one, at most
-(docs/decisions/registration.md, 15)."""
+(docs/decisions/registration.md)."""
 KEPT_TO_FINISH = 3
 """Places that are finished: the best and its rivals."""
 KEPT_TO_FINEST = 12
@@ -37,7 +37,7 @@ KEPT_TO_FINEST = 12
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
 """Candidates below these shares of the best score are dropped, after one step and after all steps
-of a level (docs/decisions/registration.md, 7)."""
+of a level (docs/decisions/registration.md)."""
 MIN_HOPEFUL = 4
 """So many stay whatever their score, for the evidence needs rivals."""
 FIRST_STEPS = 1
@@ -49,7 +49,7 @@ EXCLUSION_SHARE = 0.25
 """A rival lies farther from the best than this share of the view's side."""
 NAT_SCORE = 1.0
 """Units of the score per nat of the prior of heading and scale
-(docs/decisions/registration.md, 5)."""
+(docs/decisions/registration.md)."""
 MAX_KEPT_WINDOWS = 4
 """Search windows of whole sheets in the cache."""
 SAME_PLACE_SHARE = 1 / 8

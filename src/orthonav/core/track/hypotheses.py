@@ -101,7 +101,7 @@ def _divergence(means: Array, covariances: Array) -> Array:
     """Kullback-Leibler divergence (nats) of each of several Gaussians from the first, (N,).
 
     `means` (N, 6), `covariances` (N, 6, 6): of `COMPARED`. A well-known place must not
-    vanish in a wide hypothesis around it (docs/decisions/tracking.md, 8).
+    vanish in a wide hypothesis around it (docs/decisions/tracking.md).
     """
     inverse = np.linalg.inv(covariances[0])
     off = means - means[0]

@@ -65,24 +65,24 @@ LIKELY = 0.5
 CONFIRMED = 1.25
 """New ground, in views, that must be recognized before a track is confirmed. Each view counts by
 its own probability: no single view confirms a track, nor do further views of its ground, nor views
-that fit only because they were searched there (docs/decisions/tracking.md, 9 and 13)."""
+that fit only because they were searched there (docs/decisions/tracking.md)."""
 UNCONFIRMED = 0.8
-"""Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
+"""Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md)."""
 RECOGNIZED = 0.2
 """Probability from which on a view shows the map, by this view alone and by its agreement with the
-prediction. Without, a track is coasting (docs/decisions/tracking.md, 12)."""
+prediction. Without, a track is coasting (docs/decisions/tracking.md)."""
 RECOGNIZED_SIGMAS = 1.5
 """Farther from the estimated position than this many standard deviations per axis, a view does not
 show the map there."""
 RECOGNIZED_SHARE = 0.1
 """A hypothesis with less of the probability of its cluster does not show where the cluster is
-(docs/decisions/tracking.md, 16)."""
+(docs/decisions/tracking.md)."""
 UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
 BLIND = 0.5
 """Factor on the evidence, against a track that was confirmed, of a view that does not show the map,
-for each such view before: clouds, water and a covered lens last (decisions/tracking.md, 13)."""
+for each such view before: clouds, water and a covered lens last (decisions/tracking.md)."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
 FORGOTTEN = 0.5

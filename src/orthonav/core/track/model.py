@@ -22,7 +22,7 @@ HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Standard deviations that the heading and log scale of a registered view have at least."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
 """A good mount is misaligned by what makes so many metres on the ground, within these angles
-(docs/decisions/tracking.md, 4)."""
+(docs/decisions/tracking.md)."""
 TILT_WALK_SHARE = 1 / 30
 """Drift of a mount per root of a second, over its misalignment: in a quarter of an hour it drifts
 by as much."""
@@ -46,10 +46,10 @@ class Model:
     accel_mps2: float = 4.0
     """Of the acceleration while no velocity is reported, per axis."""
     reported_velocity_s: float = 120.0
-    """Correlation time of the error of a reported velocity, s (docs/decisions/tracking.md, 6)."""
+    """Correlation time of the error of a reported velocity, s (docs/decisions/tracking.md)."""
     coasting_walk: float = 1.3
     """Of the drift of that error while views do not show the map, m/s per root of a second: 3 m/s
-    and 9 m after 5 s, 24 m after 10 s (docs/decisions/tracking.md, 12)."""
+    and 9 m after 5 s, 24 m after 10 s (docs/decisions/tracking.md)."""
     heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)
     """Of the constant error of the reported heading."""
     heading_noise_rad: float = math.radians(2.0)
@@ -65,9 +65,9 @@ class Model:
     tilt_rad: float = math.radians(0.5)
     """Of the misalignment of a good mount, in pitch and roll; see `at_height`."""
     off_tilt_rad: float = math.radians(6.0)
-    """Of the misalignment of a bad mount (docs/decisions/tracking.md, 4)."""
+    """Of the misalignment of a bad mount (docs/decisions/tracking.md)."""
     off_mount: float = 0.03
-    """Probability that the mount is a bad one (docs/decisions/tracking.md, 4)."""
+    """Probability that the mount is a bad one (docs/decisions/tracking.md)."""
     horizon_rad: float = math.radians(1.5)
     """Of the error of the autopilot's horizon, in pitch and roll, where there is no
     `tilt_std_deg`."""
@@ -84,7 +84,7 @@ class Model:
     `off_tilt_rad`), a compass that was reset."""
     odometry_outlier: float = 0.01
     """Probability that a displacement by the camera is an outlier that fits well: clouds, a field
-    that repeats (docs/decisions/tracking.md, 5)."""
+    that repeats (docs/decisions/tracking.md)."""
     turn: float = 0.03
     """Probability, per second, that the velocity changes by more than `accel_mps2` allows."""
     miss: float = 0.5

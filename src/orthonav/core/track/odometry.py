@@ -35,9 +35,9 @@ MIN_SCORE_RATIO = 2.5
 Arroio and generated landscapes, wrong ones at most 1.7."""
 MIN_CORRELATION = 0.4
 """Least correlation: right ones have at least 0.56, wrong ones at most 0.11
-(docs/decisions/tracking.md, 5)."""
+(docs/decisions/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
-"""An expected displacement that fits this well ends the search (docs/decisions/tracking.md, 5)."""
+"""An expected displacement that fits this well ends the search (docs/decisions/tracking.md)."""
 NOISE_PX, NOISE_SHARE = 0.4, 0.01
 """Standard deviation of a displacement per axis: in pixels, and as a share of its length."""
 CANDIDATES = 8
@@ -190,7 +190,7 @@ class OdometryView:
         """The same view with the present estimate of the biases.
 
         Both views of a displacement need the same estimate: otherwise what was learnt between
-        them, a tilt most of all, would appear as motion (docs/decisions/tracking.md, 11).
+        them, a tilt most of all, would appear as motion (docs/decisions/tracking.md).
         """
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
             return OdometryView.of(self.view, self.pixel_m, bias)

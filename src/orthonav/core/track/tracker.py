@@ -71,7 +71,7 @@ MIN_LOCAL_M = 30.0
 """Least half width of that search."""
 LEAST_NEW = 0.15
 """Least share of a view that counts as new evidence, however much it overlaps the view before:
-noise, light and tilt differ (docs/decisions/tracking.md, 2)."""
+noise, light and tilt differ (docs/decisions/tracking.md)."""
 LIKELY_NATS = 5.0
 """Places so much less likely than the best one are not examined for their tilt."""
 UNSEEN_TILT_RAD = math.radians(20.0)

@@ -30,7 +30,7 @@ CLIMB_PER_S = 0.02
 """Change of log scale per second: 20 m/s at 1000 m."""
 MIN_NEW = 0.15
 """Share of a view that must be new ground for it to count: hovering proves nothing. The track
-weighs views in the same way (docs/decisions/tracking.md, 2)."""
+weighs views in the same way (docs/decisions/tracking.md)."""
 ANCHORS = 30
 """Places that counted and are remembered: circling over them proves nothing more."""
 MAX_REACH_M = 5_000.0

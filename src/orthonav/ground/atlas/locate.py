@@ -41,7 +41,7 @@ LIKELY = 0.5
 MODEL = Model(wide_m=MAX_REACH_M / SIGMAS, most_agreement=1.0)
 """Views of a flight without a prior may be far apart in time: their positions are never predicted
 well. So each must show the map by itself, however well it agrees with the prediction, and a wide
-prediction is no reason to confirm the track again (docs/decisions/atlas.md, 6)."""
+prediction is no reason to confirm the track again (docs/decisions/atlas.md)."""
 
 
 class LocalTrack:

@@ -23,7 +23,7 @@ from orthonav.ground.atlas.sheet_registration import (
 
 SEARCHED = 4
 """At most so many candidates are searched: the right one and the best rivals are among them
-(docs/decisions/atlas.md, 5)."""
+(docs/decisions/atlas.md)."""
 PROVEN = logit(1 - DEFAULT_PLAN.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""
