@@ -263,7 +263,7 @@ export function sentence(store, i) {
   if (c.reason[i]) parts.push(`no fix: ${c.reason[i]}`);
   else parts.push(described(store, i));
   if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
-  if (c.wrong[i]) parts.push("CONFIDENT AND WRONG");
+  if (c.wrong[i]) parts.push("FALSE FIX");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
   if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
   if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} high`);
