@@ -57,6 +57,8 @@ def test_an_image_is_localized_and_followed(map_path, area, flight, flight_path)
     tracker = orthonav.Tracker(map_, heading_known=False)
     first = tracker.update(colour, area.camera, time_s=0.0, agl_m=area.agl_m)
     assert isinstance(first, orthonav.Fix) and "searching" in repr(tracker)
+    headless = orthonav.Tracker(map_).update(colour, area.camera, time_s=0.0, agl_m=area.agl_m)
+    assert headless.reason == "missing_telemetry" and "heading_deg" in headless.detail
 
 
 def test_cameras_by_field_of_view_and_by_matrix(tmp_path):

@@ -143,7 +143,7 @@ def test_the_worst_view_with_its_images_and_values(page, small, ask):
         f"tracking, confident, error {metres_text(error_m)}, FALSE FIX",
         f"confidence {fix['confidence']:.3f} within {metres_text(fix['radius_m'])}",
         f"\N{GREEK SMALL LETTER SIGMA} {metres_text(spread_m)}, heading {fix['heading_deg']:.1f}°",
-        f"{metres_text(fix['agl_m'])} high",
+        f"{metres_text(fix['agl_m'])} above ground",
     ):
         assert part in said
     page.click("#more summary")

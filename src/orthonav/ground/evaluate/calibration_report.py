@@ -153,7 +153,7 @@ def criteria_header(metrics: Metrics) -> tuple[str, ...]:
         "of all views",
         f"precision within {radius}",
         "recall",
-        f"accepted and wrong by > {far}",
+        f"wrong by > {far}",
     )
 
 
@@ -182,8 +182,8 @@ def confidence_text(metrics: Metrics) -> str:
     default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
     stated = "1 fix states" if calibration.n_fixes == 1 else f"{calibration.n_fixes} fixes state"
     return (
-        f"{stated} {calibration.mean_confidence:.3f} on average, and "
-        f"{calibration.share_right:.3f} of them are within the stated radius{default}; "
+        f"{stated} a mean confidence of {calibration.mean_confidence:.3f}; the fraction within the "
+        f"stated radius is {calibration.share_right:.3f}{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
 

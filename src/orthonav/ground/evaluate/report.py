@@ -250,7 +250,7 @@ def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
             "error-curve",
             f"Error curve: {percent_text(metrics.accuracy)} of all views within "
             f"{metrics.radius_m:g} m",
-            "Percentage of all views that have a fix with an error up to the value of the axis.",
+            "Percentage of all views with a fix whose error is at most the value on the axis.",
             plots.error_curve_picture(comparison, metrics),
         ),
         Figure(

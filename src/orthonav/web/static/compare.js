@@ -266,7 +266,7 @@ export function sentence(store, i) {
   if (c.wrong[i]) parts.push("FALSE FIX");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
   if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
-  if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} high`);
+  if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} above ground`);
   if (Number.isFinite(c.ms[i])) parts.push(`${number(c.ms[i], 0)} ms`);
   if (health && health.level !== "OK") parts.push(`health ${health.level}: ${health.reasons.join(", ")}`);
   if (c.err2) parts.push(`second run: ${second(store, i)}`);
