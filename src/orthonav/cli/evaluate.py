@@ -216,7 +216,7 @@ def _warn_of_another_run(
 ) -> None:
     """Log a warning where fixes were computed from another map or flight than the given ones.
 
-    Without a flight, it is the flight folder in which the truth is, if any.
+    Without a flight, it is the flight folder that holds the ground truth, if any.
     """
     from orthonav.errors import OrthonavError
     from orthonav.flight import open_flight

@@ -135,7 +135,7 @@ def error_picture(comparison: Comparison, series: TrackSeries, radius_m: float) 
 
 
 def signed_picture(series: TrackSeries) -> Drawing:
-    """Errors ahead and to the right of the truth over time, scaled to the tracking views."""
+    """Errors ahead and to the right of the ground truth over time, scaled to the tracking views."""
 
     def draw(figure: "mpl.Figure") -> None:
         parts = figure.subplots(2, 1, sharex=True)
