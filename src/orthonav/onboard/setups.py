@@ -23,8 +23,8 @@ from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 
 V = TypeVar("V", bound=RecordedView)
 FEW = 0.5
-"""Below this fraction of confident views the configuration may be wrong, and from this fraction on a
-change explains it."""
+"""Below this fraction of confident views the configuration may be wrong; a change that reaches it
+explains it."""
 SAMPLE = 8
 """At most so many views are localized again."""
 _GIVE_UP = 4
