@@ -213,8 +213,8 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     parser.add_argument(
         "--version",
         action="store_true",
-        help="print the version; with --verbose (or --json) also what is installed, what is "
-        "missing for which command, and the processor's abilities",
+        help="print the version; with --verbose (or --json) also the installed packages, the "
+        "extras that commands lack, and the abilities of the processor",
     )
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")

@@ -109,9 +109,9 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--agl-std",
         type=float,
-        metavar="SHARE",
+        metavar="FRACTION",
         default=0.05,
-        help="standard deviation of the reported height, as a share of it (default 0.05)",
+        help="standard deviation of the reported height, as a fraction of it (default 0.05)",
     )
     prior = group.add_mutually_exclusive_group()
     prior.add_argument(
@@ -150,7 +150,7 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--drift",
         type=float,
-        metavar="SHARE",
+        metavar="FRACTION",
         default=0.03,
         help="error of dead reckoning per metre flown without a fix (default 0.03)",
     )

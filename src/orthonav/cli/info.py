@@ -25,7 +25,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--preview",
         type=Path,
         metavar="FILE.png",
-        help="write the imagery as a grey .png or .tif for QGIS, placed by FILE.aux.xml beside it",
+        help="write the imagery as a grey .png or .tif for QGIS, georeferenced by FILE.aux.xml",
     )
 
 

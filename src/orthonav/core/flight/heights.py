@@ -133,7 +133,7 @@ class FlownHeights:
         use_prior: bool = True,
     ) -> None:
         """`area_deg`: latitudes and longitudes spread over the area searched. `take_off`: latitude,
-        longitude and standard deviation (m) of the place of take-off."""
+        longitude and standard deviation (m) of the take-off position."""
         self._terrain, self._area_deg = terrain, area_deg
         self._use_prior = use_prior
         known = None
@@ -224,6 +224,6 @@ def warn_of_mismatch(off_m: float) -> None:
     if abs(off_m) > MISMATCH_M:
         log.warning(
             "heights above take-off and above sea level differ by %.0f m over this terrain: check "
-            "its vertical datum, the place of take-off and the altitude of the autopilot",
+            "its vertical datum, the take-off position and the altitude of the autopilot",
             off_m,
         )

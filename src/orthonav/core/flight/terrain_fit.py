@@ -61,7 +61,7 @@ class TerrainFit:
             self._say(
                 "datum",
                 "by the views the aircraft is %.0f m %s than reported over this terrain: check its "
-                "vertical datum, the place of take-off and the altitude of the autopilot",
+                "vertical datum, the take-off position and the altitude of the autopilot",
                 abs(middle_m),
                 "higher" if middle_m > 0 else "lower",
             )
