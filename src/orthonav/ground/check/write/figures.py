@@ -149,7 +149,7 @@ def _profile(result: CheckResult, along: Along) -> Figure:
         f"Probability and expected drift along the route; {likely} of "
         f"it at {CONFIDENT:g} or more, {len(result.stretches)} gaps without fixes",
         "Probability along the route with its 80 % interval and the lowest across the band; below, "
-        "the expected position error (one standard deviation). Shaded: gaps without fixes.",
+        "the predicted position error (1 sigma). Shaded: gaps without fixes.",
         draw_figure((10.0, 5.0), lambda figure: _draw_profile(figure, result, along)),
     )
 

@@ -125,7 +125,7 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
         shown.append((str(int(result.cells.trials.sum())), "trial views"))
     else:
         worst_m = float(result.along.drift_m.max())
-        shown.append((metres_text(worst_m), "largest expected position error along the route"))
+        shown.append((metres_text(worst_m), "largest predicted position error along the route"))
     shown.append((str(len(result.lookalikes)), "pairs of ambiguous places"))
     return shown
 

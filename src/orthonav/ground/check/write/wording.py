@@ -19,7 +19,7 @@ from orthonav.report.numbers import metres_text
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
     Word.GO: "This route can be flown with this map.",
-    Word.MARGINAL: "This route can be flown with this map, but with care; see the reasons.",
+    Word.MARGINAL: "This route does not meet all requirements for GO; see the reasons.",
     Word.NO_GO: "Do not rely on this map for this route; see the reasons.",
 }
 AREA_VERDICTS = {
