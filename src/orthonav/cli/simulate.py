@@ -87,8 +87,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--agl-std",
         type=float,
         default=0.0,
-        metavar="SHARE",
-        help="standard deviation of the reported height, as a share of it (default 0)",
+        metavar="FRACTION",
+        help="standard deviation of the reported height, as a fraction of it (default 0)",
     )
     errors.add_argument(
         "--tilt-std-deg",
