@@ -89,7 +89,7 @@ GROUPS = {
         ),
     },
     "try it without data": {
-        "demo": ("generate an area, build a map, simulate a flight, localize it and report", ""),
+        "demo": ("build a map, simulate a flight over other imagery, localize it and report", ""),
         "landscape": ("generate orthophotos of a landscape at several dates", "--out landscape"),
         "simulate": (
             "simulate a flight over an orthophoto of another year",
