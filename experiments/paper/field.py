@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from experiments.paper import matchers, views
 from experiments.paper.methods import Method, flown, methods
+from experiments.paper.results import FIELD
 from experiments.paper.runs import MB, Workplace, head, save
 from experiments.paper.scenes import Scene
 from orthonav.imagery.mosaic import Mosaic
@@ -33,7 +34,6 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.records import Fix, Prior, Telemetry, View
 
-KEY = "field"
 VIEWS = 20
 YAW_STD_DEG, AGL_STD, PRIOR_STD_PX = 5.0, 0.03, 40.0
 """Errors of the reported heading, height (share) and position (pixels of the map), all reported."""
@@ -74,7 +74,7 @@ def run(place: Workplace, scene: Scene) -> bool:
 
     Methods whose map has been built since are added to a result.
     """
-    out, maps = place.result(scene, KEY), maps_of(place, scene)
+    out, maps = place.result(scene, FIELD), maps_of(place, scene)
     if not maps:
         return False
     start, made = time.perf_counter(), head(place, scene, provenance("paper"))

@@ -30,10 +30,10 @@ from experiments.paper.results import (
     read,
     share,
 )
+from experiments.paper.runs import SWEPT_ON
 from experiments.paper.views import PLACEMENTS
 from orthonav.records import CONFIDENT
 
-SWEPT = "B"
 PROGRAM = "python -m experiments.paper"
 SHOWN_RULES = ("product best", "product weighted", "cosine best", "cosine neighbours")
 Cell = Callable[[Result], str]
@@ -198,7 +198,7 @@ def _joined(fractions: Iterable[float]) -> str:
 
 def rules(results: Sequence[Result]) -> list[Table]:
     """Rules of position and similarities on one trajectory."""
-    found = [each for each in results if each.plain.get("rules") and each.scene == SWEPT]
+    found = [each for each in results if each.plain.get("rules") and each.scene == SWEPT_ON]
     if not found:
         return []
     rows = []
@@ -213,7 +213,7 @@ def rules(results: Sequence[Result]) -> list[Table]:
         "and Akhloufi",
     )
     header = ("method", *SHOWN_RULES)
-    return [Table(f"Rules of position, {SWEPT}: accuracy at 15 m, %", header, rows, notes)]
+    return [Table(f"Rules of position, {SWEPT_ON}: accuracy at 15 m, %", header, rows, notes)]
 
 
 def sensitivity(results: Sequence[Result]) -> list[Table]:
@@ -264,7 +264,7 @@ def costs(results: Sequence[Result]) -> list[Table]:
     found = dict(by_scene(results))
     if not found:
         return []
-    scene = SWEPT if SWEPT in found else next(iter(found))
+    scene = SWEPT_ON if SWEPT_ON in found else next(iter(found))
     rows = []
     for each in best_words(found[scene]):
         plain = each.plain
