@@ -103,7 +103,14 @@ def seen(scene: Scene, localizer: Localizer, count: int) -> Iterator[Seen]:
     camera = views.camera_of(agl_m, gsd_m)
     places = views.places_en_m(localizer.tiles.centres_en_m, count)
     telemetry = Telemetry(
-        0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=YAW_STD_DEG, agl_std_m=AGL_STD * agl_m
+        0,
+        0.0,
+        0.0,
+        0.0,
+        agl_m,
+        yaw_std_deg=YAW_STD_DEG,
+        agl_std_m=AGL_STD * agl_m,
+        tilt_std_deg=0.0,
     )
     for ground in views.grounds(scene, localizer.sheet.frame, localizer.grid, places):
         turned, lower, *off = np.clip(rng.normal(size=4), -CLIPPED, CLIPPED)
