@@ -1,7 +1,7 @@
 # make demo    install into .venv and run all steps on a generated area
 # make test    install and run the tests; `make test EXTRAS=test` without PyTorch and Ray, whose tests
 #              are then skipped by name
-# make lint    style, types, import layers; rows of the paper's tables that are older than their code
+# make lint    style, types, import layers
 # make bench   measure speed, memory and accuracy, and compare with other methods
 # make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
@@ -39,7 +39,6 @@ lint: $(VENV)/.dev-installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/vulture
-	$(BIN)/python -m experiments.paper check
 
 format: $(VENV)/.dev-installed
 	$(BIN)/ruff check --fix .
