@@ -1,7 +1,7 @@
 """How many views of undisturbed flights become messages, over real imagery of two dates.
 
-`python -m benchmarks.undisturbed [--seeds N] [--jobs N] [--seconds S]` flies as the fault suite does,
-without a fault, over the scenes beside the checkout whose ground resolution is 1 to 2 m. A view over
+`python -m benchmarks.undisturbed [--seeds N] [--jobs N] [--seconds S]` flies as the fault suite
+does, without a fault, over real scenes whose ground resolution is 1 to 2 m. A view over
 ground that has changed shows the map no more, and must not become a message: so every view is also
 compared with the map at its true pose.
 """
