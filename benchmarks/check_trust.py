@@ -204,7 +204,7 @@ def fitted(found: Sequence[Outcome]) -> Recalibration:
             chance = np.where(each.right, predicted, 1 - predicted)
             total -= float(np.log(np.clip(chance, 1e-6, 1.0)).sum()) / counts[each.scene]
         off = values - np.array(astuple(PLAIN)[:4])
-        return total / len(scenes) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
+        return total / max(len(scenes), 1) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
 
     values = minimize(loss, np.array(astuple(PLAIN)[:4]), method="Nelder-Mead").x
     by = _recalibration(np.round(values, 2))
