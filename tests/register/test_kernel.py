@@ -10,13 +10,12 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.register import blocks, refine, search, sharpness, template
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.map_window import MapWindow
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
-from orthonav.core.register.scale_map import ScaleMap
 from orthonav.core.register.search import SearchWindow, bank, best_near
+from orthonav.core.register.window import MapWindow
 
 SHAPE = (256, 320)
 GROUND = Ground()

@@ -11,12 +11,12 @@ from scenes import Ground, random_poses, reference_of, templates_of
 from test_refine import GROUND, HOLES, REACH_PX, SHAPE, errors, moved, noisy, normalized_squares
 from test_registrar import VIEW_PX
 
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.refine import Refiner
 from orthonav.core.register.registrar import Registrar
 from orthonav.core.register.search import search
+from orthonav.core.register.window import Reference
 
 
 @pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())

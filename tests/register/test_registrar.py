@@ -19,9 +19,8 @@ from scenes import (
 )
 
 import orthonav.core.register.registrar as registrar_module
-from orthonav.core.register.evidence import COARSE, FINE
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.refine import Refiner
 from orthonav.core.register.registrar import (
     EXCLUSION_SHARE,
@@ -38,6 +37,7 @@ from orthonav.core.register.registrar import (
 )
 from orthonav.core.register.search import Candidate, bank, search
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import Reference
 
 SHAPE = (384, 448)
 VIEW = (96, 128)

@@ -15,7 +15,7 @@ from scenes import (
     turned_rad,
 )
 
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import (
     Bank,

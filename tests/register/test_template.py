@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import Ground, as_grey, reference_of, seen, templates_of
 
-from orthonav.core.register.evidence import COARSE, FINE, GROUPS, evidence
+from orthonav.core.register.channels import COARSE, FINE, GROUPS, channels_of
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import posed_channels, posed_half_px
 from orthonav.core.register.template import (
@@ -111,15 +111,15 @@ def test_what_blocks_add_up_to_is_the_whole(shape):
 def test_planes_turn_with_their_picture(quarters):
     """Clockwise: `rot90` turns a picture counter-clockwise, y being to the south."""
     grey = as_grey(seen(GROUND, PLACE, (60, 80)))
-    plain = evidence(grey, np.ones(grey.shape, bool))
+    plain = channels_of(grey, np.ones(grey.shape, bool))
     picture = np.ascontiguousarray(np.rot90(grey, -quarters))
-    turned = evidence(picture, np.ones(picture.shape, bool))
+    turned = channels_of(picture, np.ones(picture.shape, bool))
     planes = turned_planes(np.ascontiguousarray(np.rot90(plain, -quarters)), quarters * math.pi / 2)
     np.testing.assert_allclose(np.moveaxis(planes, 0, -1), turned, atol=2e-3)
 
 
 def test_planes_turned_back_are_the_same():
-    made = evidence(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
+    made = channels_of(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
     kept = made.copy()
     there = turned_planes(made, 0.7)
     np.testing.assert_allclose(

@@ -17,8 +17,8 @@ from orthonav.core.localize.resection import STEPS, Resection, moved_by_camera, 
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.core.register.blocks import block_scores
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.template import BLOCKS, ViewTemplates
+from orthonav.core.register.window import Reference
 
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Blocks are moved so far, pixels of each level, by the first fit and by those after it. 7 px of

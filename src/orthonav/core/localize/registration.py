@@ -32,9 +32,9 @@ from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import GreyPyramid, Reference
 from orthonav.core.register.refine import Placed
 from orthonav.core.register.registrar import Registered, Registrar
+from orthonav.core.register.window import GreyPyramid, Reference
 from orthonav.core.track.hypotheses import within
 
 ERROR_VARIANCE = 1.5

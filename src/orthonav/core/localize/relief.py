@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.prepared import MIN_AGL_STD, PreparedView
 from orthonav.core.records import DEFAULT_AGL_STD
+from orthonav.core.register.pose import SIGMAS, ScaleMap
 from orthonav.core.register.registrar import PosePrior
-from orthonav.core.register.scale_map import SIGMAS, ScaleMap
 
 MAP_NODES = 256
 """Nodes across the map of expected scales, at most."""

@@ -1,7 +1,7 @@
 """Moving a candidate to its best position, heading and scale, and judging it there.
 
-Gauss-Newton on the sum of squared differences between a view's evidence and the map's, each kind
-of evidence with its own gain, so that correlation is what is maximized; the step is found on the
+Gauss-Newton on the sum of squared differences between a view's channels and the map's, each kind
+of channels with its own gain, so that correlation is what is maximized; the step is found on the
 view's side, whose derivatives are made once (inverse compositional alignment, Baker and Matthews,
 IJCV 2004). The covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang
 and Zeger 1986): residuals of neighbouring pixels are not independent, so their scores are summed
@@ -17,13 +17,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import GROUPS
+from orthonav.core.register.channels import GROUPS
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.map_window import MapWindow
 from orthonav.core.register.pose import Pose, even_scale
-from orthonav.core.register.reference import Reference
-from orthonav.core.register.sums import FULLY_VALID, Sums, compared, sampled_planes
 from orthonav.core.register.template import BLOCKS, Template, by_steps, from_middle, gradients
+from orthonav.core.register.window import (
+    FULLY_VALID,
+    MapWindow,
+    Reference,
+    Sums,
+    compared,
+    sampled_planes,
+)
 
 Array = NDArray[np.float32]
 STEPS = 6
@@ -52,7 +57,7 @@ class Placed:
     """A view placed on the map.
 
     `score`: weighted sum of correlations times the square root of the pixels of the level that
-    it rests on; `correlations` of the kinds of evidence, `weighted` their weighted mean;
+    it rests on; `correlations` of the kinds of channels, `weighted` their weighted mean;
     `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
     `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
     standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
@@ -212,7 +217,7 @@ class SpreadSums(NamedTuple):
     - `observed` (4, 4): products of the view's derivatives by the steps and the map's.
     - `hessian` (4, 4): the Gauss-Newton matrix.
     - `blocks` (B * B, 7): by block of the view, the derivatives (4) of the score by the steps, the
-      products of view and map of both kinds of evidence, and the pixels that count.
+      products of view and map of both kinds of channels, and the pixels that count.
     """
 
     observed: NDArray[np.float64]
@@ -232,7 +237,7 @@ class SpreadSums(NamedTuple):
         return np.asarray(inverse @ spread @ inverse.T)
 
     def agreement(self) -> float:
-        """Share of the blocks of a view whose evidence correlates positively."""
+        """Share of the blocks of a view whose channels correlate positively."""
         sums, counts = self.blocks[:, 4] + self.blocks[:, 5], self.blocks[:, 6]
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0
@@ -257,7 +262,7 @@ def _bounded_inverse(
 class Comparison:
     """A view beside the map under one pose.
 
-    `correlations`, `squares` and `gains` by kind of evidence: the step is made of gain * map -
+    `correlations`, `squares` and `gains` by kind of channel: the step is made of gain * map -
     correlation^2 * view, so that its part of each kind is what moves the peak, weighted by what
     that kind can say: steps from the plain difference would fall short by the square of the
     correlation.

@@ -14,15 +14,14 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from orthonav.core.register.evidence import COARSE, FINE, EvidenceRecipe
+from orthonav.core.register.channels import COARSE, FINE, ChannelRecipe
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
+from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Placed, Refiner
-from orthonav.core.register.scale_map import ScaleMap
 from orthonav.core.register.search import PLACES_AT_ONCE, Candidate, SearchWindow, best_near
 from orthonav.core.register.sharpness import Sharpness, sharpness
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import Reference
 
 LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across
@@ -112,7 +111,7 @@ class Levels:
         look = max(0, min(round(math.log2(max(view_px, 1.0) / LOOK_PX)), levels - 1))
         return cls(min(look + 1, levels - 1), look, max(look - 1, 0))
 
-    def recipe(self, level: int) -> EvidenceRecipe:
+    def recipe(self, level: int) -> ChannelRecipe:
         """Parameters of the evidence at a level."""
         return COARSE if level > self.look else FINE
 
@@ -223,10 +222,10 @@ class Registrar:
         """`pool`: threads that share the candidates; None: the caller's alone."""
         self.reference = reference
         self._pool = pool
-        self._windows: dict[tuple[int, EvidenceRecipe, int], SearchWindow] = {}
+        self._windows: dict[tuple[int, ChannelRecipe, int], SearchWindow] = {}
         self._lock = threading.Lock()
 
-    def whole_window(self, level: int, recipe: EvidenceRecipe, view_px: float) -> SearchWindow:
+    def whole_window(self, level: int, recipe: ChannelRecipe, view_px: float) -> SearchWindow:
         """The whole sheet at a level, cached: views of about the same size share it."""
         side = _rounded_side(view_px / 2**level)
         key = (level, recipe, side)
@@ -242,7 +241,7 @@ class Registrar:
     def part_window(
         self,
         level: int,
-        recipe: EvidenceRecipe,
+        recipe: ChannelRecipe,
         view_px: float,
         centre_px: tuple[float, float],
         reach_px: float,

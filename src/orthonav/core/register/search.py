@@ -1,8 +1,8 @@
 """Candidates: where, and how turned and scaled, a view might lie in a window of the map.
 
-The view's evidence is laid on the window at every position at once by FFT, for each heading and
-scale of a bank. Evidence of the map is divided by its local energy beforehand, so that one
-backward transform gives the sum over all kinds of evidence. What comes out is the correlation
+The view's channels are laid on the window at every position at once by FFT, for each heading and
+scale of a bank. Channels of the map are divided by their local energy beforehand, so that one
+backward transform gives the sum over all kinds of channels. What comes out is the correlation
 times the square root of the pixels that it rests on: pure chance then gives values alike at every
 scale, whereas correlation alone favours small views.
 """
@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.core.geo.camera import counted_from_centres
-from orthonav.core.register.evidence import GROUPS
+from orthonav.core.register.channels import GROUPS
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.memory import thread_memory
-from orthonav.core.register.pose import Pose, even_scale, rotation
-from orthonav.core.register.reference import cut
-from orthonav.core.register.scale_map import ScaleMap
+from orthonav.core.register.pose import Pose, ScaleMap, even_scale, rotation
 from orthonav.core.register.template import Template, energy_of, turn_planes
+from orthonav.core.register.window import cut, thread_memory
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
@@ -88,7 +86,7 @@ class Candidate:
 
 
 class SearchWindow:
-    """A window of the map made ready to be searched: evidence (H, W, 4) at a level.
+    """A window of the map made ready to be searched: channels (H, W, 4) at a level.
 
     (`row`, `col`) is its first pixel on that level of the sheet; `view_px` about the side of the
     views that will be laid on it; within `margin_px` of the border no middle of a view is sought.
@@ -121,7 +119,7 @@ class SearchWindow:
 
     @cached_property
     def channels(self) -> Array:
-        """The evidence (H, W, 3) divided by its local energy."""
+        """The channels (H, W, 3) divided by their local energy."""
         return self._normalized()
 
     @cached_property
@@ -379,7 +377,7 @@ def largest_half_px(template: Template, poses: Sequence[tuple[float, float]]) ->
 def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     """Channels (3, P, P) of a template as the map would show them, its middle in theirs.
 
-    Each kind of evidence has the norm of its weight over `even_scale`, so that scores of all scales
+    Each kind of channel has the norm of its weight over `even_scale`, so that scores of all scales
     compare.
     """
     height, width = template.mask.shape

@@ -10,13 +10,13 @@ from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.core.localize.checks import check_footprint
 from orthonav.core.localize.rectify import downsampled, rectify_footprint
 from orthonav.core.records import Telemetry, View
-from orthonav.core.register.evidence import FINE, EvidenceRecipe
+from orthonav.core.register.channels import FINE, ChannelRecipe
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.refine import Placed
 from orthonav.core.register.registrar import Levels, PosePrior, Registrar
 from orthonav.core.register.search import bank, largest_half_px, search
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import Reference
 from orthonav.core.track import CameraDisplacement
 
 VIEW_PX = 160
@@ -112,7 +112,7 @@ class _ViewAsMap(Reference):
         """All levels are small."""
         return True
 
-    def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> NDArray[np.float32]:
+    def whole(self, level: int, recipe: ChannelRecipe = FINE) -> NDArray[np.float32]:
         """Evidence (H, W, 4) of a level."""
         return self._templates.at(level, recipe).values
 

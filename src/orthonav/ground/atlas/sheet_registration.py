@@ -24,12 +24,12 @@ from orthonav.core.localize.relief import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, View
-from orthonav.core.register.evidence import COARSE, FINE
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import GreyPyramid
 from orthonav.core.register.refine import Placed
 from orthonav.core.register.registrar import Registered
 from orthonav.core.register.search import Candidate
+from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.atlas.agreement import Placement, nearest_m
 from orthonav.ground.atlas.catalog import Atlas
 

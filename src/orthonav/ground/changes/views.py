@@ -20,7 +20,7 @@ from orthonav.core.localize.checks import check_view
 from orthonav.core.localize.prepared import PreparedView
 from orthonav.core.localize.registration import RegistrationLocalizer
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
-from orthonav.core.register.evidence import evidence
+from orthonav.core.register.channels import channels_of
 from orthonav.core.register.pose import Pose
 from orthonav.ground.changes.record import ChangeGrid
 
@@ -143,8 +143,8 @@ def _compared(
     rectified = view.rectified_at(level)
     shape = rectified.grey.shape
     map_grey, map_valid = _map_under(registration, pose, level, (shape[0], shape[1]))
-    mine = evidence(rectified.grey, rectified.valid)
-    theirs = evidence(map_grey, map_valid)
+    mine = channels_of(rectified.grey, rectified.valid)
+    theirs = channels_of(map_grey, map_valid)
     counts = (mine[..., _VALID] > 0) & (theirs[..., _VALID] > 0)
     numbers = _cell_numbers(registration, grid, pose, 2.0**level, (shape[0], shape[1]))
     inside = counts & (numbers >= 0)
