@@ -30,7 +30,7 @@ from benchmarks.trust_pictures import write_worst
 from benchmarks.trust_views import pairs, views_of
 from benchmarks.verdicts import percent
 from orthonav.core.files import write_text
-from orthonav.core.localize.registered import (
+from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,
     LEAST,

@@ -16,7 +16,7 @@ from orthonav.core.flight.fixes import read_results
 from orthonav.core.flight.identity import Identity, flight_digest, read_identity
 from orthonav.core.geo.camera import Camera
 from orthonav.core.grey import grey_levels
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Telemetry, View
 

@@ -52,7 +52,7 @@ Processors round single pixels differently. A change of the generator moves hous
 with them the figures of some quarter.
 """
 TILES = (
-    "src/orthonav/core/localize/match.py",
+    "src/orthonav/core/localize/tiles.py",
     "src/orthonav/core/localize/rectify.py",
     "src/orthonav/core/localize/tiles.py",
     "src/orthonav/search/*.py",

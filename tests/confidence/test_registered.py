@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.registered import (
+from orthonav.core.localize.confidence import (
     BEFORE_PHASE,
     BIAS_BEFORE_PHASE,
     CHANCES,

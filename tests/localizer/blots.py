@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.registered import Chances, RegisteredConfidence
+from orthonav.core.localize.confidence import Chances, RegisteredConfidence
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate_registration import RegistrationCalibration
 from orthonav.ground.imagery.mosaic import Mosaic

@@ -6,9 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthonav.core.localize.places import places_of
+from orthonav.core.localize.confidence import USUAL_CHANCES, USUAL_CONFIDENCE, places_of
 from orthonav.core.localize.plan import DEFAULT_PLAN, Search, SearchPlan
-from orthonav.core.localize.registered import USUAL_CHANCES, USUAL_CONFIDENCE
 from orthonav.core.localize.view_search import ViewSearch
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.refine import Placed

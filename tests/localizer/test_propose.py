@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.core.localize.propose import peak_poses
+from orthonav.core.localize.tiles import peak_poses
 from orthonav.core.register.search import bank
 
 STEP_RAD, SCALE_STEP = math.radians(8.0), 0.13

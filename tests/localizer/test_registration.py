@@ -21,8 +21,8 @@ from blots import (
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.candidates import ViewCandidates
+from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
-from orthonav.core.localize.registered import RegisteredConfidence
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View

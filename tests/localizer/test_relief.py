@@ -9,8 +9,8 @@ from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
 
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
+from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.plan import DEFAULT_PLAN
-from orthonav.core.localize.relief import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view

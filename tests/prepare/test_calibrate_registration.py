@@ -10,7 +10,7 @@ import pytest
 from helpers import textured
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.registered import (
+from orthonav.core.localize.confidence import (
     USUAL_CHANCES,
     USUAL_CONFIDENCE,
     RegisteredConfidence,

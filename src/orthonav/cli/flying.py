@@ -25,7 +25,7 @@ from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT
 from orthonav.core.track.tracker import Tracker

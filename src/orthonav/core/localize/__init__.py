@@ -28,8 +28,8 @@ between views, and
 """
 
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.match import Match, TileMatcher
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
+from orthonav.core.localize.tiles import Match, TileMatcher
 
 __all__ = [
     "Localizer",

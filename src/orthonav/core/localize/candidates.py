@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.localize.plan import Search, SearchPlan
-from orthonav.core.localize.prepared import PreparedView
-from orthonav.core.localize.propose import TileProposer
+from orthonav.core.localize.tiles import TileProposer
+from orthonav.core.localize.view import PreparedView
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.records import PRIOR_SIGMAS, Prior
 from orthonav.core.register.pose import rotation

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.checks import check_view
 from orthonav.core.localize.plan import DEFAULT_PLAN, SearchPlan
 from orthonav.core.localize.registration import RegistrationLocalizer
 from orthonav.core.localize.tiles import TileLocalizer
+from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Prior, View

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from orthonav.core.localize.camera import CameraFound, camera_found, tilt_std_deg
-from orthonav.core.localize.prepared import PreparedView
-from orthonav.core.localize.relief import LevelTerrain, Relief
-from orthonav.core.localize.relief_view import ReliefView
+from orthonav.core.localize.ground import LevelTerrain, Relief, ReliefView
+from orthonav.core.localize.view import PreparedView
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.refine import Placed, Refiner
 from orthonav.core.register.registrar import (

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.localize.camera import CameraFound, tilt_std_deg
 from orthonav.core.localize.candidates import ViewCandidates
+from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.ground import LevelTerrain, Relief
 from orthonav.core.localize.over_relief import ViewOnLevelGround, ViewOverRelief
 from orthonav.core.localize.plan import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.prepared import PreparedView, prepare
-from orthonav.core.localize.propose import TileProposer
 from orthonav.core.localize.rectify import is_oblique, off_nadir_deg
-from orthonav.core.localize.registered import RegisteredConfidence
-from orthonav.core.localize.relief import LevelTerrain, Relief
+from orthonav.core.localize.tiles import TileProposer
+from orthonav.core.localize.view import PreparedView, prepare
 from orthonav.core.localize.view_search import ViewSearch
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import SheetInfo

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from orthonav.core.localize.candidates import ViewCandidates
+from orthonav.core.localize.confidence import USUAL_CHANCES, Chances, RegisteredConfidence
 from orthonav.core.localize.over_relief import ViewOnLevelGround
 from orthonav.core.localize.plan import Budget, ClearMargin, Search
-from orthonav.core.localize.registered import USUAL_CHANCES, Chances, RegisteredConfidence
 from orthonav.core.register.refine import Placed
 from orthonav.core.register.registrar import KEPT_TO_FINISH, Registered
 

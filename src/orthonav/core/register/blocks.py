@@ -1,7 +1,7 @@
 """Blocks of a view beside the map: how well each fits when it is moved a little aside.
 
 A view that was rectified with the wrong tilt, relief or lens is distorted, so its blocks fit at
-different displacements. `orthonav.core.localize.resection` turns these into the camera.
+different displacements. `orthonav.core.localize.camera` turns these into the camera.
 """
 
 import math

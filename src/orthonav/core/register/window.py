@@ -1,7 +1,8 @@
 """The map as registration sees it: channels of windows, sampled under the pose of a view, and
 the sums over the pixels of both.
 
-The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not."""
+The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not.
+"""
 
 import math
 import threading

@@ -18,7 +18,6 @@ import numpy as np
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.core.track.evidence import Measurement, confirmed_ground, recognition, tempered
 from orthonav.core.track.hypotheses import (
     Hypothesis,
     distance,
@@ -28,6 +27,15 @@ from orthonav.core.track.hypotheses import (
     moved,
     within,
 )
+from orthonav.core.track.likelihood import (
+    Measurement,
+    confirmed_ground,
+    log_densities,
+    log_density,
+    recognition,
+    tempered,
+    updated,
+)
 from orthonav.core.track.model import (
     POSITION,
     SEEN,
@@ -36,9 +44,6 @@ from orthonav.core.track.model import (
     Model,
     ReportedAttitude,
     Sighting,
-    log_densities,
-    log_density,
-    updated,
 )
 from orthonav.core.track.motion import (
     CameraDisplacement,

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import axis_on_ground_en_m
-from orthonav.core.localize.checks import check_footprint
 from orthonav.core.localize.rectify import downsampled, rectify_footprint
+from orthonav.core.localize.view import check_footprint
 from orthonav.core.records import Telemetry, View
 from orthonav.core.register.channels import FINE, ChannelRecipe
 from orthonav.core.register.pose import Pose

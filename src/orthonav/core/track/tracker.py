@@ -17,12 +17,11 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize.camera import CameraFound
-from orthonav.core.localize.checks import check_view
+from orthonav.core.localize.confidence import places_of
+from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.places import places_of
-from orthonav.core.localize.prepared import PreparedView
 from orthonav.core.localize.registration import RegisteredView
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.view import PreparedView, check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation

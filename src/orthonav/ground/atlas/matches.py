@@ -9,9 +9,8 @@ within a sheet (`orthonav.core.register.registrar`).
 import math
 from collections.abc import Mapping, Sequence
 
-from orthonav.core.localize.logistic import logit
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE, logit
 from orthonav.core.localize.plan import DEFAULT_PLAN
-from orthonav.core.localize.registered import USUAL_CONFIDENCE
 from orthonav.core.register.registrar import HOPE, MIN_HOPEFUL
 from orthonav.ground.atlas.agreement import nearest_m
 from orthonav.ground.atlas.sheet_registration import (

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.candidates import ViewCandidates
-from orthonav.core.localize.prepared import PreparedView, prepare
-from orthonav.core.localize.registered import RegisteredConfidence
+from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.registration import RegistrationLocalizer
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.view import PreparedView, prepare
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, View

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OrthonavError
 from orthonav.core.flight.recording import Flight
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.checks import check_view
-from orthonav.core.localize.prepared import PreparedView
 from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.view import PreparedView, check_view
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
 from orthonav.core.register.channels import channels_of
 from orthonav.core.register.pose import Pose

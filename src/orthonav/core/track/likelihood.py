@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthonav.core.track.model import (
+    HEADING_FLOOR_RAD,
+    SCALE_FLOOR,
     SEEN,
+    WHITE_SHARE,
     Array,
     Model,
     ReportedAttitude,
     Sighting,
-    log_densities,
-    log_density,
-    measurement,
 )
 
 TRUSTED = (0.1, 0.5)
@@ -45,6 +45,51 @@ class Measurement:
     own_noise: Array
     alone: float
     log_chance: float
+
+
+def measurement(
+    model: Model, reported: ReportedAttitude, sighting: Sighting
+) -> tuple[Array, Array, Array]:
+    """A sighting as a measurement of `SEEN` (6,), and two covariances
+    (6, 6): of the errors of map and view, and of the telemetry noise, which is independent at every
+    view."""
+    noise = sighting.covariance.copy()
+    floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
+    noise[range(4), range(4)] += np.square(floor)
+    white = WHITE_SHARE * model.horizon_rad
+    independent = np.diag(np.square([0.0, 0.0, 0.0, 0.0, white, white]))
+    seen = sighting.mean.copy()
+    if reported.heading_rad is None:
+        seen[2] = 0.0
+        noise[2, :] = noise[:, 2] = 0.0
+        noise[2, 2] = math.pi**2
+    else:
+        seen[2] = math.remainder(seen[2] - reported.heading_rad, 2 * math.pi)
+    seen[4:] -= [reported.pitch_rad, reported.roll_rad]
+    return seen, noise, independent
+
+
+def updated(
+    mean: Array, covariance: Array, innovation: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Kalman update: posterior mean (.., 10) and covariance (.., 10, 10), by an innovation (.., 6)
+    and its covariance (.., 6, 6)."""
+    gain = np.linalg.solve(spread, SEEN @ covariance).swapaxes(-1, -2)
+    after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
+    moved = mean + (gain @ innovation[..., None])[..., 0]
+    return moved, (after + after.swapaxes(-1, -2)) / 2
+
+
+def log_densities(off: Array, spread: Array) -> Array:
+    """Natural logarithms (..) of the densities of Gaussians (.., N, N) at `off` (.., N)."""
+    _, log_det = np.linalg.slogdet(2 * math.pi * spread)
+    weighted = np.linalg.solve(spread, off[..., None])[..., 0]
+    return np.asarray(-0.5 * ((off * weighted).sum(axis=-1) + log_det))
+
+
+def log_density(off: Array, spread: Array) -> float:
+    """The same of one Gaussian."""
+    return float(log_densities(off, spread))
 
 
 def tempered(
