@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.ground import ReliefView
-from orthonav.core.localize.rectify import Orientation
+from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
+from orthonav.core.localize.rectify import Orientation, is_oblique
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.core.register.blocks import BlockScores, block_scores
 from orthonav.core.register.pose import Pose
@@ -340,9 +340,13 @@ class CameraFound:
     middle_covariance: Array | None
 
 
-def camera_found(seen: ReliefView, reference: Reference, pose: Pose) -> CameraFound | None:
+def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> CameraFound | None:
     """The camera of a view whose window lies at `pose`, its height counted from the mean ground of
-    that window; None where the ground is unknown or too few blocks are seen."""
+    that window; None where the reported tilt is exact or too few blocks are seen."""
+    if tilt_std_deg(seen.view.telemetry) == 0:
+        return None
+    if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
+        seen = ViewOverGround(Relief(LevelTerrain(), seen.relief.grid), seen.view)
     orientation, start = seen.orientation(pose), None
     if orientation is None:
         return None
@@ -379,7 +383,7 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
 
 
 def _fitted(
-    seen: ReliefView, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
+    seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> Resection | None:
     """A correction of `orientation`, under which the view is rectified: the first at the final
     level and a coarser one, others one level finer too."""
@@ -408,16 +412,16 @@ def _fitted(
 
 
 def _templates(
-    seen: ReliefView, pose: Pose, level: int, orientation: Orientation, *, first: bool
+    seen: ViewOverGround, pose: Pose, level: int, orientation: Orientation, *, first: bool
 ) -> ViewTemplates | None:
     """The view rectified under an orientation; over level ground the first is the search's."""
-    if first and seen.relief.is_level and not seen.is_oblique:
+    if first and seen.relief.is_level and not is_oblique(seen.view.view):
         return seen.view.templates
     return seen.templates_at(pose, level, orientation)
 
 
 def _middle_covariance(
-    seen: ReliefView, orientation: Orientation, covariance: Array
+    seen: ViewOverGround, orientation: Orientation, covariance: Array
 ) -> Array | None:
     """Covariance (2, 2), m2, of the ground that the middle of a view shows; None where unknown
     ground is next to it."""
@@ -429,9 +433,9 @@ def _middle_covariance(
     return slopes @ covariance @ slopes.T if np.isfinite(slopes).all() else None
 
 
-def _prior(seen: ReliefView, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:
+def _prior(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:
     """Expected correction (6,) of an orientation by telemetry, and its information (6, 6)."""
-    telemetry, prior = seen.view.picture_at(seen.view.levels.final).telemetry, seen.view.prior
+    telemetry, prior = seen.view.telemetry, seen.view.prior
     expected, std = 0.0, prior.log_scale_std
     if prior.scale_map is not None:
         expected, std = prior.scale_map.at(pose.x_px, pose.y_px), prior.scale_map.std

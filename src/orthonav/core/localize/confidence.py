@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.records import Fix, NoFix
-from orthonav.core.register.refine import Placed
-from orthonav.core.register.registrar import Registered, apart_px
 
 FEATURES = (
     "log_strength",
@@ -409,51 +407,18 @@ class Acceptance:
         return fix.evidence.get(self.criterion, math.nan)
 
 
-WORTH_LOG_ODDS = -12.0
-"""Less likely places are left out."""
-LEAST_PLACE = 1e-12
-"""Least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds."""
+def within(
+    mean: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    radius_m: float,
+    middle: NDArray[np.float64] | None = None,
+) -> float:
+    """Probability that a state lies within a radius of `middle` (2,), its own mean where None.
 
-
-def places_of(
-    found: Registered, confidence: RegisteredConfidence, near_px: float, searched_share: float
-) -> list[tuple[float, float, Placed]]:
-    """Log odds, probability by the view alone, and place: of the best place and of the other
-    finished ones that are farther than `near_px` from it.
-
-    A search of only a share of the map finds fewer rivals, and chance is lower: the log odds are
-    those within the area searched times `searched_share`, or, if less, those of a search of the
-    whole map whose rivals are what chance makes (docs/decisions/tracking.md).
+    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
     """
-    best, chances = found.evidence(), confidence.chances
-    least = {
-        "rival": chances.of_strength(best),
-        "look_rival": chances.look,
-        "fine_rival": chances.fine,
-    }
-    out: list[tuple[float, float, Placed]] = []
-    for score, placed in ((found.score, found.placed), *found.finalists):
-        if any(apart_px(placed, other) < near_px for *_, other in out):
-            continue
-        evidence = dict(best)
-        if out:
-            share = score / max(found.score, 1e-6)
-            evidence |= {
-                "strength": score,
-                "rival": found.score,
-                "look": found.look_score * share,
-                "look_rival": found.look_score,
-                "fine": math.nan,
-                "fine_rival": math.nan,
-            }
-        there = logit(confidence(evidence), LEAST_PLACE) + math.log(searched_share)
-        for name, value in least.items():
-            if not math.isnan(evidence[name]):
-                evidence[name] = max(evidence[name], value)
-        alone = confidence(evidence)
-        log_odds = min(there, logit(alone, LEAST_PLACE))
-        if out:  # the best place may have won in detail, against stronger scores elsewhere
-            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
-        if not out or log_odds > WORTH_LOG_ODDS:
-            out.append((log_odds, alone, placed))
-    return out
+    variance = float(covariance[0, 0] + covariance[1, 1]) / 2
+    away = 0.0 if middle is None else math.dist(mean[:2], middle)
+    if away > radius_m + 3 * math.sqrt(variance):
+        return 0.0
+    return 1 - math.exp(-(radius_m**2) / (2 * variance + away**2 + 1e-9))

@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.camera import enu_from_camera, undistort
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import sight_on_ground
-from orthonav.core.localize.rectify import Orientation, is_oblique, node_px, orthorectified
+from orthonav.core.localize.rectify import Orientation, node_px, orthorectified
 from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
 from orthonav.core.records import DEFAULT_AGL_STD
-from orthonav.core.register.pose import SIGMAS, Pose, ScaleMap
-from orthonav.core.register.registrar import PosePrior
+from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap
 from orthonav.core.register.template import ViewTemplates
 
 MAP_NODES = 256
@@ -83,7 +82,7 @@ class Relief:
 
     def expected(self, view: PreparedView) -> PosePrior:
         """The prior of a view with the scale expected at each place, by its height above sea."""
-        telemetry, prior = view.picture_at(view.levels.final).telemetry, view.prior
+        telemetry, prior = view.telemetry, view.prior
         below, agl_m = telemetry.below, telemetry.agl_m
         if below is None:
             return prior
@@ -93,7 +92,7 @@ class Relief:
         means, step_px = self._mean_heights(view.side_px)
         over = np.maximum(1 + (below.height_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
-        focal_std = view.picture_at(view.levels.final).camera.focal_std
+        focal_std = view.view.camera.focal_std
         std = max(math.hypot(own_m / agl_m, focal_std), MIN_AGL_STD)
         reach = min(float(np.abs(values).max()) + SIGMAS * std, SIGMAS * prior.log_scale_std)
         if below.std_m / agl_m > std:
@@ -134,7 +133,7 @@ LEVEL_PX = 0.2
 """Relief that displaces no ground of a window by more (pixels of the final level) is left out."""
 
 
-class ReliefView:
+class ViewOverGround:
     """One view over the ground of a sheet."""
 
     def __init__(self, relief: Relief, view: PreparedView) -> None:
@@ -147,11 +146,6 @@ class ReliefView:
         x, y = np.meshgrid(cols - valid.shape[1] / 2, rows - valid.shape[0] / 2)
         nodes = np.stack([x, y], axis=-1) * 2.0**view.levels.final
         self._reference_px = nodes[used] if used.any() else nodes.reshape(-1, 2)
-
-    @property
-    def is_oblique(self) -> bool:
-        """Whether the view is far off nadir."""
-        return is_oblique(self.view.picture_at(self.view.levels.final))
 
     def templates_at(
         self, pose: Pose, level: int, orientation: Orientation | None = None
@@ -175,7 +169,7 @@ class ReliefView:
         reference_m = self.reference_m(pose)
         if math.isnan(reference_m):
             return None
-        telemetry = self.view.picture_at(self.view.levels.final).telemetry
+        telemetry = self.view.telemetry
         above_m = telemetry.agl_m * math.exp(pose.log_scale)
         east, north = self.relief.en_m(pose.map_px(self.view.camera_px))
         position = np.array([east, north, reference_m + above_m])
@@ -190,6 +184,8 @@ class ReliefView:
 
     def is_level(self, pose: Pose) -> bool:
         """Whether relief displaces no ground of the window by a visible amount."""
+        if self.relief.is_level:
+            return True
         ground = self.relief.ground_m(pose.map_px(self._reference_px))
         orientation = self.orientation(pose)
         if orientation is None or not np.isfinite(ground).all():
@@ -214,7 +210,7 @@ class ReliefView:
             return pose
         east, north, above_sea_m = orientation.position_m.tolist()
         below_m = float(self.relief.terrain.at_en_m([east, north]))
-        agl_m = self.view.picture_at(self.view.levels.final).telemetry.agl_m
+        agl_m = self.view.telemetry.agl_m
         if not above_sea_m - below_m > 0:  # also where it is unknown
             return pose
         turned = replace(pose, log_scale=math.log((above_sea_m - below_m) / agl_m))

@@ -20,7 +20,7 @@ from orthonav.core.localize.view import check_rectified
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.search import Candidate
+from orthonav.core.register.search import Peak
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import Representation, embed_poses
 from orthonav.core.tiles.contract import ViewEmbedder
@@ -208,7 +208,7 @@ class TileProposer:
         weights: NDArray[np.float32],
         rows: NDArray[np.intp] | None,
         count: int,
-    ) -> list[Candidate]:
+    ) -> list[Peak]:
         """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
 
         `poses` are headings (rad) and log scales; scores are those of the embeddings, times the
@@ -230,7 +230,7 @@ class TileProposer:
             x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
             y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
             pose = Pose(x_px, y_px, turn_rad, log_scale)
-            found.append(Candidate(float(scores[place]), pose))
+            found.append(Peak(float(scores[place]), pose))
         return found
 
 

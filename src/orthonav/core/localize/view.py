@@ -3,9 +3,7 @@
 Views that cannot be placed are refused before any search, each by a `NoFix` with its reason.
 """
 
-import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -29,8 +27,8 @@ from orthonav.core.records import (
     Telemetry,
     View,
 )
-from orthonav.core.register.registrar import Levels, PosePrior
-from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.pose import PosePrior
+from orthonav.core.register.template import Levels, ViewTemplates
 
 MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
@@ -167,21 +165,36 @@ finer: it is no square, and on its coarse levels too little is left of it
 class PreparedView:
     """A view made ready for registration.
 
-    `picture_at`: the view averaged towards the ground resolution of a level. `rectified_at`: makes
-    the view rectified at the ground resolution of a level. `templates`: its evidence.
-    `levels`: levels of the map at which it is searched, judged and finished. `side_px`: root of the
-    area seen, in pixels of level 0. `camera_px` (2,): the camera as seen from the middle of the
-    view, heading up, x to the right and y down, in pixels of level 0. `prior`: expected heading and
-    scale.
+    `view`: as the camera saw it. `gsd_m`: ground resolution of level 0 of the map. `levels`: levels
+    of the map at which it is searched, judged and finished. `templates`: it rectified at the final
+    level. `side_px`: root of the area seen, in pixels of level 0. `camera_px` (2,): the camera as
+    seen from the middle of the view, heading up, x to the right and y down, in pixels of level 0.
+    `prior`: expected heading and scale.
     """
 
-    picture_at: Callable[[int], View]
-    rectified_at: Callable[[int], RectifiedView]
-    templates: ViewTemplates
+    view: View
+    gsd_m: float
     levels: Levels
+    templates: ViewTemplates
     side_px: float
     camera_px: NDArray[np.float64]
     prior: PosePrior
+    _pictures: dict[int, View]
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What was reported with the view."""
+        return self.view.telemetry
+
+    def picture_at(self, level: int) -> View:
+        """The view averaged towards the ground resolution of a level, made once."""
+        if level not in self._pictures:
+            self._pictures[level] = downsampled(self.view, self.gsd_m * 2**level)
+        return self._pictures[level]
+
+    def rectified_at(self, level: int) -> RectifiedView:
+        """The view rectified at the ground resolution of a level."""
+        return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)
 
 
 def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> PreparedView | NoFix:
@@ -197,31 +210,29 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
             return NoFix("too_small", "the view shows no ground that is near enough")
         nominal_m = NEAR_SHARE * math.sqrt(near.area_m2)
     levels = Levels.of(nominal_m / gsd_m, map_levels)
-
-    @functools.cache
-    def picture_at(level: int) -> View:
-        return downsampled(view, gsd_m * 2**level)
-
-    def rectified_at(level: int) -> RectifiedView:
-        multiple = 2 ** max(0, levels.coarse - level)
-        return rectify_footprint(picture_at(level), gsd_m=gsd_m * 2**level, multiple_px=multiple)
-
-    rectified = rectified_at(levels.final)
     unit_px = 2**levels.final
+    picture = downsampled(view, gsd_m * unit_px)
+    rectified = _rectified(picture, gsd_m, levels, levels.final)
     refused = check_footprint(rectified, unit_px, MIN_VIEW_PX)
     if refused is not None:
         return refused
     offset = rectified.offset_en_m / gsd_m
-    side_px = math.sqrt(float(rectified.valid.sum())) * unit_px
     return PreparedView(
-        picture_at,
-        rectified_at,
-        ViewTemplates(rectified.grey, rectified.valid, levels.final),
+        view,
+        gsd_m,
         levels,
-        side_px,
+        ViewTemplates(rectified.grey, rectified.valid, levels.final),
+        math.sqrt(float(rectified.valid.sum())) * unit_px,
         np.array([-offset[0], offset[1]]),
         pose_prior(telemetry, heading_known, camera.focal_std),
+        {levels.final: picture},
     )
+
+
+def _rectified(picture: View, gsd_m: float, levels: Levels, level: int) -> RectifiedView:
+    """A picture rectified at a level, its sides whole pixels of the coarse one."""
+    multiple = 2 ** max(0, levels.coarse - level)
+    return rectify_footprint(picture, gsd_m=gsd_m * 2**level, multiple_px=multiple)
 
 
 def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> PosePrior:

@@ -65,7 +65,9 @@ def even_scale(log_scale: float) -> float:
     return math.exp(log_scale / 2)
 
 
-Array = NDArray[np.float32]
+NAT_SCORE = 1.0
+"""Units of the score per nat of the prior of heading and scale
+(docs/decisions/registration.md)."""
 SIGMAS = 3.0
 """A place is compared under scales within so many standard deviations of the expected one."""
 HALF_STEP = 0.07
@@ -80,7 +82,7 @@ class ScaleMap:
     `std`: their standard deviation.
     """
 
-    values: Array
+    values: NDArray[np.float32]
     step_px: float
     std: float
 
@@ -91,7 +93,7 @@ class ScaleMap:
         col = min(max(round(x_px / self.step_px), 0), cols - 1)
         return float(self.values[row, col])
 
-    def over(self, level: int, row: int, col: int, shape: tuple[int, int]) -> Array:
+    def over(self, level: int, row: int, col: int, shape: tuple[int, int]) -> NDArray[np.float32]:
         """Log scales expected at the pixels of a window (H, W) of a level."""
         unit = 2.0**level / self.step_px
         matrix = np.array([[unit, 0, col * unit], [0, unit, row * unit]])
@@ -105,3 +107,38 @@ class ScaleMap:
         """Least and greatest expected log scale of the places where `log_scale` is compared."""
         off = SIGMAS * self.std + HALF_STEP
         return log_scale - off, log_scale + off
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Expected heading and scale: `turn_rad` (None: unknown), and standard deviations of both.
+
+    `scale_map`: the log scale expected at each place, with a deviation of its own; None where 0 is
+    expected everywhere.
+    """
+
+    turn_rad: float | None
+    turn_std_rad: float
+    log_scale_std: float
+    scale_map: ScaleMap | None = None
+
+    def cost(self, pose: Pose) -> float:
+        """What is subtracted from the score of a pose, by the prior."""
+        if self.scale_map is None:
+            return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
+        own = PosePrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
+        expected = self.scale_map.at(pose.x_px, pose.y_px)
+        return NAT_SCORE * own.nats(pose.turn_rad, pose.log_scale - expected)
+
+    def nats(
+        self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
+    ) -> float:
+        """Negative log density of a heading and scale, 0 at its peak.
+
+        Where they stand for all `within` (rad, log scale) around, that of the likeliest of those.
+        """
+        parts = [(log_scale, self.log_scale_std, within[1])]
+        if self.turn_rad is not None:
+            off = math.remainder(turn_rad - self.turn_rad, 2 * math.pi)
+            parts.append((off, self.turn_std_rad, within[0]))
+        return sum((max(abs(o) - w, 0.0) / max(std, 0.01)) ** 2 / 2 for o, std, w in parts)

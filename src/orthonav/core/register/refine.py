@@ -53,17 +53,15 @@ MIN_CURVATURE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A view placed on the map.
+class Fit:
+    """How well a view fits the map at a pose and a level.
 
     `score`: weighted sum of correlations times the square root of the pixels of the level that
     it rests on; `correlations` of the kinds of channels, `weighted` their weighted mean;
     `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
     `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
     standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
-    pixels), turn (rad) and log scale, where they were asked for; `window`: over relief, the pose
-    whose height is counted from the mean ground of the window, that of `pose` from the ground below
-    the camera.
+    pixels), turn (rad) and log scale, where they were asked for.
     """
 
     pose: Pose
@@ -76,12 +74,6 @@ class Placed:
     agreement: float = math.nan
     blocks_t: float = math.nan
     covariance: NDArray[np.float64] | None = None
-    window: Pose | None = None
-
-    @classmethod
-    def unjudged(cls, pose: Pose, level: int) -> "Placed":
-        """A proposed pose that was not judged yet."""
-        return cls(pose, level, math.nan, (), math.nan, math.nan, False)
 
 
 class Refiner:
@@ -105,28 +97,28 @@ class Refiner:
         small_step_px: float = SMALL_STEP_PX,
         *,
         with_covariance: bool = False,
-    ) -> Placed:
+    ) -> Fit:
         """The view at the best pose near `pose`, within a few pixels of the level.
 
         It ends where a step moves no part of the view by more than `small_step_px`.
         """
         window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
-        placed, step = self._refined(window, pose, steps, small_step_px)
+        fit, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
-            return placed
-        sums = self._spread(window, placed.pose)
-        to_map = self._to_map(placed.pose)
+            return fit
+        sums = self._spread(window, fit.pose)
+        to_map = self._to_map(fit.pose)
         covariance = np.asarray(to_map @ sums.covariance() @ to_map.T)
-        if not placed.converged:
+        if not fit.converged:
             # Still moving: its last step is an error of its own.
             covariance += np.outer(move := to_map @ step, move)
         return replace(
-            placed, covariance=covariance, agreement=sums.agreement(), blocks_t=sums.blocks_t()
+            fit, covariance=covariance, agreement=sums.agreement(), blocks_t=sums.blocks_t()
         )
 
     def _refined(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
-    ) -> tuple[Placed, Sequence[float]]:
+    ) -> tuple[Fit, Sequence[float]]:
         """The best pose of so many steps at most, and the last step (4,)."""
         if KERNEL is None:
             return self._refined_by_numpy(window, pose, steps, small_step_px)
@@ -134,7 +126,7 @@ class Refiner:
             *self._for_kernel(window, pose, steps, small_step_px)
         )
         numbers = score, correlations, weighted, overlap, bool(converged)
-        return Placed(Pose(*found), self.template.level, *numbers), step
+        return Fit(Pose(*found), self.template.level, *numbers), step
 
     def _for_kernel(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
@@ -150,7 +142,7 @@ class Refiner:
 
     def _refined_by_numpy(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
-    ) -> tuple[Placed, Sequence[float]]:
+    ) -> tuple[Fit, Sequence[float]]:
         """`_refined` without the kernel."""
         unit = 2.0**self.template.level
         converged, step = False, [0.0] * 4
@@ -167,7 +159,7 @@ class Refiner:
             converged = moves_px < small_step_px
             if converged:
                 break
-        return best.placed(converged), step
+        return best.fit(converged), step
 
     def _compared(self, window: MapWindow, pose: Pose) -> "Comparison":
         """The view beside the map under a pose."""
@@ -298,9 +290,9 @@ class Comparison:
         pixels = self.template.block_pixels
         return np.asarray((pixels - self._sums.left_pixels) / np.maximum(pixels, 1.0))
 
-    def placed(self, converged: bool) -> Placed:
+    def fit(self, converged: bool) -> Fit:
         """The numbers of this pose."""
-        return Placed(
+        return Fit(
             self.pose,
             self.template.level,
             self.score,

@@ -8,10 +8,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.channels import CHANNELS, FINE, GROUPS, ChannelRecipe, channel_planes
+from orthonav.core.register.channels import (
+    CHANNELS,
+    COARSE,
+    FINE,
+    GROUPS,
+    ChannelRecipe,
+    channel_planes,
+)
 from orthonav.core.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
+JUDGED_PX = 72.0
+"""A view is judged at the level where it is about so many pixels across
+(docs/decisions/registration.md)."""
 BLOCKS = 6
 """Blocks along one side of a view, in which residuals are taken as one (see `refine`)."""
 
@@ -215,6 +225,25 @@ def energy_of(values: Array) -> float:
     return float(flat @ flat)
 
 
+@dataclass(frozen=True)
+class Levels:
+    """Levels of the map at which a view is searched coarsely, judged, and finished."""
+
+    coarse: int
+    judged: int
+    final: int
+
+    @classmethod
+    def of(cls, view_px: float, levels: int) -> "Levels":
+        """Levels for a view of `view_px` pixels of level 0 across (root of its area)."""
+        judged = max(0, min(round(math.log2(max(view_px, 1.0) / JUDGED_PX)), levels - 1))
+        return cls(min(judged + 1, levels - 1), judged, max(judged - 1, 0))
+
+    def recipe(self, level: int) -> ChannelRecipe:
+        """Parameters of the channels at a level."""
+        return COARSE if level > self.judged else FINE
+
+
 class ViewTemplates:
     """A view's templates at the levels of a map, made when asked for.
 
@@ -230,6 +259,11 @@ class ViewTemplates:
     def valid(self) -> NDArray[np.bool_]:
         """What was seen (H, W), at the finest level."""
         return self._pictures[0][1]
+
+    @cached_property
+    def side_px(self) -> float:
+        """Root of the area of the view, in pixels of level 0."""
+        return math.sqrt(self.at(self.finest).pixels) * 2.0**self.finest
 
     def at(self, level: int, recipe: ChannelRecipe = FINE) -> Template:
         """The template at a level, `finest` or coarser."""

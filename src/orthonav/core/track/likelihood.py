@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthonav.core.localize.confidence import RegisteredConfidence, logit
+from orthonav.core.localize.place import Place
 from orthonav.core.track.model import (
     HEADING_FLOOR_RAD,
     SCALE_FLOOR,
@@ -27,6 +29,57 @@ SEARCHED_SIGMAS = 6.0
 """Width of the search over heading and scale, in standard deviations, from end to end."""
 MAX_LOG_ODDS = 7.0
 """Limit of the log odds of a single view."""
+WORTH_LOG_ODDS = -12.0
+"""Less likely places are left out."""
+LEAST_PLACE = 1e-12
+"""Least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds."""
+
+
+def places_of(
+    best: Place, confidence: RegisteredConfidence, near_px: float, searched_share: float
+) -> list[tuple[float, float, Place]]:
+    """Log odds, probability by the view alone, and place: of the best place and of its rivals that
+    are farther than `near_px` from it and from each other.
+
+    A search of only a share of the map finds fewer rivals, and chance is lower: the log odds are
+    those within the area searched times `searched_share`, or, if less, those of a search of the
+    whole map whose rivals are what chance makes (docs/decisions/tracking.md).
+    """
+    share, chances = math.log(searched_share), confidence.chances
+    chance = {
+        "rival": chances.of_strength(best.scores),
+        "look_rival": chances.look,
+        "fine_rival": chances.fine,
+    }
+    out: list[tuple[float, float, Place]] = []
+    for place in (best, *best.rivals):
+        if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
+            continue
+        scores = _as_rival(best, place) if out else best.scores
+        alone = confidence(
+            scores
+            | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
+        )
+        log_odds = min(logit(confidence(scores), LEAST_PLACE) + share, logit(alone, LEAST_PLACE))
+        if out:  # the best place may have won in detail, against stronger scores elsewhere
+            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
+        if not out or log_odds > WORTH_LOG_ODDS:
+            out.append((log_odds, alone, place))
+    return out
+
+
+def _as_rival(best: Place, place: Place) -> dict[str, float]:
+    """The scores of a rival as if it were the best place, and the best one its rival."""
+    share = place.score / max(best.score, 1e-6)
+    look = best.scores["look"]
+    return best.scores | {
+        "strength": place.score,
+        "rival": best.score,
+        "look": look * share,
+        "look_rival": look,
+        "fine": math.nan,
+        "fine_rival": math.nan,
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize.confidence import within
 from orthonav.core.records import CONFIDENT
 from orthonav.core.track.hypotheses import (
     Hypothesis,
@@ -25,7 +26,6 @@ from orthonav.core.track.hypotheses import (
     merged,
     moments,
     moved,
-    within,
 )
 from orthonav.core.track.likelihood import (
     Measurement,

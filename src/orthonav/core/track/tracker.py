@@ -17,16 +17,15 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize.camera import CameraFound
-from orthonav.core.localize.confidence import places_of
+from orthonav.core.localize.confidence import within
 from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.registration import RegisteredView
+from orthonav.core.localize.place import Place
+from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView, check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.refine import Placed
-from orthonav.core.register.registrar import Registered
 from orthonav.core.track import (
     CameraDisplacement,
     Estimate,
@@ -37,7 +36,7 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
-from orthonav.core.track.hypotheses import within
+from orthonav.core.track.likelihood import places_of
 from orthonav.core.track.model import (
     BIASES,
     HEADING,
@@ -470,14 +469,15 @@ class Tracker:
             camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
             telemetry=known,
         )
-        seen = self._registration.register(corrected, prior, self._heading_known)
-        if isinstance(seen, NoFix):
-            return seen
+        search = self._registration.search(corrected, prior, self._heading_known)
+        if isinstance(search, NoFix):
+            return search
         sightings, newness = [], max(1 - overlap, LEAST_NEW)
-        if not isinstance(seen.found, NoFix):
+        best = search.run()
+        if not isinstance(best, NoFix):
             area = math.inf if searched is None else math.pi * searched[1] ** 2
             share = min(area / self.mixture.area_m2, 1.0)
-            sightings = self._sightings(seen, seen.found, known, bias[1], share)
+            sightings = self._sightings(search, best, known, bias[1], share)
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
@@ -550,8 +550,8 @@ class Tracker:
 
     def _sightings(
         self,
-        seen: RegisteredView,
-        found: Registered,
+        search: Search,
+        best: Place,
         telemetry: Telemetry,
         log_scale: float,
         searched_share: float,
@@ -561,16 +561,16 @@ class Tracker:
         `telemetry`: corrected by the track; `log_scale`: what its height was corrected by.
         `searched_share`: share of the map that was searched.
         """
-        near_px = NEAR_SHARE * seen.prepared.side_px
-        places = places_of(found, self._confidence, near_px, searched_share)
+        near_px = NEAR_SHARE * search.view.side_px
+        places = places_of(best, self._confidence, near_px, searched_share)
         made = []
-        for log_odds, alone, placed in places:
+        for log_odds, alone, place in places:
             likely = log_odds > places[0][0] - LIKELY_NATS
-            camera = seen.camera(placed) if likely else None
+            camera = search.camera(place) if likely else None
             if camera is None:
-                mean, covariance = self._by_similarity(seen.prepared, placed, telemetry)
+                mean, covariance = self._by_similarity(search, place, telemetry)
             else:
-                mean, covariance = self._by_camera(seen.prepared, camera, telemetry)
+                mean, covariance = self._by_camera(search.view, camera, telemetry)
             mean[3] += log_scale
             if np.isfinite(covariance).all():
                 made.append(Sighting(mean, covariance, log_odds, alone))
@@ -593,20 +593,18 @@ class Tracker:
         return np.array([east, north, heading, scale, pitch, roll]), covariance
 
     def _by_similarity(
-        self, prepared: PreparedView, placed: Placed, telemetry: Telemetry
+        self, search: Search, place: Place, telemetry: Telemetry
     ) -> tuple[Array, Array]:
         """The same of a view that does not show its tilt."""
-        if placed.covariance is None:
-            again = self._registration.registrar.with_covariance(
-                prepared.templates, prepared.levels, placed
-            )
-            placed = replace(again, pose=placed.pose)
+        registration, pose, spread = self._registration, place.pose, place.fit.covariance
+        if spread is None:
+            spread = search.placer.covariance_at(pose)
         tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-        mean = np.concatenate([self._registration.seen_from(prepared, placed.pose), tilt_rad])
-        heading_deg = math.degrees(placed.pose.turn_rad)
+        mean = np.concatenate([registration.seen_from(search.view, pose), tilt_rad])
+        heading_deg = math.degrees(pose.turn_rad)
         lever = tilt_lever_m(replace(telemetry, yaw_deg=heading_deg))
         covariance = np.zeros((6, 6))
-        covariance[:4, :4] = self._registration.covariance(prepared, placed)
+        covariance[:4, :4] = registration.camera_covariance(search.view, pose, spread)
         covariance[:2, :2] += UNSEEN_TILT_RAD**2 * lever @ lever.T
         covariance[:2, 4:] = -(UNSEEN_TILT_RAD**2) * lever
         covariance[4:, :2] = covariance[:2, 4:].T

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.files import Progress
 from orthonav.core.localize.confidence import USUAL_TILES
-from orthonav.core.localize.plan import SearchPlan
-from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.policy import SearchPlan, SearchPolicy
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile
@@ -241,7 +241,7 @@ def registration_record(
     localizer = RegistrationLocalizer.of_map(
         made,
         TileProposer.of(tiles, embedding.embedder, inputs.representation),
-        SearchPlan(last_ms=SEARCH_MS),
+        SearchPlan(policy=SearchPolicy(last_ms=SEARCH_MS)),
     )
     assert localizer is not None
     crops = sheet.sampler.crops
