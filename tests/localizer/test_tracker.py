@@ -381,8 +381,8 @@ def test_the_pose_of_a_camera_is_the_inverse(localizer):
     registration = localizer.registration
     telemetry = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
     grey = rendered(GROUND, (20.0, -35.0), (33.0, 4.0, -7.0), AGL_M, WIDE)
-    view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
-    pose = registration.best(view, None).placed.pose
+    search = registration.search(View(grey, WIDE, telemetry))
+    view, pose = search.view, search.run().pose
     place = registration.camera_en_m(view, pose)
     again = registration.pose_of(view, np.array([*place, pose.turn_rad, pose.log_scale]))
     assert again.x_px == pytest.approx(pose.x_px) and again.y_px == pytest.approx(pose.y_px)
