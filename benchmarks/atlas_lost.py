@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 from pyproj import Transformer
 
@@ -36,7 +37,6 @@ from orthonav.atlas.tile_search import TileSearch
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
 from orthonav.records import CONFIDENT, Fix, Telemetry, View
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
 PAST, PRESENT = DEFAULT_DATES[2], DEFAULT_DATES[0]

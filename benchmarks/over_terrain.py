@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import ArrayLike, NDArray
 from rasterio.windows import Window
 
@@ -36,7 +37,6 @@ from orthonav.localizer.relief import Relief
 from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 from orthonav.simulate.perspective import Raster, random_relief, seen_view
 
 GROUPS = ("slopes", "wrong", "oblique")

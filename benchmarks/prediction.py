@@ -26,6 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES
 from numpy.typing import NDArray
 
 from benchmarks.inputs import DATA, file_of
@@ -40,7 +41,6 @@ from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, Prior
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
 WIDTHS_PX = (112, 160, 256)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES, generate_area, generate_heights
 from numpy.typing import ArrayLike, NDArray
 
 from orthonav.cli.heights import map_heights
@@ -32,7 +33,6 @@ from orthonav.onboard.run import Locator, SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area, generate_heights
 
 SLOPE, AGL_M, SPACING_M = 0.15, 200.0, 40.0
 CAMERA = Camera(640, 480, 560.0, 560.0, 320.0, 240.0)

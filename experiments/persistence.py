@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
 from orthonav.ground.check.persistence import (
@@ -24,7 +25,6 @@ from orthonav.ground.check.persistence import (
     terms,
 )
 from orthonav.register.evidence import FINE, evidence
-from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
 Array = NDArray[Any]
 SEEDS = (901, 902, 903, 904)

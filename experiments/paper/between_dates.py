@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
@@ -29,7 +30,6 @@ from orthonav.extras import needed
 from orthonav.files import replacing, write_text
 from orthonav.neural.means import Means, mixed_precision
 from orthonav.represent.canny import Canny
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 AREAS = ((101, 1.0), (102, 1.0), (103, 1.5), (104, 2.0), (105, 3.0), (106, 5.0))
 """Seed and ground resolution of the landscapes; those of the experiments have other seeds."""

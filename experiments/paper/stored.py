@@ -120,7 +120,7 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
 def _drawn() -> str:
     """Means and standard deviations of the grey levels of the quarters of some generated ground,
     at every date and resolution."""
-    from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
+    from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
     made, levels = Landscape(SEED), []
     west_m, north_m = (origin + off for origin, off in zip(ORIGIN_M, DRAWN_FROM_M, strict=True))

@@ -5,6 +5,9 @@ import math
 import cv2
 import numpy as np
 import pytest
+from lab.landscape import generate_area, generate_heights
+from lab.landscape.epoch import DEFAULT_DATES
+from lab.landscape.scene import Landscape
 from test_flight import FISH, LENS, PLAIN, SEEN
 
 from orthonav.errors import FlightError
@@ -12,9 +15,6 @@ from orthonav.flight import open_flight, read_image, read_truth
 from orthonav.geo.camera import Camera
 from orthonav.imagery.terrain import open_dem
 from orthonav.simulate.flight import SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import generate_area, generate_heights
-from orthonav.simulate.landscape.epoch import DEFAULT_DATES
-from orthonav.simulate.landscape.scene import Landscape
 from orthonav.simulate.perspective import Raster, met, rays_enu, seen_view
 from orthonav.simulate.render import render_view
 
