@@ -61,8 +61,8 @@ ELSEWHERE = {
     "confidence": 0.03,
     "std_m": 0.03,
 }
-"""On other processors, which round differently. Between AVX-512, AVX2 and SSE confident single views
-move by up to 5 cm, tracks by 9 cm, confidences by 0.02."""
+"""On other processors, which round differently. Between AVX-512, AVX2 and SSE, confident single
+views move by up to 5 cm, tracks by 9 cm, confidences by 0.02."""
 FLAT_CONFIDENCE, FLAT_TIMES = 0.5, 3.0
 """Elsewhere, fixes below this confidence may differ so much more: the score around them is nearly
 level, and rounding decides where its refinement ends (by up to 0.4 m)."""
