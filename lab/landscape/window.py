@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.noise import Float64
+from lab.landscape.noise import Float64
 
 Box = tuple[float, float, float, float]
 """West, south, east and north in metres from the landscape's origin."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.network import LineKind
-from orthonav.ground.simulate.landscape.noise import Float64
-from orthonav.ground.simulate.landscape.parcels import FIRST_YEAR, Boundary, LandCover
+from lab.landscape.network import LineKind
+from lab.landscape.noise import Float64
+from lab.landscape.parcels import FIRST_YEAR, Boundary, LandCover
 
 
 @dataclass(frozen=True, eq=False)

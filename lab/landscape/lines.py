@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.ground.simulate.landscape.network import LineKind
-from orthonav.ground.simulate.landscape.noise import Float64
-from orthonav.ground.simulate.landscape.window import Box, box_of
+from lab.landscape.network import LineKind
+from lab.landscape.noise import Float64
+from lab.landscape.window import Box, box_of
 
 _STEP_M = 12.0  # longest straight piece of a border; must be below the margin of a drawing
 HALF_WIDTH_M = {

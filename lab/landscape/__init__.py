@@ -6,9 +6,9 @@ with the years of changes), `crops` (appearance at a date), `surface` and `relie
 shadow), `hills`, `sensor`, and `scene` and `area`, which combine them.
 """
 
-from orthonav.ground.simulate.landscape.area import generate_area, generate_heights
-from orthonav.ground.simulate.landscape.epoch import DEFAULT_DATES, Epoch, Season
-from orthonav.ground.simulate.landscape.scene import GSD_RANGE_M, ORIGIN_M, Landscape
+from lab.landscape.area import generate_area, generate_heights
+from lab.landscape.epoch import DEFAULT_DATES, Epoch, Season
+from lab.landscape.scene import GSD_RANGE_M, ORIGIN_M, Landscape
 
 __all__ = [
     "DEFAULT_DATES",

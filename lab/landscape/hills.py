@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from orthonav.ground.simulate.landscape.noise import Float32, Float64, fractal_grid, key_of
+from lab.landscape.noise import Float32, Float64, fractal_grid, key_of
 
 WAVELENGTHS_M = (1700.0, 900.0, 500.0)
 BASE_M = 200.0

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from orthonav.ground.simulate.landscape.lines import Line, dense, make_line
-from orthonav.ground.simulate.landscape.network import CELL_M, Network
-from orthonav.ground.simulate.landscape.noise import Float64, UInt32, hash_u32, key_of, noise_at
-from orthonav.ground.simulate.landscape.parcels import (
+from lab.landscape.lines import Line, dense, make_line
+from lab.landscape.network import CELL_M, Network
+from lab.landscape.noise import Float64, UInt32, hash_u32, key_of, noise_at
+from lab.landscape.parcels import (
     FIRST_YEAR,
     Boundary,
     LandCover,
@@ -20,9 +20,9 @@ from orthonav.ground.simulate.landscape.parcels import (
     area_and_centre,
     long_axis,
 )
-from orthonav.ground.simulate.landscape.plants import Trees, plant
-from orthonav.ground.simulate.landscape.roofs import Buildings, build
-from orthonav.ground.simulate.landscape.window import Box, box_of
+from lab.landscape.plants import Trees, plant
+from lab.landscape.roofs import Buildings, build
+from lab.landscape.window import Box, box_of
 
 
 @dataclass(frozen=True, eq=False)

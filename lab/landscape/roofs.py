@@ -5,9 +5,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.network import Settlement
-from orthonav.ground.simulate.landscape.noise import Float64
-from orthonav.ground.simulate.landscape.parcels import FIRST_YEAR, LandCover
+from lab.landscape.network import Settlement
+from lab.landscape.noise import Float64
+from lab.landscape.parcels import FIRST_YEAR, LandCover
 
 _ROOF_RGB = np.array(
     [

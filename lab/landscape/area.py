@@ -11,14 +11,14 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.landscape.epoch import DEFAULT_DATES, Epoch
+from lab.landscape.hills import hills
+from lab.landscape.noise import Float32
+from lab.landscape.scene import ORIGIN_M, Landscape, check_gsd
+from lab.landscape.window import chunks
 from orthonav.core.errors import AreaError, OutputError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import not_written, replacing
-from orthonav.ground.simulate.landscape.epoch import DEFAULT_DATES, Epoch
-from orthonav.ground.simulate.landscape.hills import hills
-from orthonav.ground.simulate.landscape.noise import Float32
-from orthonav.ground.simulate.landscape.scene import ORIGIN_M, Landscape, check_gsd
-from orthonav.ground.simulate.landscape.window import chunks
 
 _BLOCK_PX = 512
 _WINDOW_PX = 1024  # a whole number of blocks, so that no block is compressed twice

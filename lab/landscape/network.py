@@ -11,7 +11,7 @@ from math import atan2, cos, hypot, pi
 
 import numpy as np
 
-from orthonav.ground.simulate.landscape.noise import Float64, key_of, noise_at, uniform_at
+from lab.landscape.noise import Float64, key_of, noise_at, uniform_at
 
 CELL_M = 800.0
 """Side of a macro-cell."""

@@ -4,20 +4,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
+from lab.landscape.__main__ import main
+from lab.landscape.network import Network
+from lab.landscape.noise import fractal_grid, key_of, noise_at, noise_grid, white_grid
+from lab.landscape.relief import lighting
+from lab.landscape.window import PixelWindow
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
-from orthonav.ground.simulate.landscape.network import Network
-from orthonav.ground.simulate.landscape.noise import (
-    fractal_grid,
-    key_of,
-    noise_at,
-    noise_grid,
-    white_grid,
-)
-from orthonav.ground.simulate.landscape.relief import lighting
-from orthonav.ground.simulate.landscape.window import PixelWindow
 
 SUMMER, AUTUMN, SPRING = DEFAULT_DATES
 WEST_M, NORTH_M = ORIGIN_M[0] + 600.0, ORIGIN_M[1] + 1500.0
@@ -211,6 +206,16 @@ def test_geotiff_has_position_and_date(tmp_path: Path):
         assert image.profile["compress"] == "deflate"
         pixels = np.moveaxis(image.read(), 0, 2)
     assert np.array_equal(pixels, Landscape(1).render(SUMMER, 652000.0, 6862150.0, 125, 75, 2.0))
+
+
+def test_the_command_writes_three_dates(tmp_path: Path, capsys):
+    out = tmp_path / "area"
+    main(["--out", str(out), "--size-m", "120", "100", "--gsd-m", "2"])
+    printed = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert sorted(printed) == sorted(out.iterdir()) and len(printed) == 3
+    with pytest.raises(SystemExit, match="error: size_m must be"):
+        main(["--out", str(tmp_path / "no"), "--size-m", "-5", "5"])
+    assert not (tmp_path / "no").exists()
 
 
 @pytest.mark.parametrize(

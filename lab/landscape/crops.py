@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.epoch import Epoch
-from orthonav.ground.simulate.landscape.noise import Float32, Float64, key_of, uniform
-from orthonav.ground.simulate.landscape.parcels import LandCover
-from orthonav.ground.simulate.landscape.plan import CellPlan
+from lab.landscape.epoch import Epoch
+from lab.landscape.noise import Float32, Float64, key_of, uniform
+from lab.landscape.parcels import LandCover
+from lab.landscape.plan import CellPlan
 
 # Share of the fields; display colours in spring, summer and autumn; rows of the crop: strength,
 # spacing (m), strength of the tractor lanes.

@@ -6,13 +6,12 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError
-from orthonav.ground.simulate.landscape.crops import appearance_of
-from orthonav.ground.simulate.landscape.epoch import Epoch
-from orthonav.ground.simulate.landscape.network import Network
-from orthonav.ground.simulate.landscape.noise import Float32
-from orthonav.ground.simulate.landscape.plan import CellPlan, make_plan, outline_box
-from orthonav.ground.simulate.landscape.relief import (
+from lab.landscape.crops import appearance_of
+from lab.landscape.epoch import Epoch
+from lab.landscape.network import Network
+from lab.landscape.noise import Float32
+from lab.landscape.plan import CellPlan, make_plan, outline_box
+from lab.landscape.relief import (
     lighting,
     paint_buildings,
     paint_orchards,
@@ -20,9 +19,10 @@ from orthonav.ground.simulate.landscape.relief import (
     paint_wood,
     shadow_reach_m,
 )
-from orthonav.ground.simulate.landscape.sensor import develop, expose
-from orthonav.ground.simulate.landscape.surface import label_parcels, paint_lines, paint_parcels
-from orthonav.ground.simulate.landscape.window import Box, PixelWindow, chunks
+from lab.landscape.sensor import develop, expose
+from lab.landscape.surface import label_parcels, paint_lines, paint_parcels
+from lab.landscape.window import Box, PixelWindow, chunks
+from orthonav.core.errors import AreaError
 
 ORIGIN_M = (652000.0, 6862000.0)
 """Lambert-93 (EPSG:2154) east and north of the landscape's origin."""

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.crops import Appearance
-from orthonav.ground.simulate.landscape.epoch import Epoch, Season
-from orthonav.ground.simulate.landscape.lines import Line, ribbon
-from orthonav.ground.simulate.landscape.network import LineKind, Network
-from orthonav.ground.simulate.landscape.noise import Float32, fractal_grid, key_of
-from orthonav.ground.simulate.landscape.plan import CellPlan
-from orthonav.ground.simulate.landscape.window import PixelWindow, box_of
+from lab.landscape.crops import Appearance
+from lab.landscape.epoch import Epoch, Season
+from lab.landscape.lines import Line, ribbon
+from lab.landscape.network import LineKind, Network
+from lab.landscape.noise import Float32, fractal_grid, key_of
+from lab.landscape.plan import CellPlan
+from lab.landscape.window import PixelWindow, box_of
 
 Mask = NDArray[np.uint8]
 Labels = NDArray[np.int32]

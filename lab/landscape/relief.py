@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.crops import Appearance
-from orthonav.ground.simulate.landscape.epoch import Epoch, Season
-from orthonav.ground.simulate.landscape.noise import (
+from lab.landscape.crops import Appearance
+from lab.landscape.epoch import Epoch, Season
+from lab.landscape.noise import (
     Float32,
     Float64,
     fractal_grid,
@@ -17,12 +17,12 @@ from orthonav.ground.simulate.landscape.noise import (
     noise_grid,
     uniform,
 )
-from orthonav.ground.simulate.landscape.parcels import LandCover
-from orthonav.ground.simulate.landscape.plan import CellPlan
-from orthonav.ground.simulate.landscape.plants import Trees, join
-from orthonav.ground.simulate.landscape.roofs import FLAT, Buildings
-from orthonav.ground.simulate.landscape.surface import Labels, Mask
-from orthonav.ground.simulate.landscape.window import PixelWindow
+from lab.landscape.parcels import LandCover
+from lab.landscape.plan import CellPlan
+from lab.landscape.plants import Trees, join
+from lab.landscape.roofs import FLAT, Buildings
+from lab.landscape.surface import Labels, Mask
+from lab.landscape.window import PixelWindow
 
 _LEVELS_PER_M = 8.0  # heights are drawn into bytes
 TALLEST_M = 26.0

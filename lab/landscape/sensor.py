@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.simulate.landscape.epoch import Epoch
-from orthonav.ground.simulate.landscape.noise import Float32, key_of, noise_grid, white_grid
-from orthonav.ground.simulate.landscape.window import PixelWindow
+from lab.landscape.epoch import Epoch
+from lab.landscape.noise import Float32, key_of, noise_grid, white_grid
+from lab.landscape.window import PixelWindow
 
 _SKY = np.array([0.40, 0.43, 0.48], np.float32)  # share of diffuse light, which shadows receive too
 _HAZE_RGB = np.array([196.0, 204.0, 214.0], np.float32)

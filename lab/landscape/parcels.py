@@ -12,7 +12,7 @@ from math import cos, hypot, pi, sin
 import cv2
 import numpy as np
 
-from orthonav.ground.simulate.landscape.network import LineKind, Network, Settlement
+from lab.landscape.network import LineKind, Network, Settlement
 
 Point = tuple[float, float]
 
