@@ -161,13 +161,13 @@ def test_the_search_stays_around_a_reported_start_unless_it_is_as_wide_as_the_ma
     localizer, monkeypatch, std_m, whole
 ):
     tracker, priors = Tracker(localizer), []
-    register = localizer.registration.register
+    search = localizer.registration.search
 
     def noted(view, prior=None, *others, **named):
         priors.append(prior)
-        return register(view, prior, *others, **named)
+        return search(view, prior, *others, **named)
 
-    monkeypatch.setattr(localizer.registration, "register", noted)
+    monkeypatch.setattr(localizer.registration, "search", noted)
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array([-150.0, -120.0]))
     prior = Prior(float(lat), float(lon), std_m)
     rows = []
