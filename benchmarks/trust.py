@@ -33,13 +33,13 @@ from orthonav.core.files import write_text
 from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,
-    LEAST,
     USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
     features_of,
 )
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.build.fit import LEAST
 from orthonav.ground.evaluate.calibration import calibrate
 
 RIDGE = 1e-5

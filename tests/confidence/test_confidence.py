@@ -12,10 +12,9 @@ from orthonav.core.localize.confidence import (
     TILE_FEATURES,
     USUAL_TILES,
     LogisticConfidence,
-    fit_few,
-    fit_logistic,
 )
 from orthonav.core.localize.tiles import MAX_RATIO, lowe_ratio, peak_ratio, rival_score
+from orthonav.ground.build.fit import fit_few, fit_logistic
 
 
 def scores(*values):

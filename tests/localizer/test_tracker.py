@@ -535,7 +535,6 @@ def test_exact_dead_reckoning_of_a_confirmed_track_is_confirmed_around_it(
     covariance = np.eye(STATE) * std_m**2
     expected = Estimate(np.zeros(STATE), covariance, 0.7, state, 0.5, 0.0, False, followed=True)
     tracker = Tracker(localizer)
-    areas = [tracker._search_area(expected) for _ in range(2)]
-    whole, around = areas
-    assert whole == (None, None, True)
-    assert around[0] is not None and around[2] is confirms
+    whole, around = (tracker._search_area(expected, whole_map=each) for each in (True, False))
+    assert whole == (None, True)
+    assert around.circle is not None and around.confirms is confirms

@@ -8,7 +8,7 @@ on each other too, which is odometry by the camera (`odometry`).
 import math
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,22 @@ SIGHT_STEPS = 4
 """Steps along the line of sight to the ground that a view shows. Each leaves a share of the error:
 the slope of the ground over that of the line."""
 Array = NDArray[np.float64]
+
+
+class SearchArea(NamedTuple):
+    """The part of the map that is searched: a `circle` (middle (2,), radius in metres), None for
+    all of it; and whether a place found there `confirms` the track."""
+
+    circle: tuple[Array, float] | None
+    confirms: bool
+
+    @property
+    def area_m2(self) -> float:
+        """Its area, infinite for all of the map."""
+        return math.inf if self.circle is None else math.pi * self.circle[1] ** 2
+
+
+WHOLE_MAP = SearchArea(None, True)
 
 
 class Tracker:
@@ -459,7 +475,10 @@ class Tracker:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
-        prior, searched, confirms = self._search_area(expected)
+        if expected is not None and expected.followed and self._must_compete(expected):
+            self._whole_map = not self._whole_map  # the whole map and the surroundings by turns
+        searched = self._search_area(expected, whole_map=self._whole_map)
+        prior = self._prior(searched)
         bias, spread = self._correction(telemetry, expected, prior)
         known = _known(corrected_by(telemetry, bias), spread)
         if prior is not None and expected is not None and telemetry.below is not None:
@@ -475,8 +494,7 @@ class Tracker:
         sightings, newness = [], max(1 - overlap, LEAST_NEW)
         best = search.run()
         if not isinstance(best, NoFix):
-            area = math.inf if searched is None else math.pi * searched[1] ** 2
-            share = min(area / self.mixture.area_m2, 1.0)
+            share = min(searched.area_m2 / self.mixture.area_m2, 1.0)
             sightings = self._sightings(search, best, known, bias[1], share)
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
@@ -484,7 +502,9 @@ class Tracker:
             math.radians(telemetry.roll_deg),
         )
         self._seen = sightings
-        self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
+        self.mixture.update(
+            attitude, sightings, newness, searched.circle, ground, confirms=searched.confirms
+        )
         return None
 
     def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
@@ -519,34 +539,31 @@ class Tracker:
             return expected.belief < LOCAL_SHARE
         return not (expected.state.is_followed and expected.confirmed)
 
-    def _search_area(
-        self, expected: Estimate | None
-    ) -> tuple[Prior | None, tuple[Array, float] | None, bool]:
-        """The part of the map to search, as a prior and as a circle (middle, radius), None for all,
-        and whether a place found there may confirm the track.
-
-        It is the surroundings of the predicted position where that is nearly certain. Where these
-        have to compete with the whole map, views are searched there and here by turns.
-        """
-        whole_map = None, None, True
+    def _search_area(self, expected: Estimate | None, *, whole_map: bool) -> SearchArea:
+        """The part of the map to search: the surroundings of the predicted position where that is
+        nearly certain, else all of it. `whole_map`: what to search where places there have to
+        compete with the whole map."""
         if expected is None or not expected.followed:
-            return whole_map  # an unconfirmed place must compete with the whole map
+            return WHOLE_MAP  # an unconfirmed place must compete with the whole map
         competes = self._must_compete(expected)
-        if competes:
-            self._whole_map = not self._whole_map
-            if self._whole_map:
-                return whole_map
-        elif expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE:
-            return whole_map
+        is_lost = expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE
+        if whole_map if competes else is_lost:
+            return WHOLE_MAP
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
-        reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
-        if 4 * reach**2 > self.mixture.area_m2 / 4:
-            return whole_map
-        lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
-        prior = Prior(float(lat), float(lon), reach / PRIOR_SIGMAS)
+        reach_m = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
+        if 4 * reach_m**2 > self.mixture.area_m2 / 4:
+            return WHOLE_MAP
         # Dead reckoning from a confirmed place that is still exact is as good as tracking.
-        exact = expected.state is not State.SEARCHING and reach <= MIN_LOCAL_M
-        return prior, (expected.mean[:2], reach), exact or not competes
+        exact = expected.state is not State.SEARCHING and reach_m <= MIN_LOCAL_M
+        return SearchArea((expected.mean[:2], reach_m), exact or not competes)
+
+    def _prior(self, area: SearchArea) -> Prior | None:
+        """An area as the prior of a search."""
+        if area.circle is None:
+            return None
+        middle, reach_m = area.circle
+        lat, lon = self._localizer.sheet.frame.latlon_from_en(middle)
+        return Prior(float(lat), float(lon), reach_m / PRIOR_SIGMAS)
 
     def _sightings(
         self,

@@ -21,11 +21,10 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import (
     TILE_FEATURES,
     LogisticConfidence,
-    fit_few,
-    fit_logistic,
 )
 from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.ground.build.fit import fit_few, fit_logistic
 
 CROPS = 192
 """Views searched; seconds per map."""

@@ -21,13 +21,13 @@ from orthonav.core.localize.confidence import (
     USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
-    fit_registered,
 )
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
 from orthonav.ground.build.calibrate import Crop
 from orthonav.ground.build.change import changed
+from orthonav.ground.build.fit import fit_registered
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
