@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from orthonav.core.flight.terrain_fit import TerrainFit
+from orthonav.core.flight.heights import TerrainFit
 from orthonav.core.records import Fix
 
 
@@ -48,7 +48,7 @@ def test_what_does_not_fit_is_named_once(terrain, named, caplog):
 
 def test_a_long_flight_is_judged_by_its_latest_views(caplog, monkeypatch):
     """A wrong datum is named once most of them lie on the part of the terrain that has it."""
-    monkeypatch.setattr("orthonav.core.flight.terrain_fit.MAX_VIEWS", 40)
+    monkeypatch.setattr("orthonav.core.flight.heights.MAX_VIEWS", 40)
 
     def joined(lat, lon):
         return np.where(np.asarray(lon) < 2.005, 200.0, 260.0)

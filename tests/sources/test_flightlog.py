@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from orthonav.core.errors import FlightError, OrthonavError
 from orthonav.core.flight import open_flight, read_image
-from orthonav.core.flight import png as png_module
+from orthonav.core.flight import logged as png_module
 from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
     PROFILE,
@@ -27,13 +27,13 @@ from orthonav.core.flight.logged import (
     VIEW,
     LoggedView,
     camera_plain,
+    lossless_png,
     picture_message,
     telemetry_message,
     to_json,
     view_of,
 )
 from orthonav.core.flight.mount import Bias, Mount, write_mount
-from orthonav.core.flight.png import lossless_png
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer

@@ -33,9 +33,8 @@ from recorders import (
 from orthonav.core.errors import FlightError
 from orthonav.ground.recordings import open_source
 from orthonav.ground.recordings.exif import read_photo
-from orthonav.ground.recordings.logs import read_log
-from orthonav.ground.recordings.photo_poses import poses_of
-from orthonav.ground.recordings.subtitles import read_srt
+from orthonav.ground.recordings.logs import read_log, read_srt
+from orthonav.ground.recordings.photos import poses_of
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = (

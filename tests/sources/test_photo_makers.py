@@ -13,11 +13,9 @@ from orthonav.core.geo.attitude import (
     GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.exif import read_photo
+from orthonav.ground.recordings.exif import Xmp, read_maker_notes, read_photo
 from orthonav.ground.recordings.focal import FocalLength, Optics, focal_length
-from orthonav.ground.recordings.makernotes import read_maker_notes
-from orthonav.ground.recordings.photo_poses import UNKNOWN_YAW_STD_DEG
-from orthonav.ground.recordings.xmp import Xmp
+from orthonav.ground.recordings.photos import UNKNOWN_YAW_STD_DEG
 
 MODEL, SOFTWARE, XMP_TAG, MAKER_NOTE = 0x0110, 0x0131, 700, 0x927C
 FIRMWARE, VIEWER = "v01.43.0039", "Microsoft Windows Photo Viewer 10.0"

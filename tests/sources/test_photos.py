@@ -25,7 +25,7 @@ from orthonav.core.records import Prior
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.exif import read_photo
 from orthonav.ground.recordings.focal import focal_length
-from orthonav.ground.recordings.photo_poses import poses_of
+from orthonav.ground.recordings.photos import poses_of
 from orthonav.ground.recordings.recording import LEVEL_GROUND
 
 SUBSEC, OFFSET = 0x9291, 0x9011

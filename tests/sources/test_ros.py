@@ -11,13 +11,13 @@ from bags import FORMATS, Messages, flight, record
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from orthonav.core.flight.ros_messages import camera_of_info, grey_of_image
 from recorders import START_S, camera_file, picture, px4_topics, ulog
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.ros_images import camera_of_info, grey_of_image
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 
 MIDDLE = (START_S * 2 + 1) * 5 * 10**8  # of the first image: half a second

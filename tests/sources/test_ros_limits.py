@@ -11,8 +11,8 @@ import zstandard
 from bags import Messages, flight, record
 
 from orthonav.core.errors import FlightError
-from orthonav.ground.recordings import import_flight, open_source, ros_limits
-from orthonav.ground.recordings.ros_limits import bound_inflation, check_held
+from orthonav.ground.recordings import import_flight, open_source, ros_files
+from orthonav.ground.recordings.ros_files import bound_inflation, check_held
 
 MB = 2**20
 
@@ -71,7 +71,7 @@ def test_chunks_of_ros_1(monkeypatch):
     bound_inflation()
     from rosbags.rosbag1 import reader
 
-    monkeypatch.setattr(ros_limits, "MAX_CHUNK_BYTES", MB)
+    monkeypatch.setattr(ros_files, "MAX_CHUNK_BYTES", MB)
     for name, pack in (("bz2", bz2.compress), ("lz4", lz4.frame.compress)):
         inflate = reader.decompressors[name]
         for size in (0, 1, MB):
@@ -127,6 +127,6 @@ def test_a_recording_whose_chunks_are_too_large(tmp_path, monkeypatch):
     messages = Messages()
     path = record(tmp_path / "flight", flight(messages), messages, "file")
     assert import_flight(open_source(path), tmp_path / "out").views == 4
-    monkeypatch.setattr(ros_limits, "MAX_HELD_BYTES", 1000)
+    monkeypatch.setattr(ros_files, "MAX_HELD_BYTES", 1000)
     with pytest.raises(FlightError, match=r"more than 1000\): .*mcap"):
         open_source(path)

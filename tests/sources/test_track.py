@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.flight.telemetry_track import (
     GAP_NS,
     RecordedTrack,
@@ -27,6 +26,7 @@ from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.records import Prior
 from orthonav.ground.recordings.recording import (
     LEVEL_GROUND_IN_GAPS,
+    SourceOptions,
     SourceView,
     check_overlap,
     fitted,

@@ -14,7 +14,7 @@ from orthonav.core.geo.attitude import (
     GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.subtitles import blocks, read_srt
+from orthonav.ground.recordings.logs import blocks, read_srt
 
 
 @pytest.fixture

@@ -42,13 +42,13 @@ from orthonav.core.flight.logged import (
     LoggedView,
     calibration_message,
     camera_plain,
+    lossless_png,
     navsat_message,
     picture_message,
     position_message,
     telemetry_message,
     to_json,
 )
-from orthonav.core.flight.png import lossless_png
 from orthonav.core.flight.recording import fitted
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import CONFIDENT, Fix, Telemetry, ViewResult

@@ -2,27 +2,40 @@
 
 import logging
 import math
+import os
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from orthonav.core.errors import CameraError, FlightError, lfs_pointer
+from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.flight.telemetry_track import RecordedTrack
-from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.attitude import (
+    ASSUMED_TILT_STD_DEG,
+    AUTOPILOT_TILT_STD_DEG,
+    GIMBAL_TILT_STD_DEG,
+    enu_from_gimbal_camera,
+)
+from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.ground.recordings.exif import Photo, read_photo
 from orthonav.ground.recordings.focal import FocalLength, focal_length
-from orthonav.ground.recordings.image_table import ImageRow
+from orthonav.ground.recordings.image_table import (
+    ImageRow,
+    ImageTable,
+    is_image_table,
+    read_image_table,
+)
 from orthonav.ground.recordings.logs import read_log
-from orthonav.ground.recordings.photo_files import SUFFIXES, ChosenPhotos
-from orthonav.ground.recordings.photo_poses import PhotoPose, poses_of
 from orthonav.ground.recordings.recording import (
     Recording,
+    SourceOptions,
     SourceView,
     check_overlap,
     given_camera,
@@ -36,9 +49,209 @@ from orthonav.ground.recordings.recording import (
     with_options,
 )
 
+log = logging.getLogger(__name__)
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+_MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
+
+
+def photo_paths(folder: Path) -> list[Path]:
+    """Photographs below a folder, hidden ones left out, by name."""
+    found = folder.rglob("*")
+    return sorted(
+        path
+        for path in found
+        if path.suffix.lower() in SUFFIXES
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+
+
+def is_photo(path: Path) -> bool:
+    """Whether a file begins as an image does."""
+    with path.open("rb") as stream:
+        return stream.read(8).startswith(_MAGICS)
+
+
+@dataclass(frozen=True)
+class ChosenPhotos:
+    """The images of a source: below `folder`, with the table that describes them, if any.
+
+    `singly`: whether they were named one by one, by the user or by the table. Then they need no
+    time, and a camera that looks straight down is assumed where nothing else is known.
+    """
+
+    folder: Path
+    paths: Sequence[Path]
+    table: ImageTable | None
+    singly: bool
+
+    @classmethod
+    def of(cls, sources: Sequence[Path], options: SourceOptions) -> "ChosenPhotos":
+        """The images of a folder, of a table in it, or those named."""
+        first, telemetry = sources[0], options.telemetry
+        table = None
+        if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
+            table = read_image_table(telemetry)
+        if len(sources) == 1 and first.is_dir():
+            paths = photo_paths(first)
+            if table is None and telemetry is None:
+                table = image_table_in(first, paths)
+            return cls(first, paths, table, table is not None)
+        if len(sources) == 1 and is_image_table(first):
+            return cls(first.parent, photo_paths(first.parent), read_image_table(first), True)
+        for path in sources:
+            if not is_photo(require_file(path, "photograph")):
+                raise FlightError(f"expected photographs, where several files are given: {path}")
+        folder = Path(os.path.commonpath([path.resolve().parent for path in sources]))
+        return cls(folder, [path.resolve() for path in sources], table, True)
+
+
+def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
+    """The table that lies in a folder and names some of these photographs below it.
+
+    Raises `FlightError` where there are several.
+    """
+    names = [path.relative_to(folder).as_posix() for path in photos]
+    found = []
+    for path in sorted(path for path in folder.iterdir() if is_image_table(path)):
+        table = read_image_table(path)
+        if any(table.row(name) for name in names):
+            found.append(table)
+        else:
+            log.warning("table that names none of the photographs is not used: %s", path)
+    if len(found) > 1:
+        several = ", ".join(table.path.name for table in found[:5])
+        raise FlightError(
+            f"folder has several tables of images ({several}); give one by --telemetry: {folder}"
+        )
+    return found[0] if found else None
+
+
+UNKNOWN_YAW_STD_DEG = 180.0
+"""Standard deviation of a heading that may be off by any angle."""
+_TURNED_DEG = 5.0
+"""A gimbal follows the aircraft within a few degrees; at more it would not report 0."""
+_OPPOSED_DEG = 135.0
+_EDITOR = re.compile(
+    r"microsoft|windows|photo\s*(?:viewer|shop|gallery|scape)|lightroom|gimp|picasa|paint|irfan"
+    r"|acdsee|xnview|magick|digikam|darktable|rawtherapee|affinity|capture one|snapseed|preview"
+    r"|pixelmator|faststone|zoner|corel|gthumb|shotwell|polarr|gwenview|nomacs|apple|google",
+    re.IGNORECASE,
+)
+"""Programs that show, turn or develop photographs."""
+_FIRMWARE = re.compile(r"[vV]?\d+(?:\.\d+)+")
+
+
+@dataclass(frozen=True)
+class PhotoPose:
+    """Attitude of a photograph in the convention of orthonav; NaN where it is unknown."""
+
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+    yaw_std_deg: float | None = None
+    """Standard deviation of the heading, None for the usual one."""
+    tilt_std_deg: float | None = None
+    """Standard deviation of pitch and roll by what recorded them, None where they are unknown."""
+
+
+def poses_of(photos: Sequence[Photo]) -> tuple[list[PhotoPose], list[str]]:
+    """The attitude of each photograph of a flight, and warnings for people.
+
+    Photographs of one camera are judged together: a gimbal that is level and points north in all of
+    them, whatever the heading of the aircraft, was not recorded. The camera then looks straight
+    down, with the heading of the aircraft.
+    """
+    cameras: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+    for number, photo in enumerate(photos):
+        cameras[photo.optics.make, photo.optics.model].append(number)
+    unrecorded = {
+        number
+        for numbers in cameras.values()
+        if _is_unrecorded([photos[each] for each in numbers])
+        for number in numbers
+    }
+    poses = [
+        _level(photo) if number in unrecorded else _pose(photo)
+        for number, photo in enumerate(photos)
+    ]
+    warnings = []
+    if unrecorded:
+        warnings.append(
+            f"gimbal angles of {len(unrecorded)} photographs are all 0, so they were not recorded: "
+            "heading of the aircraft and a camera that looks straight down assumed"
+        )
+    edited = _edited(photos)
+    if edited:
+        warnings.append(_edited_warning(photos, poses, edited))
+    for number in edited:
+        poses[number] = replace(poses[number], yaw_std_deg=UNKNOWN_YAW_STD_DEG)
+    return poses, warnings
+
+
+def _level(photo: Photo) -> PhotoPose:
+    """The attitude of a camera that is assumed to look straight down."""
+    return PhotoPose(photo.body_yaw_deg % 360, 0.0, 0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG)
+
+
+def _pose(photo: Photo) -> PhotoPose:
+    rotation, tilt_std_deg = photo.rotation, AUTOPILOT_TILT_STD_DEG
+    if photo.gimbal_deg is not None:
+        rotation, tilt_std_deg = enu_from_gimbal_camera(photo.gimbal_deg), GIMBAL_TILT_STD_DEG
+    if rotation is None:
+        return PhotoPose(photo.body_yaw_deg % 360)
+    return PhotoPose(*attitude_of(rotation), tilt_std_deg=tilt_std_deg)
+
+
+def _is_unrecorded(photos: Sequence[Photo]) -> bool:
+    """Whether the gimbal reports 0, 0, 0 in all photographs while the aircraft is turned."""
+    if any(photo.gimbal_deg is None or any(photo.gimbal_deg) for photo in photos):
+        return False
+    return any(abs(_signed(photo.body_yaw_deg)) > _TURNED_DEG for photo in photos)
+
+
+def _edited(photos: Sequence[Photo]) -> list[int]:
+    """Numbers of the photographs that an editor has written, which may have turned them."""
+    usual, count = Counter(photo.software for photo in photos).most_common(1)[0]
+    named = _FIRMWARE.match(usual) is not None and 2 * count > len(photos)
+    return [
+        number
+        for number, photo in enumerate(photos)
+        if _EDITOR.search(photo.software)
+        or (named and photo.software and not _FIRMWARE.match(photo.software))
+    ]
+
+
+def _edited_warning(
+    photos: Sequence[Photo], poses: Sequence[PhotoPose], edited: Sequence[int]
+) -> str:
+    text = (
+        f"{len(edited)} of {len(photos)} photographs were written by an editor "
+        f"({photos[edited[0]].software}); one that was turned there has kept its angles, "
+        "so the heading of these is taken as unknown"
+    )
+    rest = [pose.yaw_deg for number, pose in enumerate(poses) if number not in set(edited)]
+    mean = _mean_deg(rest)
+    opposed = [abs(_signed(poses[each].yaw_deg - mean)) > _OPPOSED_DEG for each in edited]
+    if all(opposed) and not math.isnan(mean):
+        text += "; they were flown against the direction of the rest"
+    return text
+
+
+def _mean_deg(headings: Sequence[float]) -> float:
+    """Mean direction; NaN where there is none."""
+    known = np.radians([heading for heading in headings if math.isfinite(heading)])
+    if not known.size:
+        return math.nan
+    return math.degrees(math.atan2(np.sin(known).sum(), np.cos(known).sum()))
+
+
+def _signed(angle_deg: float) -> float:
+    return (angle_deg + 180) % 360 - 180
+
+
 _BY_NAME_NS = 10**9
 """Spacing of photographs without a time, which are ordered by name."""
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 Messages: https://docs.ros.org/en/rolling/p/sensor_msgs/, axes: REP 103 and REP 105.
 """
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,26 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight.recording import fitted
-from orthonav.core.flight.ros_images import camera_of_info, grey_of_message
-from orthonav.core.flight.ros_topics import Topics, find_topics
-from orthonav.core.flight.ros_track import read_track, stamp_ns
-from orthonav.core.flight.source_options import SourceOptions
-from orthonav.core.flight.telemetry_track import RecordedTrack
+from orthonav.core.flight.ros_messages import (
+    attitude_of_message,
+    camera_of_info,
+    grey_of_message,
+    height_of_message,
+    stamp_ns,
+)
+from orthonav.core.flight.telemetry_track import (
+    RecordedTrack,
+    Samples,
+    TimeSeries,
+    altitude_series,
+    attitude_series,
+)
+from orthonav.core.geo.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.recordings.logs import read_log
 from orthonav.ground.recordings.recording import (
     Recording,
+    SourceOptions,
     SourceView,
     check_overlap,
     given_camera,
@@ -30,6 +43,110 @@ from orthonav.ground.recordings.recording import (
     with_mean_velocities,
 )
 from orthonav.ground.recordings.ros_files import opened
+
+TYPES: dict[str, tuple[str, ...]] = {
+    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    "camera_info": ("sensor_msgs/msg/CameraInfo",),
+    "attitude": (
+        "sensor_msgs/msg/Imu",
+        "nav_msgs/msg/Odometry",
+        "geometry_msgs/msg/PoseStamped",
+    ),
+    "velocity": ("nav_msgs/msg/Odometry",),
+    "position": ("sensor_msgs/msg/NavSatFix",),
+    "height": (
+        "sensor_msgs/msg/Range",
+        "mavros_msgs/msg/Altitude",
+        "std_msgs/msg/Float64",
+        "std_msgs/msg/Float32",
+    ),
+}
+_PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
+log = logging.getLogger(__name__)
+_HOME_NAMES = ("rel_alt", "relative_altitude")
+_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
+
+
+@dataclass(frozen=True, eq=False)
+class Topics:
+    """The connection of each role that was found, and all candidates for attitude."""
+
+    image: Any
+    roles: Mapping[str, Any]
+    attitudes: tuple[Any, ...]
+    connections: tuple[Any, ...]
+
+    def of(self, connection: Any) -> list[Any]:
+        """All connections on the topic of one (bags split or appended have several)."""
+        return [one for one in self.connections if one.topic == connection.topic]
+
+    def summary(self) -> str:
+        """Role and topic of each connection, for people."""
+        named = {"image": self.image, **self.roles}
+        return ", ".join(f"{role} {one.topic}" for role, one in named.items())
+
+
+def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
+    """The topics of a recording by role.
+
+    Raises `FlightError` where a requested topic is missing or has another type, and where there is
+    no image topic, or more than one.
+    """
+    connections = tuple(reader.connections)
+    counted = {one.topic: one for one in connections if one.msgcount}
+    found: dict[str, list[Any]] = {}
+    for role, types in TYPES.items():
+        if role in asked:
+            found[role] = [_asked(role, asked[role], counted, path)]
+        else:
+            of_type = [one for one in counted.values() if _fits(one, role)]
+            found[role] = sorted(
+                of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
+            )
+    images = found.pop("image")
+    if len(images) != 1:
+        found_names = ", ".join(sorted(one.topic for one in images))
+        if not images:
+            found_names = f"none among {', '.join(sorted(counted)) or 'no topic'}"
+        raise FlightError(
+            f"expected one topic of images, found {found_names}; give --topic: {path}"
+        )
+    infos = found["camera_info"]
+    near = [one for one in infos if _beside(one.topic, images[0].topic)]
+    found["camera_info"] = near or (infos if len(infos) == 1 else [])
+    roles = {role: ones[0] for role, ones in found.items() if ones}
+    return Topics(images[0], roles, tuple(found["attitude"]), connections)
+
+
+def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
+    if name not in counted:
+        raise FlightError(
+            f"no messages on {name}; available: {', '.join(sorted(counted)) or 'none'}: {path}"
+        )
+    if counted[name].msgtype not in TYPES[role]:
+        raise FlightError(
+            f"{name} carries {counted[name].msgtype}; {role} is one of "
+            f"{', '.join(TYPES[role])}: {path}"
+        )
+    return counted[name]
+
+
+def _fits(connection: Any, role: str) -> bool:
+    if connection.msgtype not in TYPES[role]:
+        return False
+    named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
+    return named or connection.msgtype not in _PLAIN_NUMBERS
+
+
+def is_above_home(topic: str) -> bool:
+    """Whether a topic of plain numbers has the height above take-off, by its name."""
+    return topic.rpartition("/")[2] in _HOME_NAMES
+
+
+def _beside(info: str, image: str) -> bool:
+    """Whether a camera_info is in the namespace of an image (image_raw/compressed too)."""
+    return image.startswith(info.rpartition("/")[0] + "/")
+
 
 _COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
@@ -135,3 +252,97 @@ def _view(
 
 def _broken(reason: str, where: str) -> NDArray[np.uint8]:
     raise FlightError(f"image message cannot be read ({reason}): {where}")
+
+
+def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
+    """The track of the selected topics.
+
+    The attitude is that of the first topic that has one (raw IMUs do not).
+    """
+    attitude: TimeSeries | None = None
+    for connection in topics.attitudes:
+        attitude = _attitude(reader, topics, connection, mount_deg)
+        if attitude is not None:
+            break
+    heights = _heights(reader, topics)
+    velocity = _collected(reader, topics, "velocity", 2, _velocity)
+    position = _collected(reader, topics, "position", 3, _position)
+    places = None if position is None else position.positions()
+    return RecordedTrack(
+        attitude=attitude,
+        heights=() if heights["agl"] is None else (heights["agl"],),
+        home=heights["home"],
+        amsl=heights["amsl"],
+        hae=altitude_series(places),  # sensor_msgs/NavSatFix
+        position=places,
+        velocity=None if velocity is None else velocity.series(),
+        origin_ns=0 if attitude is None else int(attitude.time_ns[0]),
+    )
+
+
+def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
+    """Time and message; damaged messages are skipped."""
+    for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
+        try:
+            message = reader.deserialize(raw, one.msgtype)
+        except Exception:  # a damaged message is one sample less
+            continue
+        yield stamp_ns(message, recorded_ns), message
+
+
+def _attitude(reader: Any, topics: Topics, connection: Any, mount_deg: Angles) -> TimeSeries | None:
+    samples = Samples(4)
+    for time_ns, message in _messages(reader, topics, connection):
+        turn = attitude_of_message(message)
+        if turn is not None:
+            samples.add(time_ns, *turn)
+    times, wxyz = samples.arrays()
+    enu_from_flu, sound = rotations_of_wxyz(wxyz)
+    return attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
+
+
+def _collected(
+    reader: Any,
+    topics: Topics,
+    role: str,
+    width: int,
+    values_of: Callable[[Any], tuple[float, ...] | None],
+) -> Samples | None:
+    if role not in topics.roles:
+        return None
+    samples = Samples(width)
+    for time_ns, message in _messages(reader, topics, topics.roles[role]):
+        values = values_of(message)
+        if values is not None:
+            samples.add(time_ns, *values)
+    return samples
+
+
+def _heights(reader: Any, topics: Topics) -> dict[str, TimeSeries | None]:
+    """Heights above ground (agl), take-off (home) and sea level (amsl)."""
+    found = {name: Samples(1) for name in ("agl", "home", "amsl")}
+    if "height" in topics.roles:
+        connection = topics.roles["height"]
+        for time_ns, message in _messages(reader, topics, connection):
+            if hasattr(message, "bottom_clearance"):
+                found["agl"].add(time_ns, message.bottom_clearance)
+                found["home"].add(time_ns, message.relative)
+                found["amsl"].add(time_ns, message.amsl)
+            elif (height := height_of_message(message)) is not None:
+                found["home" if is_above_home(connection.topic) else "agl"].add(time_ns, height)
+    return {name: samples.series() for name, samples in found.items()}
+
+
+def _velocity(message: Any) -> tuple[float, ...] | None:
+    """East and north velocity of an odometry, whose twist is in body axes."""
+    turn, twist = message.pose.pose.orientation, message.twist.twist.linear
+    for enu_from_flu in rotations_of_wxyz(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]:
+        east, north, _ = enu_from_flu @ [twist.x, twist.y, twist.z]
+        return float(east), float(north)
+    return None
+
+
+def _position(message: Any) -> tuple[float, ...] | None:
+    if message.status.status < 0:  # no fix
+        return None
+    return message.latitude, message.longitude, message.altitude
