@@ -3,7 +3,6 @@
 Messages: https://docs.ros.org/en/rolling/p/sensor_msgs/, axes: REP 103 and REP 105.
 """
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -61,8 +60,9 @@ TYPES: dict[str, tuple[str, ...]] = {
         "std_msgs/msg/Float32",
     ),
 }
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
 _PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
-log = logging.getLogger(__name__)
 _HOME_NAMES = ("rel_alt", "relative_altitude")
 _HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
 
@@ -112,7 +112,8 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
             f"expected one topic of images, found {found_names}; give --topic: {path}"
         )
     infos = found["camera_info"]
-    near = [one for one in infos if _beside(one.topic, images[0].topic)]
+    # In the namespace of the image (image_raw/compressed too).
+    near = [one for one in infos if images[0].topic.startswith(one.topic.rpartition("/")[0] + "/")]
     found["camera_info"] = near or (infos if len(infos) == 1 else [])
     roles = {role: ones[0] for role, ones in found.items() if ones}
     return Topics(images[0], roles, tuple(found["attitude"]), connections)
@@ -132,24 +133,8 @@ def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
 
 
 def _fits(connection: Any, role: str) -> bool:
-    if connection.msgtype not in TYPES[role]:
-        return False
     named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
-    return named or connection.msgtype not in _PLAIN_NUMBERS
-
-
-def is_above_home(topic: str) -> bool:
-    """Whether a topic of plain numbers has the height above take-off, by its name."""
-    return topic.rpartition("/")[2] in _HOME_NAMES
-
-
-def _beside(info: str, image: str) -> bool:
-    """Whether a camera_info is in the namespace of an image (image_raw/compressed too)."""
-    return image.startswith(info.rpartition("/")[0] + "/")
-
-
-_COMPRESSED = "sensor_msgs/msg/CompressedImage"
-_ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
+    return connection.msgtype in TYPES[role] and (named or connection.msgtype not in _PLAIN_NUMBERS)
 
 
 def open_ros(path: Path, options: SourceOptions) -> Recording:
@@ -218,36 +203,24 @@ def _camera(reader: Any, topics: Topics, path: Path) -> Camera:
 def _views(
     path: Path, topic: str, track: RecordedTrack, options: SourceOptions
 ) -> Iterator[SourceView]:
+    """The views; a damaged message raises when its image is decoded."""
     with opened(path) as (reader, _):
         connections = [one for one in reader.connections if one.topic == topic]
         messages = reader.messages(connections=connections)
         for number, (connection, time_ns, raw) in enumerate(messages):
-            yield _view(reader, (connection.msgtype, time_ns, raw), number, path, track, options)
-
-
-def _view(
-    reader: Any,
-    message: tuple[str, int, bytes],
-    number: int,
-    path: Path,
-    track: RecordedTrack,
-    options: SourceOptions,
-) -> SourceView:
-    """One view; a damaged message raises when its image is decoded."""
-    kind, time_ns, raw = message
-    where, data, ending = f"image {number} of {path}", None, ".png"
-    try:
-        image = reader.deserialize(raw, kind)
-        time_ns = stamp_ns(image, time_ns)
-        load = partial(grey_of_message, image, where)
-        if kind == _COMPRESSED:
-            encoded = np.asarray(image.data, dtype=np.uint8).tobytes()
-            starts = (name for start, name in _ENDINGS.items() if encoded.startswith(start))
-            ending, data = next(starts, ".bin"), partial(bytes, encoded)
-    except Exception as error:
-        load = partial(_broken, f"{type(error).__name__}: {error}", where)
-    telemetry, truth = known_at(track, time_ns + options.time_offset_ns, options)
-    return SourceView(f"{number:06d}{ending}", telemetry, truth, where, load, data)
+            where, data, ending = f"image {number} of {path}", None, ".png"
+            try:
+                image = reader.deserialize(raw, connection.msgtype)
+                time_ns = stamp_ns(image, time_ns)
+                load = partial(grey_of_message, image, where)
+                if connection.msgtype == _COMPRESSED:
+                    encoded = np.asarray(image.data, dtype=np.uint8).tobytes()
+                    starts = (name for start, name in _ENDINGS.items() if encoded.startswith(start))
+                    ending, data = next(starts, ".bin"), partial(bytes, encoded)
+            except Exception as error:
+                load = partial(_broken, f"{type(error).__name__}: {error}", where)
+            telemetry, truth = known_at(track, time_ns + options.time_offset_ns, options)
+            yield SourceView(f"{number:06d}{ending}", telemetry, truth, where, load, data)
 
 
 def _broken(reason: str, where: str) -> NDArray[np.uint8]:
@@ -261,27 +234,30 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
     """
     attitude: TimeSeries | None = None
     for connection in topics.attitudes:
-        attitude = _attitude(reader, topics, connection, mount_deg)
+        times, wxyz = _samples(reader, topics, connection, 4, attitude_of_message).arrays()
+        enu_from_flu, sound = rotations_of_wxyz(wxyz)
+        attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
         if attitude is not None:
             break
-    heights = _heights(reader, topics)
-    velocity = _collected(reader, topics, "velocity", 2, _velocity)
-    position = _collected(reader, topics, "position", 3, _position)
-    places = None if position is None else position.positions()
+    agl, home, amsl = _heights(reader, topics)
+    places = _samples(reader, topics, topics.roles.get("position"), 3, _position).positions()
+    velocity = _samples(reader, topics, topics.roles.get("velocity"), 2, _velocity)
     return RecordedTrack(
         attitude=attitude,
-        heights=() if heights["agl"] is None else (heights["agl"],),
-        home=heights["home"],
-        amsl=heights["amsl"],
+        heights=() if agl is None else (agl,),
+        home=home,
+        amsl=amsl,
         hae=altitude_series(places),  # sensor_msgs/NavSatFix
         position=places,
-        velocity=None if velocity is None else velocity.series(),
+        velocity=velocity.series(),
         origin_ns=0 if attitude is None else int(attitude.time_ns[0]),
     )
 
 
 def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
     """Time and message; damaged messages are skipped."""
+    if connection is None:
+        return
     for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
         try:
             message = reader.deserialize(raw, one.msgtype)
@@ -290,47 +266,33 @@ def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[in
         yield stamp_ns(message, recorded_ns), message
 
 
-def _attitude(reader: Any, topics: Topics, connection: Any, mount_deg: Angles) -> TimeSeries | None:
-    samples = Samples(4)
-    for time_ns, message in _messages(reader, topics, connection):
-        turn = attitude_of_message(message)
-        if turn is not None:
-            samples.add(time_ns, *turn)
-    times, wxyz = samples.arrays()
-    enu_from_flu, sound = rotations_of_wxyz(wxyz)
-    return attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
-
-
-def _collected(
+def _samples(
     reader: Any,
     topics: Topics,
-    role: str,
+    connection: Any,
     width: int,
     values_of: Callable[[Any], tuple[float, ...] | None],
-) -> Samples | None:
-    if role not in topics.roles:
-        return None
+) -> Samples:
     samples = Samples(width)
-    for time_ns, message in _messages(reader, topics, topics.roles[role]):
-        values = values_of(message)
-        if values is not None:
+    for time_ns, message in _messages(reader, topics, connection):
+        if (values := values_of(message)) is not None:
             samples.add(time_ns, *values)
     return samples
 
 
-def _heights(reader: Any, topics: Topics) -> dict[str, TimeSeries | None]:
-    """Heights above ground (agl), take-off (home) and sea level (amsl)."""
-    found = {name: Samples(1) for name in ("agl", "home", "amsl")}
-    if "height" in topics.roles:
-        connection = topics.roles["height"]
-        for time_ns, message in _messages(reader, topics, connection):
-            if hasattr(message, "bottom_clearance"):
-                found["agl"].add(time_ns, message.bottom_clearance)
-                found["home"].add(time_ns, message.relative)
-                found["amsl"].add(time_ns, message.amsl)
-            elif (height := height_of_message(message)) is not None:
-                found["home" if is_above_home(connection.topic) else "agl"].add(time_ns, height)
-    return {name: samples.series() for name, samples in found.items()}
+def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
+    """Heights above ground, take-off and sea level."""
+    agl, home, amsl = (Samples(1) for _ in range(3))
+    connection = topics.roles.get("height")
+    for time_ns, message in _messages(reader, topics, connection):
+        if hasattr(message, "bottom_clearance"):
+            agl.add(time_ns, message.bottom_clearance)
+            home.add(time_ns, message.relative)
+            amsl.add(time_ns, message.amsl)
+        elif (height := height_of_message(message)) is not None:
+            above_home = connection.topic.rpartition("/")[2] in _HOME_NAMES
+            (home if above_home else agl).add(time_ns, height)
+    return agl.series(), home.series(), amsl.series()
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:

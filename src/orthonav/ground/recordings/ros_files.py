@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -251,11 +252,7 @@ class _Ended(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        starts = {
-            io.SEEK_SET: 0,
-            io.SEEK_CUR: self._at,
-            io.SEEK_END: self._complete + len(self._end),
-        }
+        starts = 0, self._at, self._complete + len(self._end)
         self._at = max(0, starts[whence] + offset)
         return self._at
 
@@ -299,18 +296,14 @@ def check_held(readers: Iterable[Any]) -> None:
                 )
 
 
-def _most_held(chunks: Iterable[Any]) -> int:
+def _most_held(chunks: Sequence[Any]) -> int:
     """Largest total of chunks that overlap at one time."""
-    edges = []
-    for chunk in chunks:
-        start, end = chunk.message_start_time, chunk.message_end_time
-        edges += [(start, 0, chunk.uncompressed_size)]
-        edges += [(max(start, end), 1, -chunk.uncompressed_size)]
-    held = most = 0
-    for _, _, step in sorted(edges):
-        held += step
-        most = max(most, held)
-    return most
+    edges = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
+    edges += [
+        (max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size)
+        for chunk in chunks
+    ]
+    return max(accumulate(step for _, _, step in sorted(edges)), default=0)
 
 
 def _require(size: int) -> None:
