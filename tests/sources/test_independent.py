@@ -34,7 +34,7 @@ from orthonav.core.errors import FlightError
 from orthonav.ground.recordings import open_source
 from orthonav.ground.recordings.exif import read_photo
 from orthonav.ground.recordings.logs import read_log, read_srt
-from orthonav.ground.recordings.photos import poses_of
+from orthonav.ground.recordings.photos import posed
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = (
@@ -124,7 +124,8 @@ def compare(path):
 
 def compare_pose(ours, tags):
     """Heading and tilt: of the gimbal, of the body where a camera has none."""
-    (pose,), _ = poses_of([ours])
+    (photo,), _ = posed([ours])
+    pose = photo.pose
     heading = first(tags, "XMP-drone-dji:GimbalYawDegree", "DJI:CameraYaw", "XMP-sensefly:Heading")
     pitch = first(tags, "XMP-drone-dji:GimbalPitchDegree", "DJI:CameraPitch")
     ahead = pitch + 90 if math.isfinite(pitch) else first(tags, "XMP-sensefly:PitchAngle")

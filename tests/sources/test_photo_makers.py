@@ -198,9 +198,9 @@ def test_maker_notes_of_older_models(tmp_path, order):
 def test_maker_notes_that_hold_none(tmp_path):
     whole = maker_notes(yaw=1.0, camera_pitch=-90.0, camera_yaw=2.0, camera_roll=0.0)
     for data in (b"", b"\1", whole[:20], b"[ae_dbg_info:0]" * 9, maker_notes(yaw=float("nan"))):
-        assert read_maker_notes(data, "DJI").gimbal_deg is None
-    assert read_maker_notes(whole, "Canon").gimbal_deg is None
-    assert read_maker_notes(whole, "DJI\0").gimbal_deg == pytest.approx((2, -90, 0))
+        assert read_maker_notes(data, "DJI")[0] is None
+    assert read_maker_notes(whole, "Canon")[0] is None
+    assert read_maker_notes(whole, "DJI")[0] == pytest.approx((2, -90, 0))
 
 
 def test_the_heading_of_the_aircraft_without_a_gimbal(tmp_path):

@@ -25,7 +25,7 @@ from orthonav.core.records import Prior
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.exif import read_photo
 from orthonav.ground.recordings.focal import focal_length
-from orthonav.ground.recordings.photos import poses_of
+from orthonav.ground.recordings.photos import posed
 from orthonav.ground.recordings.recording import LEVEL_GROUND
 
 SUBSEC, OFFSET = 0x9291, 0x9011
@@ -34,7 +34,8 @@ FILM_NOTE = "focal length 44 px, good to 3 %: 35 mm equivalent of EXIF"
 
 def attitude(photo):
     """Heading, pitch and roll of a photograph by itself."""
-    (pose,), _ = poses_of([photo])
+    (photo,), _ = posed([photo])
+    pose = photo.pose
     return pose.yaw_deg, pose.pitch_deg, pose.roll_deg
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError, described
+from orthonav.core.flight.folder import BROKEN, camera_from_plain
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
@@ -295,17 +296,10 @@ def camera_plain(camera: Camera) -> dict[str, Any]:
 def camera_of(plain: Any) -> Camera:
     """Inverse of `camera_plain`. Raises `FlightError` or `CameraError`."""
     try:
-        return Camera(
-            width_px=_integer(plain["width_px"]),
-            height_px=_integer(plain["height_px"]),
-            **{name: _number(plain[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
-            distortion=tuple(_number(value) for value in plain["distortion"]),
-            model=str(plain["model"]),
-            focal_std=_number(plain.get("focal_std", 0.0)),
-        )
+        return camera_from_plain(plain)
     except CameraError:
         raise
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except BROKEN as error:
         raise FlightError(f"camera of the log is damaged: {described(error)}") from error
 
 

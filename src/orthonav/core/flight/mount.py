@@ -1,6 +1,6 @@
-"""Constant errors of a flight's telemetry: mounting of the camera, compass, height, focal length.
+"""Constant errors of a flight's telemetry, and the latency of its camera.
 
-`orthonav calibrate` estimates them from a flight and writes a small JSON file for later flights.
+`orthonav calibrate` estimates them and writes small JSON files for later flights.
 """
 
 import json
@@ -17,6 +17,11 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Telemetry
 
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
+MOST_MS = 12_000.0
+VERSION = 1
+MAX_BYTES = 100_000
+BROKEN = (KeyError, TypeError, ValueError, OverflowError)
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
@@ -123,40 +128,6 @@ def _bias(plain: dict[str, Any], name: str) -> Bias:
     return bias
 
 
-VERSION = 1
-MAX_BYTES = 100_000
-BROKEN = (KeyError, TypeError, ValueError, OverflowError)
-Record = TypeVar("Record")
-
-
-def write_record(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
-    """Write fields as JSON with the version in `orthonav_{kind}`, whole or not at all."""
-    plain = {f"orthonav_{kind}": VERSION, **fields}
-    write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-
-
-def read_record(path: Path, kind: str, command: str, from_plain: Callable[[Any], Record]) -> Record:
-    """Read what `write_record` wrote by `command`; `from_plain` raises one of `BROKEN`.
-
-    Raises `MissingFileError` or `FlightError`.
-    """
-    path = require_file(path, f"{kind} file")
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError("too large")
-        plain = json.loads(path.read_text(encoding="utf-8"))
-        if plain[f"orthonav_{kind}"] != VERSION:
-            raise ValueError(f"version {plain[f'orthonav_{kind}']}, expected {VERSION}")
-        return from_plain(plain)
-    except (*BROKEN, AttributeError, RecursionError, OSError) as error:
-        raise FlightError(
-            f"not a {kind} file of `{command}` ({described(error)}): {path}"
-        ) from error
-
-
-MOST_MS = 12_000.0
-
-
 @dataclass(frozen=True)
 class CameraLatency:
     """Time from exposure to arrival.
@@ -185,3 +156,28 @@ def _from_plain(plain: Any) -> CameraLatency:
     if not (0 <= found.latency_ms <= MOST_MS and 0 <= found.std_ms < math.inf):
         raise ValueError("latency out of range")
     return found
+
+
+def write_record(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
+    """Write fields as JSON with the version in `orthonav_{kind}`, whole or not at all."""
+    plain = {f"orthonav_{kind}": VERSION, **fields}
+    write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+
+
+def read_record(path: Path, kind: str, command: str, from_plain: Callable[[Any], Record]) -> Record:
+    """Read what `write_record` wrote by `command`; `from_plain` raises one of `BROKEN`.
+
+    Raises `MissingFileError` or `FlightError`.
+    """
+    path = require_file(path, f"{kind} file")
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError("too large")
+        plain = json.loads(path.read_text(encoding="utf-8"))
+        if plain[f"orthonav_{kind}"] != VERSION:
+            raise ValueError(f"version {plain[f'orthonav_{kind}']}, expected {VERSION}")
+        return from_plain(plain)
+    except (*BROKEN, AttributeError, RecursionError, OSError) as error:
+        raise FlightError(
+            f"not a {kind} file of `{command}` ({described(error)}): {path}"
+        ) from error

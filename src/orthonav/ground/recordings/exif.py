@@ -17,6 +17,7 @@ from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
 from orthonav.ground.recordings.focal import Optics
+from orthonav.ground.recordings.image_table import ImageRow
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_TAG, _MAKE, _MODEL, _SOFTWARE = 700, 0x010F, 0x0110, 0x0131
@@ -28,10 +29,24 @@ _ZOOM = 0xA404
 _QUARTER_HOUR = timedelta(minutes=15)
 
 
+@dataclass(frozen=True)
+class PhotoPose:
+    """Attitude of a photograph in the convention of orthonav; NaN where it is unknown."""
+
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+    yaw_std_deg: float | None = None
+    """Standard deviation of the heading, None for the usual one."""
+    tilt_std_deg: float | None = None
+    """Standard deviation of pitch and roll by what recorded them, None where they are unknown."""
+
+
 @dataclass(frozen=True, eq=False)
 class Photo:
     """Metadata of one photograph; NaN and None where it has none."""
 
+    path: Path
     width_px: int
     """Columns of the image."""
     height_px: int
@@ -66,6 +81,10 @@ class Photo:
     """Height above ground, where a table states it."""
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
+    row: ImageRow | None = None
+    """What a table says of it."""
+    pose: PhotoPose = PhotoPose()
+    """Its attitude, once all photographs of the flight are known."""
 
 
 def read_photo(path: Path) -> Photo:
@@ -85,25 +104,27 @@ def read_photo(path: Path) -> Photo:
     # Some thermal cameras have XMP in the Exif directory.
     xmp = Xmp.of(packet or tags.get(_XMP_TAG) or more.get(_XMP_TAG) or b"")
     make = _word(tags.get(_MAKE))
-    notes = read_maker_notes(_bytes(more.get(_MAKER_NOTE)), make)
+    notes = more.get(_MAKER_NOTE)
+    gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
     time_ns, zone_known = xmp.time_ns, True
     if time_ns is None:
         time_ns, zone_known = _time(tags, more, gps)
     latlon, alt = _place(gps)
     body_yaw = xmp.body_yaw_deg()
     if math.isnan(body_yaw) and not xmp.unread:
-        body_yaw = notes.body_yaw_deg
+        body_yaw = heading
     doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
     if latlon is None and _lacks_references(gps):
         doubts.append("GPS position without N or S, or without E or W")
     return Photo(
+        path=path,
         width_px=width,
         height_px=height,
         time_ns=time_ns,
         zone_known=zone_known,
         latlon_deg=xmp.latlon_deg() or latlon,
         alt_m=alt,
-        gimbal_deg=xmp.gimbal_deg() or notes.gimbal_deg,
+        gimbal_deg=xmp.gimbal_deg() or gimbal,
         rotation=xmp.rotation(make),
         body_yaw_deg=body_yaw,
         home_m=xmp.home_m(),
@@ -134,10 +155,6 @@ def _word(value: Any) -> str:
     return "" if value is None else str(value).strip("\0 ")
 
 
-def _bytes(value: Any) -> bytes:
-    return value if isinstance(value, bytes) else b""
-
-
 def _time(
     tags: dict[int, Any], more: dict[int, Any], gps: dict[int, Any]
 ) -> tuple[int | None, bool]:
@@ -163,11 +180,10 @@ def _time(
 
 
 def _offset(text: str) -> timedelta | None:
-    found = re.fullmatch(r"([+-])(\d\d):(\d\d)", text)
-    if found is None:
-        return timedelta() if text == "Z" else None
-    offset = timedelta(hours=int(found[2]), minutes=int(found[3]))
-    return -offset if found[1] == "-" else offset
+    try:
+        return datetime.strptime(text, "%z").utcoffset()
+    except ValueError:
+        return None
 
 
 def _gps_time(gps: dict[int, Any]) -> datetime | None:
@@ -218,27 +234,22 @@ _FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
 _BODY_YAW, _CAMERA_PITCH, _CAMERA_YAW, _CAMERA_ROLL = 7, 9, 10, 11
 
 
-@dataclass(frozen=True)
-class MakerNotes:
-    """Angles of maker notes, degrees."""
+def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float] | None, float]:
+    """Yaw, pitch and roll of the gimbal, as in DJI's XMP, and heading of the aircraft.
 
-    gimbal_deg: tuple[float, float, float] | None = None
-    """Yaw, pitch, roll of the gimbal, as in DJI's XMP."""
-    body_yaw_deg: float = math.nan
-    """Heading of the aircraft."""
-
-
-def read_maker_notes(data: bytes, make: str) -> MakerNotes:
-    """The angles in the maker notes of a camera of this make; other makers' are not read."""
-    if make.strip("\0 ").upper() != "DJI":
-        return MakerNotes()
+    They are in the maker notes of DJI's older models; other makers' are not read. An IFD of TIFF
+    without a header: the number of entries, then 12 bytes each. Tags as ExifTool lists them
+    (`Image::ExifTool::DJI`): 6 to 8 pitch, yaw and roll of the aircraft, 9 to 11 of the camera.
+    """
+    if make.upper() != "DJI":
+        return None, math.nan
     # Programs that rewrite EXIF may change its byte order but not that of the notes.
     values = next(filter(None, (_floats(data, order) for order in "<>")), {})
     yaw, pitch, roll = (
         values.get(tag, math.nan) for tag in (_CAMERA_YAW, _CAMERA_PITCH, _CAMERA_ROLL)
     )
     known = math.isfinite(yaw + pitch + roll)
-    return MakerNotes((yaw, pitch, roll) if known else None, values.get(_BODY_YAW, math.nan))
+    return (yaw, pitch, roll) if known else None, values.get(_BODY_YAW, math.nan)
 
 
 def _floats(data: bytes, order: str) -> Mapping[int, float]:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +91,10 @@ class SourceOptions:
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
+_ROUNDED = (
+    *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
+    *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
+)
 JUMP_M, JUMP_MPS = 500.0, 150.0
 """Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
 that this program is for flies slower, and logs round positions to some metres."""
@@ -158,24 +163,14 @@ def with_options(
 
 def rounded(telemetry: Telemetry) -> Telemetry:
     """The telemetry at the precision of a flight folder, so that import changes no result."""
-    prior, velocity = telemetry.prior, telemetry.vel_en_mps
-    return replace(
-        telemetry,
-        yaw_deg=round(telemetry.yaw_deg, DECIMALS),
-        pitch_deg=round(telemetry.pitch_deg, DECIMALS),
-        roll_deg=round(telemetry.roll_deg, DECIMALS),
-        agl_m=round(telemetry.agl_m, DECIMALS),
-        yaw_std_deg=_rounded(telemetry.yaw_std_deg),
-        agl_std_m=_rounded(telemetry.agl_std_m),
-        prior=prior and Prior(*(round(number, DECIMALS) for number in astuple(prior))),
-        vel_en_mps=velocity and (round(velocity[0], DECIMALS), round(velocity[1], DECIMALS)),
-        home_m=_rounded(telemetry.home_m),
-        amsl_m=_rounded(telemetry.amsl_m),
-        hae_m=_rounded(telemetry.hae_m),
-    )
+    return replace(telemetry, **{name: _rounded(getattr(telemetry, name)) for name in _ROUNDED})
 
 
-def _rounded(value: float | None) -> float | None:
+def _rounded(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_rounded, value))
+    if isinstance(value, Prior):
+        return Prior(*map(_rounded, astuple(value)))
     return None if value is None else round(value, DECIMALS)
 
 

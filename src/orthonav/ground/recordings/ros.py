@@ -283,7 +283,7 @@ def _samples(
 def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
     """Heights above ground, take-off and sea level."""
     agl, home, amsl = (Samples(1) for _ in range(3))
-    connection = topics.roles.get("height")
+    connection: Any = topics.roles.get("height")
     for time_ns, message in _messages(reader, topics, connection):
         if hasattr(message, "bottom_clearance"):
             agl.add(time_ns, message.bottom_clearance)
