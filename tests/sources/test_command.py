@@ -182,12 +182,6 @@ def test_doubtful_input_causes_a_warning(run, tmp_path):
     assert reasons == ["missing_telemetry", "bad_image", "missing_telemetry"]
 
 
-def test_verbose_says_nothing_of_every_tag(run, tmp_path):
-    photographs(tmp_path / "photos")
-    code, _, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight", "-v")
-    assert code == 0 and "tag:" not in err and len(err.splitlines()) < 20
-
-
 def truncated(path):
     path.write_bytes(path.read_bytes()[:700])
     return path
@@ -225,30 +219,6 @@ def test_damaged_input_is_one_line_and_nothing_is_written(run, how, tmp_path, ca
         assert (code, out) == (1, "") and message in err
         assert err.startswith("orthonav: error: ") and err.count("\n") == 1
     assert names_in(tmp_path) == before
-
-
-@pytest.mark.parametrize(
-    "options",
-    [["--topic", "image"], ["--jpeg-quality", "101"], ["--kind", "film"], ["--mount-deg", "1"]],
-)
-def test_wrong_usage(run, tmp_path, options):
-    code, out, err = run("import", tmp_path, "--out", tmp_path / "flight", *options)
-    assert code == 2 and out == "" and "usage: orthonav import" in err
-
-
-def test_the_kind_may_be_given(run, tmp_path, camera):
-    source = folder_of(tmp_path / "recorded")
-    code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "ros")
-    assert code == 1 and err.count("\n") == 1
-    code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "video")
-    assert code == 1 and "expected a file" in err
-
-
-def test_an_existing_output_is_not_replaced(run, tmp_path, names_in):
-    source = folder_of(tmp_path / "recorded")
-    before = names_in(tmp_path)
-    code, _, err = run("import", source, "--out", source)
-    assert code == 1 and "not empty" in err and names_in(tmp_path) == before
 
 
 def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):

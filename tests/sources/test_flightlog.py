@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 import struct
 import time
 import tracemalloc
@@ -17,7 +16,6 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from orthonav.core.errors import FlightError, OrthonavError
-from orthonav.core.flight import open_flight, read_image
 from orthonav.core.flight import logged as png_module
 from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
@@ -219,17 +217,6 @@ def test_invalid_options_are_rejected(map_path, tmp_path, run, options):
     assert done.code == 1 and done.err.count("\n") == 1 and "flight log: invalid" in done.err
 
 
-def test_an_import_has_the_same_pictures(tmp_path, run):
-    path = short_log(tmp_path / "log")
-    done = run("import", path, "--out", tmp_path / "flight")
-    assert done.code == 0
-    views = open_flight(tmp_path / "flight").views
-    assert [view.frame for view in views] == [f"{index:06d}.png" for index in range(5)]
-    for index, view in enumerate(views):
-        assert np.array_equal(read_image(view.path), picture(index))
-        assert view.telemetry.time_ns == telemetry(index).time_ns
-
-
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 known = st.floats(allow_nan=False, allow_infinity=False)
 NAMED = ("time_ns", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "prior", "vel_en_mps", "below")
@@ -281,15 +268,6 @@ def test_two_flights_in_a_folder(tmp_path):
     assert open_source(tmp_path / "flight_0002.mcap").expected == 7
     with pytest.raises(FlightError, match=r"2 flights.*flight_0001\.mcap, flight_0002\.mcap"):
         open_source(tmp_path)
-
-
-@pytest.mark.parametrize("views", ["none", "thumbnails"])
-def test_a_log_without_images_is_an_error(tmp_path, run, views):
-    path = short_log(tmp_path, views=views)
-    with pytest.raises(FlightError, match=f"no full images \\(views: {views}\\)"):
-        open_source(path)
-    done = run("import", path, "--out", tmp_path / "flight")
-    assert done.code == 1 and done.err.count("\n") == 1
 
 
 def test_an_image_unusable_in_flight_is_unusable_again(tmp_path):
@@ -605,14 +583,3 @@ def test_results_that_are_broken_are_passed_over(tmp_path):
     assert result.outcome.reason == "blank"
     messages = [session(), reported(), shown(), (log_module.RESULT, 0, b"{}")]
     assert list(open_source(crafted(tmp_path / "a.mcap", messages)).results()) == []
-
-
-def test_it_may_lie_in_a_read_only_place(tmp_path, content):
-    shutil.rmtree(tmp_path / "log", ignore_errors=True)
-    (tmp_path / "log").mkdir()
-    path = tmp_path / "log" / "flight_0001.mcap"
-    path.write_bytes(content[0])
-    path.chmod(0o444)
-    (tmp_path / "log").chmod(0o555)
-    assert open_source(tmp_path / "log").expected == 5
-    (tmp_path / "log").chmod(0o755)

@@ -18,7 +18,7 @@ from recorders import (
     video,
 )
 
-from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.errors import FlightError
 from orthonav.core.flight import open_flight
 from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
@@ -45,10 +45,6 @@ def log(kind, tmp_path):
 def turned(first, second):
     """The difference of two headings, -180..180."""
     return (first - second + 180) % 360 - 180
-
-
-def test_the_kind_is_found_by_content(kind, log):
-    assert log_kind(log) == kind
 
 
 def test_attitude_of_a_camera_that_looks_down_is_that_of_the_body(log):
@@ -81,15 +77,6 @@ def test_heights_are_of_the_distance_sensor_where_it_is_sound(kind, early, late,
     track = read_log(WRITERS[kind](tmp_path / "log"), DOWN)
     heights = [track.telemetry((START_S + t) * 10**9).agl_m for t in (3, 9)]
     assert heights == pytest.approx([early, late], abs=0.01)
-
-
-@pytest.mark.parametrize(
-    "kind, home, amsl", [("ulog", 400 + 3 - 280, 400), ("dataflash", 113, 400), ("tlog", 108, 400)]
-)
-def test_heights_above_home_and_sea_level(kind, home, amsl, tmp_path):
-    reported = read_log(WRITERS[kind](tmp_path / "log"), DOWN).telemetry((START_S + 3) * 10**9)
-    assert (reported.home_m, reported.amsl_m) == pytest.approx((home, amsl), abs=0.01)
-    assert reported.hae_m is None
 
 
 def test_the_mount_turns_the_camera(log):
@@ -220,12 +207,6 @@ def test_the_velocity_between_photographs_is_the_mean_of_a_log(photographs, tmp_
     assert written == [view.telemetry for view in recording.views]
 
 
-def test_views_after_the_end_of_a_log_are_not_made_up(photographs, log, tmp_path):
-    options = SourceOptions(telemetry=log, time_offset_s=7.0)
-    telemetry = [view.telemetry.missing() for view in open_source(photographs, options).views]
-    assert telemetry[0] == telemetry[1] == [] and len(telemetry[2]) == 4
-
-
 def test_a_log_of_another_flight_is_refused(photographs, log, tmp_path):
     options = SourceOptions(telemetry=log, time_offset_s=3600.0)
     with pytest.raises(FlightError, match="give --time-offset-s"):
@@ -293,8 +274,3 @@ def test_what_is_broken_is_one_error(tmp_path, kind, capfd):
         read_log(path, DOWN)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_log_that_is_not_there(tmp_path):
-    with pytest.raises(MissingFileError, match="telemetry log"):
-        read_log(tmp_path / "none.ulg", DOWN)

@@ -15,16 +15,13 @@ from recorders import (
     dji,
     packet,
     photo,
-    picture,
     place,
 )
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.flight import open_flight, read_image, read_truth
-from orthonav.core.records import Prior
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.exif import read_photo
-from orthonav.ground.recordings.focal import focal_length
 from orthonav.ground.recordings.photos import posed
 from orthonav.ground.recordings.recording import LEVEL_GROUND
 
@@ -37,10 +34,6 @@ def attitude(photo):
     (photo,), _ = posed([photo])
     pose = photo.pose
     return pose.yaw_deg, pose.pitch_deg, pose.roll_deg
-
-
-def focal(photo, sensor_width_mm=None):
-    return focal_length(photo.optics, photo.width_px, photo.height_px, sensor_width_mm)
 
 
 @pytest.fixture
@@ -95,16 +88,6 @@ def test_the_camera_is_that_of_the_focal_length(folder):
     assert telemetry.fx_px == pytest.approx(8.8 / 13.2 * 64)
 
 
-def test_the_focal_length_by_the_resolution_of_the_sensor(tmp_path):
-    """8.8 mm at 200 px per mm (5080 per inch) are 1760 px of 640 that were thinned to 64."""
-    more = {0xA405: None, 0xA20E: 5080.0, 0xA210: 2, 0xA002: 640}
-    assert focal(read_photo(photo(tmp_path / "a.jpg", more=more))).px == pytest.approx(176.0)
-    per_cm = {0xA405: None, 0xA20E: 2000.0, 0xA210: 3}
-    assert focal(read_photo(photo(tmp_path / "b.jpg", more=per_cm))).px == pytest.approx(1760.0)
-    none = {0xA405: 0, 0x920A: None}
-    assert focal(read_photo(photo(tmp_path / "c.jpg", more=none))) is None
-
-
 def test_a_camera_file_replaces_exif(folder, tmp_path):
     file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
     recording = open_source(folder, SourceOptions(camera=file))
@@ -113,11 +96,6 @@ def test_a_camera_file_replaces_exif(folder, tmp_path):
     wrong = camera_file(tmp_path / "d.json", width_px=128, height_px=72)
     with pytest.raises(CameraError, match="another aspect ratio"):
         open_source(folder, SourceOptions(camera=wrong))
-
-
-def test_the_position_may_be_used_as_a_prior(folder):
-    view = next(open_source(folder, SourceOptions(prior_std_m=25.0)).views)
-    assert view.telemetry.prior == Prior(*view.truth_latlon_deg, 25.0)
 
 
 @pytest.mark.parametrize("as_elements", [False, True])
@@ -288,23 +266,3 @@ def test_damaged_photographs_are_left_out_with_a_warning(folder, tmp_path):
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.broken) == (4, 1) and "h.jpg" in done.first_broken
     assert len(open_flight(tmp_path / "flight").views) == 4
-
-
-def test_folders_that_are_no_flight_are_refused(tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(FlightError, match="flight log:"):
-        open_source(tmp_path / "empty")
-    photo(tmp_path / "p/a.jpg", time=None)
-    with pytest.raises(FlightError, match="no time in EXIF"):
-        open_source(tmp_path / "p")
-    photo(tmp_path / "q/a.jpg", more={0xA405: None, 0x920A: None})
-    with pytest.raises(CameraError, match="give --camera"):
-        open_source(tmp_path / "q")
-
-
-def test_no_copy_of_a_picture_is_made_before_it_is_asked_for(folder):
-    views = list(open_source(folder).views)
-    (folder / "c.jpg").unlink()
-    with pytest.raises(FileNotFoundError):
-        views[0].grey()
-    assert views[1].grey().shape == picture().shape
