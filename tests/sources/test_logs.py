@@ -47,17 +47,6 @@ def turned(first, second):
     return (first - second + 180) % 360 - 180
 
 
-def test_attitude_of_a_camera_that_looks_down_is_that_of_the_body(log):
-    """In UTC by the GPS; a hundredth of a degree is what DataFlash holds."""
-    track = read_log(log, DOWN)
-    for t, yaw, pitch, roll in flown():
-        telemetry = angles_at(track.attitude, (START_S * 1000 + round(t * 1000)) * 10**6)
-        assert turned(telemetry[0], yaw) == pytest.approx(0, abs=0.02)
-        assert telemetry[1:] == pytest.approx((pitch, roll), abs=0.02)
-    between = angles_at(track.attitude, START_S * 10**9 + 2_550_000_000)  # across north
-    assert turned(between[0], 350 + 4 * 2.55) == pytest.approx(0, abs=0.02)
-
-
 def test_position_and_velocity(log):
     track = read_log(log, DOWN)
     at = START_S * 10**9 + 3 * 10**9

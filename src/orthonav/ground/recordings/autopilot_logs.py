@@ -1,7 +1,7 @@
-"""ArduPilot's logs: DataFlash (.bin), and the ground station's telemetry log (.tlog).
+"""Logs of autopilots: PX4 (ULog), ArduPilot (DataFlash), and of ground stations (.tlog).
 
-Fields: https://ardupilot.org/copter/docs/logmessages.html and
-https://mavlink.io/en/messages/common.html.
+Fields: https://docs.px4.io/main/en/dev_log/ulog_file_format.html,
+https://ardupilot.org/copter/docs/logmessages.html, https://mavlink.io/en/messages/common.html.
 """
 
 import contextlib
@@ -46,6 +46,19 @@ _WANTED = {
     "DISTANCE_SENSOR",
     "RANGEFINDER",
 }
+
+
+ULOG_MAGIC = b"ULog\x01\x12\x35"
+_TOPICS = [
+    "vehicle_attitude",
+    "vehicle_local_position",
+    "vehicle_global_position",
+    "vehicle_gps_position",
+    "sensor_gps",
+    "distance_sensor",
+    "home_position",
+]
+Columns = dict[str, NDArray[Any]]
 
 
 class _Collected:
@@ -199,19 +212,6 @@ def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
         collected.distance.add(time_ns, message.distance)
 
 
-ULOG_MAGIC = b"ULog\x01\x12\x35"
-_TOPICS = [
-    "vehicle_attitude",
-    "vehicle_local_position",
-    "vehicle_global_position",
-    "vehicle_gps_position",
-    "sensor_gps",
-    "distance_sensor",
-    "home_position",
-]
-Columns = dict[str, NDArray[Any]]
-
-
 def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
     """The track of a ULog; times are UTC where the log has a GPS fix, else since boot.
 
@@ -292,23 +292,39 @@ def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> TimeSeries 
     return attitude_series(_time_ns(columns, shift_us)[sound], rotations)
 
 
+def _series(
+    columns: Columns, values: list[NDArray[Any]], sound: NDArray[Any], shift_us: int
+) -> TimeSeries | None:
+    """The series of these columns of values where they are sound."""
+    table = np.stack(values, axis=1).astype(np.float64)
+    return series_of(_time_ns(columns, shift_us)[sound], table[sound])
+
+
+def _valid(columns: Columns, name: str) -> NDArray[np.bool_]:
+    """Where a flag is set; everywhere where it was not logged."""
+    return np.asarray(columns.get(name, np.ones(len(columns["timestamp"]))) != 0)
+
+
+def _has_fix(columns: Columns) -> NDArray[np.bool_]:
+    return np.asarray(columns.get("fix_type", np.full(len(columns["timestamp"]), 3)) >= 3)
+
+
 def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[TimeSeries, ...]:
     """Heights above ground by distance sensor: the estimator's, then the raw one."""
     local = topics.get("vehicle_local_position", {})
     sensor = topics.get("distance_sensor", {})
     found = []
     if "dist_bottom" in local:
-        valid = local.get("dist_bottom_valid", np.ones(len(local["dist_bottom"]))) != 0
+        valid = _valid(local, "dist_bottom_valid")
         # Without a sensor the estimator guesses, and calls its guess valid.
         sensors = local.get("dist_bottom_sensor_bitfield", np.full(len(valid), len(sensor)))
-        valid &= sensors != 0
-        found.append(_height(local, local["dist_bottom"], valid, shift_us))
+        found.append(_series(local, [local["dist_bottom"]], valid & (sensors != 0), shift_us))
     if "current_distance" in sensor:
         distance = sensor["current_distance"]
         valid = sensor.get("orientation", np.full(len(distance), _DOWNWARD)) == _DOWNWARD
         valid &= distance > sensor.get("min_distance", np.zeros(len(distance)))
         valid &= distance < sensor.get("max_distance", np.full(len(distance), np.inf))
-        found.append(_height(sensor, distance, valid, shift_us))
+        found.append(_series(sensor, [distance], valid, shift_us))
     return tuple(series for series in found if series is not None)
 
 
@@ -318,29 +334,19 @@ def _home(topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
     place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
     if "alt" in place and "alt" in home:
         above = place["alt"].astype(np.float64) - float(home["alt"][-1])
-        return _height(place, above, np.ones(len(above), dtype=bool), shift_us)
+        return _series(place, [above], np.ones(len(above), dtype=bool), shift_us)
     if "z" not in local:
         return None
-    valid = local.get("z_valid", np.ones(len(local["z"]))) != 0
-    return _height(local, -local["z"], valid, shift_us)
+    return _series(local, [-local["z"]], _valid(local, "z_valid"), shift_us)
 
 
 def _hae(gps: Columns, shift_us: int) -> TimeSeries | None:
     """Height of the GPS receiver above the ellipsoid."""
     if "altitude_ellipsoid_m" in gps:  # since PX4 1.14
-        height = gps["altitude_ellipsoid_m"].astype(np.float64)
-    elif "alt_ellipsoid" in gps:
-        height = gps["alt_ellipsoid"] * 1e-3
-    else:
-        return None
-    return _height(gps, height, gps.get("fix_type", np.full(len(height), 3)) >= 3, shift_us)
-
-
-def _height(
-    columns: Columns, height_m: NDArray[Any], valid: NDArray[np.bool_], shift_us: int
-) -> TimeSeries | None:
-    times = _time_ns(columns, shift_us)
-    return series_of(times[valid], height_m[valid].astype(np.float64)[:, None])
+        return _series(gps, [gps["altitude_ellipsoid_m"]], _has_fix(gps), shift_us)
+    if "alt_ellipsoid" in gps:
+        return _series(gps, [gps["alt_ellipsoid"] * 1e-3], _has_fix(gps), shift_us)
+    return None
 
 
 def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
@@ -354,14 +360,11 @@ def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSe
         if "lat" not in gps:
             return None
         parts = gps["lat"], gps["lon"], gps["alt"]
-    place = np.stack(parts, axis=1).astype(np.float64)
-    sound = gps.get("fix_type", np.full(len(place), 3)) >= 3
+    place, sound = np.stack(parts, axis=1).astype(np.float64), _has_fix(gps)
     return position_series(_time_ns(gps, shift_us)[sound], place[sound])
 
 
 def _velocity(local: Columns, shift_us: int) -> TimeSeries | None:
     if "vx" not in local:
         return None
-    east_north = np.stack([local["vy"], local["vx"]], axis=1).astype(np.float64)
-    sound = local.get("v_xy_valid", np.ones(len(east_north))) != 0
-    return series_of(_time_ns(local, shift_us)[sound], east_north[sound])
+    return _series(local, [local["vy"], local["vx"]], _valid(local, "v_xy_valid"), shift_us)
