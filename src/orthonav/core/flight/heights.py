@@ -31,6 +31,19 @@ MISMATCH_M = 20.0
 and positions of take-off explain less, a wrong datum more."""
 LARGEST_STD_M = 10_000.0
 """A position with a larger standard deviation is unknown: a map is at most 50 km across."""
+MIN_VIEWS = 20
+"""Fewer confident views say nothing about the terrain."""
+OFF_M = 25.0
+"""Heights by the views and by the terrain that differ by more on the whole are named: barometers
+explain less, a wrong datum more."""
+SPREAD_M, SPREAD_SHARE = 3.0, 0.02
+"""So is a difference whose robust standard deviation is more, in metres and as a share of the
+height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
+(`python -m benchmarks.terrain_flight`)."""
+MAX_VIEWS = 2000
+"""Only so many of the latest confident views are kept."""
+HOLES_SHARE = 0.1
+"""So are holes below more than this share of the confident views."""
 _LOST = ("searching", "lost")
 """States of a track that has no position."""
 log = logging.getLogger(__name__)
@@ -227,21 +240,6 @@ def warn_of_mismatch(off_m: float) -> None:
             "its vertical datum, the place of take-off and the altitude of the autopilot",
             off_m,
         )
-
-
-MIN_VIEWS = 20
-"""Fewer confident views say nothing about the terrain."""
-OFF_M = 25.0
-"""Heights by the views and by the terrain that differ by more on the whole are named: barometers
-explain less, a wrong datum more."""
-SPREAD_M, SPREAD_SHARE = 3.0, 0.02
-"""So is a difference whose robust standard deviation is more, in metres and as a share of the
-height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
-(`python -m benchmarks.terrain_flight`)."""
-MAX_VIEWS = 2000
-"""Only so many of the latest confident views are kept."""
-HOLES_SHARE = 0.1
-"""So are holes below more than this share of the confident views."""
 
 
 class TerrainFit:

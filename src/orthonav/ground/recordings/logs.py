@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
@@ -12,7 +13,6 @@ from orthonav.core.flight.folder import number_of, time_ns_of
 from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
-    TimeSeries,
     attitude_of_angles,
     measured,
 )
@@ -35,6 +35,34 @@ from orthonav.ground.recordings.autopilot_logs import (
 )
 
 _SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
+MAX_BYTES = 500_000_000
+_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+_TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
+_ENDS = (">", "]", ")")
+"""What blocks end with that are whole, besides the end of a line."""
+_TAG = re.compile(r"<[^<>]*>")
+_FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
+_GPS = re.compile(
+    rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
+)
+_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
+_HOME = re.compile(r"\bHOME\s*\(")
+_HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
+_GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
+NEEDED = ("time_s", "pitch_deg", "roll_deg")
+_COLUMNS = {
+    "height": ("agl_m",),
+    "home": ("home_m",),
+    "amsl": ("amsl_m",),
+    "hae": ("hae_m",),
+    "velocity": ("vel_east_mps", "vel_north_mps"),
+    "yaw_std": ("yaw_std_deg",),
+    "agl_std": ("agl_std_m",),
+    "tilt_std": ("tilt_std_deg",),
+    "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
+}
+"""Columns of a table by the series of `RecordedTrack`."""
+_HEIGHTS = ("height", "home", "amsl", "hae")
 
 
 def log_kind(path: Path) -> str:
@@ -67,6 +95,8 @@ def log_kind(path: Path) -> str:
 def read_log(path: Path, mount_deg: Angles) -> RecordedTrack:
     """The track of a log. `mount_deg` applies where the log holds the attitude of the body."""
     kind = log_kind(path)
+    if kind in ("srt", "table") and path.stat().st_size > MAX_BYTES:
+        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     if kind == "ulog":
         return read_ulog(path, mount_deg)
     if kind == "dataflash":
@@ -74,22 +104,6 @@ def read_log(path: Path, mount_deg: Angles) -> RecordedTrack:
     if kind == "tlog":
         return read_tlog(path, mount_deg)
     return read_srt(path) if kind == "srt" else read_table(path)
-
-
-MAX_BYTES = 500_000_000
-_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
-_TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
-_ENDS = (">", "]", ")")
-"""What blocks end with that are whole, besides the end of a line."""
-_TAG = re.compile(r"<[^<>]*>")
-_FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
-_GPS = re.compile(
-    rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
-)
-_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
-_HOME = re.compile(r"\bHOME\s*\(")
-_HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
-_GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
 
 
 @dataclass(frozen=True)
@@ -117,16 +131,16 @@ def read_srt(path: Path) -> RecordedTrack:
 
     Raises `FlightError` where it has no telemetry.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
-    attitude, position, height = Samples(3), Samples(3), Samples(1)
-    last = None
     data = path.read_bytes()
-    for last in blocks(data):
-        _add(last, last.start_ns, attitude, position, height)
-    if last is None:
+    timed = [(block.start_ns, block) for block in blocks(data)]
+    if not timed:
         raise FlightError(f"subtitles hold no telemetry: {path}")
-    _add(last, last.end_ns, attitude, position, height)
+    timed.append((timed[-1][1].end_ns, timed[-1][1]))
+    attitude, position, height = Samples(3), Samples(3), Samples(1)
+    for time_ns, block in timed:
+        attitude.add(time_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
+        position.add(time_ns, block.lat_deg, block.lon_deg, block.alt_m)
+        height.add(time_ns, block.height_m)
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         home=height.series(),
@@ -143,14 +157,6 @@ def end_ns(track: RecordedTrack) -> int:
     """Last time of a track from subtitles or a table."""
     series = (track.attitude, track.position, track.home, *track.heights)
     return max(int(one.time_ns[-1]) for one in series if one is not None)
-
-
-def _add(
-    block: SubtitleBlock, time_ns: int, attitude: Samples, position: Samples, height: Samples
-) -> None:
-    attitude.add(time_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
-    position.add(time_ns, block.lat_deg, block.lon_deg, block.alt_m)
-    height.add(time_ns, block.height_m)
 
 
 def blocks(data: bytes) -> Iterator[SubtitleBlock]:
@@ -234,59 +240,46 @@ def _first(pattern: re.Pattern[str], text: str) -> float:
     return float(found[1]) if found else math.nan
 
 
-NEEDED = ("time_s", "pitch_deg", "roll_deg")
-_NAMES = {
-    "height": ("agl_m",),
-    "home": ("home_m",),
-    "amsl": ("amsl_m",),
-    "hae": ("hae_m",),
-    "velocity": ("vel_east_mps", "vel_north_mps"),
-    "yaw_std": ("yaw_std_deg",),
-    "agl_std": ("agl_std_m",),
-    "tilt_std": ("tilt_std_deg",),
-    "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
-}
-_HEIGHTS = ("height", "home", "amsl", "hae")
-
-
 def read_table(path: Path) -> RecordedTrack:
     """The track of a CSV with `time_s` and the columns of a flight's telemetry, and, where it was
     recorded, `lat_deg,lon_deg`. Angles are those of the camera, in the convention of orthonav.
 
     Raises `FlightError`, with the line, for an invalid table.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     attitude, position = Samples(3), Samples(3)
-    others = {name: Samples(len(columns)) for name, columns in _NAMES.items()}
+    others = {name: Samples(len(columns)) for name, columns in _COLUMNS.items()}
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             rows = TableRows(stream)
             missing = [name for name in NEEDED if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
-            held = {
-                name: columns
-                for name, columns in _NAMES.items()
-                if not set(columns).isdisjoint(rows.columns)
-            }
-            placed = not {"lat_deg", "prior_lat_deg"}.isdisjoint(rows.columns)
+            held = [name for name in _COLUMNS if set(_COLUMNS[name]) & set(rows.columns)]
             for row in rows:
                 time_ns = time_ns_of(row["time_s"])
                 if time_ns is None:
                     raise FlightError(f"line {rows.line}: time_s is not a time: {path}")
                 angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
                 attitude.add(time_ns, *angles)
-                if placed:
-                    position.add(time_ns, *_position(row, rows.line, path), math.nan)
-                for name, columns in held.items():
-                    values = [number_of(row.get(column)) for column in columns]
+                position.add(time_ns, *_position(row, rows.line, path), math.nan)
+                for name in held:
+                    values = [number_of(row.get(column)) for column in _COLUMNS[name]]
                     if name in _HEIGHTS:
                         values = [measured(value) for value in values]
                     others[name].add(time_ns, *values)
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
-    return _track(attitude, position, others, path)
+    found: dict[str, Any] = {name: each.series() for name, each in others.items()}
+    height = found.pop("height")
+    track = RecordedTrack(
+        attitude_of_angles(attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles))),
+        heights=() if height is None else (height,),
+        position=position.positions(),
+        **found,
+    )
+    if track.attitude is None:
+        raise FlightError(f"telemetry has no line with pitch and roll: {path}")
+    return track
 
 
 def _position(row: Mapping[str, str | None], line: int, path: Path) -> tuple[float, float]:
@@ -296,28 +289,3 @@ def _position(row: Mapping[str, str | None], line: int, path: Path) -> tuple[flo
     if hint := swapped_hint(lat_deg, lon_deg) or swapped_hint(*prior):
         raise FlightError(f"line {line}: position is out of range{hint}: {path}")
     return lat_deg, lon_deg
-
-
-def _track(
-    attitude: Samples, position: Samples, others: dict[str, Samples], path: Path
-) -> RecordedTrack:
-    found: dict[str, TimeSeries | None] = {name: each.series() for name, each in others.items()}
-    height = found["height"]
-    track = RecordedTrack(
-        attitude=attitude_of_angles(
-            attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles))
-        ),
-        heights=() if height is None else (height,),
-        home=found["home"],
-        amsl=found["amsl"],
-        hae=found["hae"],
-        position=position.positions(),
-        velocity=found["velocity"],
-        yaw_std=found["yaw_std"],
-        agl_std=found["agl_std"],
-        tilt_std=found["tilt_std"],
-        prior=found["prior"],
-    )
-    if track.attitude is None:
-        raise FlightError(f"telemetry has no line with pitch and roll: {path}")
-    return track
