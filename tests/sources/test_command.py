@@ -10,7 +10,7 @@ import pytest
 from bags import Messages, record
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from recorders import START_S, camera_file, dji, packet, photo, place, tlog, video
+from recorders import START_S, camera_file, packet, photo, place, tlog, video
 
 from orthonav.core.flight import FlightWriter, open_flight, read_image
 from orthonav.core.flight.fixes import read_results
@@ -231,24 +231,6 @@ def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
         add_gps(source / f"{index}.png", place(*PLACE))
     _, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
     assert "from the map" not in err
-
-
-def test_a_photograph_that_was_turned_in_an_editor_is_placed(run, tmp_path, camera):
-    """It keeps its old angles, and is named by its software."""
-    xmp = dji(yaw=20.0, height=160.0)
-    path = photo(tmp_path / "photos/a.png", xmp=xmp, first={0x0131: "Windows Photo Viewer 10"})
-    with Image.open(path) as written:
-        tags, text = written.getexif(), written.info["XML:com.adobe.xmp"]
-    info = PngInfo()
-    info.add_itxt("XML:com.adobe.xmp", text)
-    Image.fromarray(seen(0)[::-1, ::-1].copy()).save(path, exif=tags, pnginfo=info)
-    out = tmp_path / "a.jsonl"
-    code, _, err = run("localize", MAP, tmp_path / "photos", "--camera", camera, "--out", out)
-    assert code == 0 and "1 of 1 photographs were written by an editor" in err
-    (result,) = read_results(out)
-    off = np.subtract((result.outcome.lat_deg, result.outcome.lon_deg), PLACE)
-    assert np.abs(off * [111e3, 76e3]).max() < 2
-    assert result.outcome.heading_deg == pytest.approx(200, abs=1)
 
 
 def test_one_photograph_is_placed_and_printed(run, tmp_path):

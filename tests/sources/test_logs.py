@@ -80,17 +80,10 @@ def test_the_mount_turns_the_camera(log):
 
 def test_newer_px4_names(tmp_path):
     topics = px4_topics()
-    stamp = "uint64_t"
     rows = [(row[0], row[1], 46.5, 2.5, 400.0, 3) for row in topics.pop("vehicle_gps_position")[1]]
     topics["sensor_gps"] = (
-        {
-            "timestamp": stamp,
-            "time_utc_usec": stamp,
-            "latitude_deg": "double",
-            "longitude_deg": "double",
-            "altitude_msl_m": "double",
-            "fix_type": "uint8_t",
-        },
+        "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg"
+        ";double altitude_msl_m;uint8_t fix_type",
         rows,
     )
     track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
