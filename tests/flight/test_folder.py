@@ -80,16 +80,6 @@ def test_round_trip(folder):
     assert truth == {"a.png": (46.5, 2.5), "b.jpg": (-46.12345679, 179.5), "c.tif": (0.0, 0.0)}
 
 
-def test_a_flight_without_truth(tmp_path):
-    writer = FlightWriter(tmp_path, CAMERA, "")
-    data = cv2.imencode(".png", scene())[1].tobytes()
-    writer.add_encoded("sub/a.png", data, FULL, None)
-    writer.close()
-    assert not (tmp_path / "truth.csv").exists()
-    (view,) = open_flight(tmp_path).views
-    assert np.array_equal(view.grey(), scene()) and view.where == str(view.path)
-
-
 def test_columns_that_no_view_needs_are_not_written(tmp_path):
     writer = FlightWriter(tmp_path, CAMERA, "")
     writer.add("a.png", rgb(), BARE, (0.0, 0.0))

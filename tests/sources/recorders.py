@@ -183,7 +183,7 @@ def quaternion_wxyz(yaw, pitch, roll):
 
 
 def ulog(path, topics):
-    """A ULog by pyulog's own writer. `topics`: name -> (fields as in its format, rows of tuples)."""
+    """A ULog by pyulog's own writer. `topics`: name -> (fields as its format has them, rows)."""
     from pyulog.core import ULog
 
     log = ULog(None)

@@ -159,29 +159,6 @@ def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
     assert code == 0 and "2 views: 2 confident" in out and "truth is ignored: line 2" in err
 
 
-def test_doubtful_input_causes_a_warning(run, tmp_path):
-    for index in range(3):
-        photo(tmp_path / f"photos/{index}.jpg", f"2023:11:14 22:13:2{index}", seed=index)
-    data = (tmp_path / "photos/1.jpg").read_bytes()
-    (tmp_path / "photos/1.jpg").write_bytes(data[:-200])
-    code, out, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight")
-    assert code == 0 and "2 views, 0 with heading" in out
-    assert "good to 3 %: 35 mm equivalent of EXIF" in err
-    assert "1 views left out, the first" in err and "1.jpg" in err
-    assert "2 of 2 views lack heading, pitch, roll or height" in err
-    note = json.loads((tmp_path / "flight/flight.json").read_text())["note"]
-    assert "35 mm equivalent of EXIF" in note
-    assert not (tmp_path / "flight/truth.csv").exists()
-    quiet = run("import", tmp_path / "photos", "--out", tmp_path / "quiet", "-q")
-    assert quiet[0] == 0 and quiet[2] == ""
-    located = run("localize", MAP, tmp_path / "photos", "--out", tmp_path / "fixes.jsonl")
-    assert located[0] == 1 and "1.jpg" in located[2] and not (tmp_path / "fixes.jsonl").exists()
-    skipped = ("localize", MAP, tmp_path / "photos", "--out", tmp_path / "f", "--skip-bad-images")
-    assert run(*skipped)[0] == 0
-    reasons = [result.outcome.reason for result in read_results(tmp_path / "f")]
-    assert reasons == ["missing_telemetry", "bad_image", "missing_telemetry"]
-
-
 def truncated(path):
     path.write_bytes(path.read_bytes()[:700])
     return path

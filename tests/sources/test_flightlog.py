@@ -320,24 +320,6 @@ def test_a_log_may_end_anywhere(tmp_path, content):
         assert (len(opened.warnings) == 1) == (cut < ends[-1][0] + 9)
 
 
-def test_flipped_bits_are_detected(tmp_path, content):
-    data, _ = content
-    path = tmp_path / "flight_0001.mcap"
-    rng = np.random.default_rng(1)
-    for at, bit in zip(rng.integers(0, len(data), 120), rng.integers(0, 8, 120), strict=True):
-        broken = bytearray(data)
-        broken[at] ^= 1 << int(bit)
-        path.write_bytes(broken)
-        try:
-            views = list(open_source(path).views)
-            for view in views:
-                index = int(view.frame[:6])
-                assert np.array_equal(view.grey(), picture(index))
-                assert repr(view.telemetry) == repr(telemetry(index))
-        except OrthonavError:
-            continue
-
-
 @given(st.data())
 @settings(max_examples=100, deadline=None)
 def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, content, data):
@@ -349,7 +331,7 @@ def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, co
     path.write_bytes(whole[:first] + middle + whole[last:])
     try:
         for view in open_source(path, SourceOptions(kind="log")).views:
-            view.grey()
+            assert np.array_equal(view.grey(), picture(int(view.frame[:6])))
     except OrthonavError:
         pass
 

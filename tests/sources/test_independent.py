@@ -25,7 +25,6 @@ from recorders import (
     photo,
     place,
     px4_topics,
-    subtitles,
     tlog,
     ulog,
 )
@@ -251,12 +250,6 @@ def test_recorded_subtitles_are_in_their_country(path):
     if heights:
         seen = {round(float(value), 2) for value in track.home.values[:, 0]}
         assert seen <= {float(height) for height in heights}
-
-
-def test_latitude_and_longitude_of_subtitles_are_not_swapped(tmp_path):
-    first_latitude = "2022.06.21 16:06:17\nGPS(36.6146,-6.1120,0.0M) BAROMETER:0.3M"
-    path = subtitles(tmp_path / "a.srt", [first_latitude] * 3)
-    assert read_srt(path).position.values[0, :2] == pytest.approx((36.6146, -6.112))
 
 
 @pytest.mark.parametrize("path", recorded("bags", ".mcap"))

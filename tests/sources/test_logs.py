@@ -19,7 +19,6 @@ from recorders import (
 )
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight import open_flight
 from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import log_kind, read_log
@@ -171,22 +170,6 @@ def test_photographs_with_a_log(photographs, log, tmp_path):
         assert telemetry.time_ns == (START_S + second + 2) * 10**9
         assert turned(telemetry.yaw_deg, 350 + 4 * (second + 2)) == pytest.approx(0, abs=0.02)
         assert telemetry.prior.std_m == 20 and math.isfinite(telemetry.agl_m)
-
-
-def test_the_velocity_between_photographs_is_the_mean_of_a_log(photographs, tmp_path):
-    path = tmp_path / "log.csv"
-    rows = [f"{START_S + t},0,0,0,100,{9 - t * t / 3},0\n" for t in range(9)]
-    header = "time_s,yaw_deg,pitch_deg,roll_deg,agl_m,vel_east_mps,vel_north_mps\n"
-    path.write_text(header + "".join(rows))
-    options = SourceOptions(telemetry=path, time_offset_s=1.5)
-    recording = open_source(photographs, options)
-    import_flight(recording, tmp_path / "flight")
-    east = [view.telemetry.vel_en_mps[0] for view in recording.views]
-    at = [9 - t * t / 3 for t in range(9)]
-    means = [(at[t] + 2 * at[t + 1] + at[t + 2]) / 4 for t in (2, 4)]
-    assert east == pytest.approx([at[2], *means], abs=1e-6)
-    written = [view.telemetry for view in open_flight(tmp_path / "flight").views]
-    assert written == [view.telemetry for view in recording.views]
 
 
 def test_a_log_of_another_flight_is_refused(photographs, log, tmp_path):

@@ -97,29 +97,18 @@ def test_a_camera_file_replaces_exif(folder, tmp_path):
 
 
 @pytest.mark.parametrize("as_elements", [False, True])
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
-def test_xmp_in_every_form(tmp_path, suffix, as_elements):
+@pytest.mark.parametrize(
+    "suffix, maker", [("jpg", DJI), ("jpg", AUTEL), ("png", DJI), ("tif", DJI)]
+)
+def test_xmp_in_every_form(tmp_path, suffix, maker, as_elements):
     values = {"GimbalYawDegree": "-12.5", "GimbalPitchDegree": "-70.0", "GimbalRollDegree": "0.0"}
-    xmp = packet(as_elements=as_elements, **values)
+    xmp = packet(maker, as_elements, **values)
     telemetry = read_photo(photo(tmp_path / f"a.{suffix}", xmp=xmp))
     assert attitude(telemetry) == pytest.approx((347.5, 20, 0))
     assert math.isnan(telemetry.home_m) and (telemetry.width_px, telemetry.height_px) == (
         WIDTH,
         HEIGHT,
     )
-
-
-def test_autel(tmp_path):
-    xmp = packet(
-        AUTEL,
-        GimbalYawDegree="90.0",
-        GimbalPitchDegree="-90.0",
-        GimbalRollDegree="0.0",
-        RelativeAltitude="80.25",
-    )
-    telemetry = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make="Autel Robotics"))
-    assert attitude(telemetry) == pytest.approx((90, 0, 0), abs=1e-6)
-    assert telemetry.home_m == 80.25
 
 
 @pytest.mark.parametrize("make, roll", [("Sony", 4), ("senseFly", -4), ("Parrot", 4)])

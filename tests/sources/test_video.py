@@ -11,7 +11,6 @@ from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import blocks
@@ -179,17 +178,6 @@ def test_windows_lines_and_long_times(tmp_path):
     text = "7\r\n01:02:03,5 --> 01:02:04,000\r\n[latitude: 1.5] [longitude: 2.5]\r\n\r\n"
     (block,) = blocks(text.encode())
     assert block.start_ns == 3_723_500_000_000 and block.lat_deg == 1.5
-
-
-def test_one_block_a_second_holds_until_the_next(tmp_path):
-    """Older drones write one block a second; the last one holds until it ends."""
-    path = video(tmp_path / "a.mkv")
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=10 * n) for n in range(3)], spacing_s=1)
-    camera_file(tmp_path / "camera.json")
-    views = list(open_source(path, options(path, rate_hz=2)).views)
-    yaws = [view.telemetry.yaw_deg for view in views]
-    assert yaws == pytest.approx([0, 5, 10, 15, 20, 20])
-    assert {view.telemetry.tilt_std_deg for view in views} == {GIMBAL_TILT_STD_DEG}
 
 
 def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
