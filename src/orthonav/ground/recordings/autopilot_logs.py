@@ -46,8 +46,6 @@ _WANTED = {
     "DISTANCE_SENSOR",
     "RANGEFINDER",
 }
-
-
 ULOG_MAGIC = b"ULog\x01\x12\x35"
 _TOPICS = [
     "vehicle_attitude",

@@ -1,4 +1,9 @@
-"""Metadata of a photograph: EXIF (CIPA DC-008, Exif 2.32), XMP and maker notes."""
+"""Metadata of a photograph: EXIF (CIPA DC-008, Exif 2.32), XMP and maker notes.
+
+Values of XMP are searched by the names of DJI, Autel, senseFly and Pix4D in the text of the packet:
+some firmware writes undeclared prefixes, which no XML parser accepts. Conventions of angles:
+`docs/flights.md`.
+"""
 
 import math
 import re
@@ -27,6 +32,23 @@ _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 _ZOOM = 0xA404
 _QUARTER_HOUR = timedelta(minutes=15)
+_FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
+_BODY_YAW, _CAMERA_PITCH, _CAMERA_YAW, _CAMERA_ROLL = 7, 9, 10, 11
+_VALUE = re.compile(
+    r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
+)
+_NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
+"""A number with a decimal point or comma, or a fraction."""
+_ANGLE_OR_PLACE = re.compile(
+    r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
+)
+"""Values that a view is worse off without."""
+_EXPOSED = re.compile(
+    r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
+    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
+)
+_WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
 
 @dataclass(frozen=True)
@@ -110,6 +132,10 @@ def read_photo(path: Path) -> Photo:
     if time_ns is None:
         time_ns, zone_known = _time(tags, more, gps)
     latlon, alt = _place(gps)
+    rtk = xmp.first("drone-dji:RtkFlag") > 0
+    north, east = (
+        xmp.first(f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
+    )
     body_yaw = xmp.body_yaw_deg()
     if math.isnan(body_yaw) and not xmp.unread:
         body_yaw = heading
@@ -127,10 +153,12 @@ def read_photo(path: Path) -> Photo:
         gimbal_deg=xmp.gimbal_deg() or gimbal,
         rotation=xmp.rotation(make),
         body_yaw_deg=body_yaw,
-        home_m=xmp.home_m(),
+        home_m=measured(
+            xmp.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
+        ),
         amsl_m=xmp.first("sensefly:AltitudeAMSL"),
-        hae_m=xmp.hae_m(),
-        vel_en_mps=xmp.velocity_en_mps(),
+        hae_m=xmp.first("drone-dji:AbsoluteAltitude" if rtk else "sensefly:AltitudeWGS84"),
+        vel_en_mps=(east, north) if math.isfinite(east + north) else None,
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
         doubts=tuple(doubts),
@@ -230,10 +258,6 @@ def _number(value: Any) -> float:
         return math.nan
 
 
-_FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
-_BODY_YAW, _CAMERA_PITCH, _CAMERA_YAW, _CAMERA_ROLL = 7, 9, 10, 11
-
-
 def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float] | None, float]:
     """Yaw, pitch and roll of the gimbal, as in DJI's XMP, and heading of the aircraft.
 
@@ -266,23 +290,6 @@ def _floats(data: bytes, order: str) -> Mapping[int, float]:
         if kind == _FLOAT and values == 1 and abs(value) <= 360:
             found[tag] = value
     return found
-
-
-_VALUE = re.compile(
-    r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
-    r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
-)
-_NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
-"""A number with a decimal point or comma, or a fraction."""
-_ANGLE_OR_PLACE = re.compile(
-    r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
-)
-"""Values that a view is worse off without."""
-_EXPOSED = re.compile(
-    r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
-    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
-)
-_WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
 
 @dataclass(frozen=True)
@@ -351,25 +358,6 @@ class Xmp:
         # senseFly uses the names of Pix4D with the opposite sign of roll.
         yaw, pitch, roll = angles
         return enu_from_camera(yaw, pitch, -roll if "sensefly" in make.lower() else roll)
-
-    def velocity_en_mps(self) -> tuple[float, float] | None:
-        """Velocity over ground, east and north."""
-        north, east = (
-            self.first(f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
-        )
-        return (east, north) if math.isfinite(east + north) else None
-
-    def home_m(self) -> float:
-        """Height above the place of take-off."""
-        return measured(
-            self.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
-        )
-
-    def hae_m(self) -> float:
-        """Height above the ellipsoid: of RTK, or as senseFly writes it."""
-        if self.first("drone-dji:RtkFlag") > 0:
-            return self.first("drone-dji:AbsoluteAltitude")
-        return self.first("sensefly:AltitudeWGS84")
 
     def _angles(self, pattern: str) -> tuple[float, float, float] | None:
         yaw, pitch, roll = (self.first(pattern.format(name)) for name in ("Yaw", "Pitch", "Roll"))
