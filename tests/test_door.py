@@ -49,13 +49,16 @@ def test_an_image_is_localized_and_followed(map_path, area, flight, flight_path)
             found.append(np.hypot(*(at[0] - at[1])) / fix.std_m)
     assert len(found) >= 5 and np.median(found) < 3
     assert map_.contains(*truth[flight.views[0].frame]) and not map_.contains(0.0, 0.0)
-    south, west, north, east = map_.bounds_deg
-    assert south < truth[flight.views[0].frame][0] < north and west < east
+    west, south, east, north = map_.bounds_deg
+    lat_deg, lon_deg = truth[flight.views[0].frame]
+    assert west < lon_deg < east and south < lat_deg < north
     blank = localizer.localize(colour * 0, area.camera, agl_m=area.agl_m)
     assert not blank.is_confident and blank.reason in repr(blank)
     tracker = orthonav.Tracker(map_, heading_known=False)
     first = tracker.update(colour, area.camera, time_s=0.0, agl_m=area.agl_m)
     assert isinstance(first, orthonav.Fix) and "searching" in repr(tracker)
+    headless = orthonav.Tracker(map_).update(colour, area.camera, time_s=0.0, agl_m=area.agl_m)
+    assert headless.reason == "missing_telemetry" and "heading_deg" in headless.detail
 
 
 def test_cameras_by_field_of_view_and_by_matrix(tmp_path):

@@ -32,7 +32,7 @@ def test_an_interrupt_of_the_search_for_another_set_up_skips_it(
     command = ["localize", map_path, turned, "--out", tmp_path / "fixes.jsonl"]
     done = run(*command)
     assert (done.code, done.err) == (0, "")
-    assert "! the search for another set-up was interrupted" in done.out
+    assert "! the search for another configuration was interrupted" in done.out
     assert f"written to {tmp_path / 'fixes.jsonl'}" in done.out
     assert len(read_results(tmp_path / "fixes.jsonl")) == 2
     assert "!" not in run(*command, "--no-diagnosis").out
@@ -41,7 +41,9 @@ def test_an_interrupt_of_the_search_for_another_set_up_skips_it(
 def test_the_search_for_another_set_up_ends_in_time(run, map_path, turned, tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.cli.setups.BUDGET_S", 0.0)
     done = run("localize", map_path, turned, "--out", tmp_path / "fixes.jsonl")
-    assert done.code == 0 and "! the search for another set-up was ended after 0 s" in done.out
+    assert (
+        done.code == 0 and "! the search for another configuration was ended after 0 s" in done.out
+    )
 
 
 def test_an_interrupt_names_what_is_written(run, map_path, flight_path, tmp_path, monkeypatch):

@@ -44,7 +44,7 @@ def value_of(option, action):
 MEANING = {
     "--accept": "criterion of a confident fix and its threshold",
     "--agl-m": "height above ground",
-    "--agl-std": "standard deviation of the reported height, as a share of it",
+    "--agl-std": "standard deviation of the reported height, as a fraction of it",
     "--allow-holes": "even if",
     "--band-m": "width of the search band for legs without a width of their own",
     "--camera": "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",

@@ -9,7 +9,7 @@
         print(fix.lat_deg, fix.lon_deg, fix.std_m, fix.heading_deg)
 
 `build_map` makes a map from orthophotos, `Tracker` follows a flight, `evaluate` compares fixes with
-the truth. The names in `__all__` are stable from version 0.2 on; modules below are not.
+ground truth. The names in `__all__` are stable from version 0.2 on; modules below are not.
 """
 
 from importlib import import_module

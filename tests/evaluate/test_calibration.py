@@ -332,8 +332,18 @@ def test_json_names_and_keeps_what_was_there() -> None:
     ("offsets", "confidence", "cov", "words"),
     [
         (OFFSETS, None, None, ["no fix states one", "of 1 correct fixes 1 without one"]),
-        (OFFSETS, 0.5, [[1.0, 1.0], [1.0, 1.0]], ["4 fixes state 0.500", "1 unusable"]),
-        (OFFSETS[1:], 0.5, [[1.0, 0.0], [0.0, 1.0]], ["0.000 of them", "no fix is correct"]),
+        (
+            OFFSETS,
+            0.5,
+            [[1.0, 1.0], [1.0, 1.0]],
+            ["4 fixes state a mean confidence of 0.500", "1 unusable"],
+        ),
+        (
+            OFFSETS[1:],
+            0.5,
+            [[1.0, 0.0], [0.0, 1.0]],
+            ["stated radius is 0.000", "no fix is correct"],
+        ),
         (OFFSETS, 0.5, [[1.0, None], [None, 1.0]], ["1 without one"]),
     ],
 )
@@ -355,7 +365,7 @@ def test_lines_name_thresholds_and_a_missing_radius() -> None:
     lines = calibration_lines(measure(flown(OFFSETS, 0.9, None, radius_m=math.nan), 35.0))
     assert "4 state no radius; 35 m is used" in lines[6]
     assert [line.split(":")[0] for line in lines[7:-1]] == ["  >= 0.5", "  >= 0.9", "  >= 0.99"]
-    assert "50.0 % of them within 35 m (100.0 % of all that are); 2 of 4 wrong" in lines[8]
+    assert "precision within 35 m 50.0 %, recall 100.0 %; 2 of 4 wrong" in lines[8]
 
 
 def test_the_command_evaluates_several_flights(tmp_path, capsys) -> None:
@@ -380,7 +390,10 @@ def test_the_command_evaluates_several_flights(tmp_path, capsys) -> None:
     ]
     assert main(["evaluate", *options]) in (0, None)
     said = capsys.readouterr().out
-    assert "confidence: 1 fixes state 0.950" in said and ">= 0.9: 50.0 % of views" in said
+    assert (
+        "confidence: 1 fix states a mean confidence of 0.950" in said
+        and ">= 0.9: 50.0 % of views" in said
+    )
     assert (
         "covariance: consistent with the errors; NEES of 1 correct fixes has" in said
         and "1 without one" in said

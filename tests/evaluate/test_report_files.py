@@ -144,7 +144,7 @@ def test_the_legend_names_only_visible_marks(coarse) -> None:
     for comparison, radius_m, there in (
         (confident, 15.0, "confident"),
         (confident, 0.5, "confident, off by more than 0.5 m"),
-        (wrong, 0.5, "confident and wrong"),
+        (wrong, 0.5, "false fix"),
         (doubtful, 15.0, "low confidence"),
         (doubtful, 0.5, "low confidence, off by more than 0.5 m"),
     ):

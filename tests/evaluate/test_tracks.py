@@ -623,6 +623,9 @@ def test_evaluate_a_track(golden_flight, tmp_path: Path, capsys, only_new) -> No
     assert isinstance(track["first_view"], int)
     html = (report / "index.html").read_text("utf-8")
     assert html.count("<figure") == 11 and "The worst views. 0003.jpg" in html
+    assert (
+        f"<code>orthonav view {golden_flight[1]} --map {GOLDEN} --flight {flight} --truth" in html
+    )
 
 
 def test_evaluate_refuses_flights_that_do_not_fit(golden_flight, tmp_path, capsys) -> None:

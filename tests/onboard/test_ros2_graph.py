@@ -166,7 +166,7 @@ def test_parameters_of_a_sourced_node(flown, env, tmp_path, distribution):
     parameters = PACKAGE / "config" / "params.yaml"
     asked = tmp_path / "asked.yaml"
     asked.write_text(parameters.read_text().replace("map_frame: map", "map_frame: earth"))
-    words = [PACKAGE / "orthonav_ros" / "node.py", flown[0], "--quiet"]
+    words = [PACKAGE / "orthonav_ros" / "node.py", flown[0]]
     words += ["--ros-args", "--log-level", "error"]
     words += ["--ros-args", "-r", "__node:=orthonav", "-r", "__ns:=/uav1", "--params-file", asked]
     flying = Flying(env, tmp_path, distribution, True, *words, "-r", "image:=/cam/image_raw")

@@ -1,4 +1,4 @@
-"""Where few views are confident, the program finds which value of the set-up is wrong."""
+"""Where few views are confident, the program finds which value of the configuration is wrong."""
 
 import math
 from dataclasses import replace
@@ -138,8 +138,10 @@ def test_a_sample_of_the_doubted_views_is_kept(views):
 def test_a_constant_and_a_varying_heading_read_differently():
     found = Tried(Setup("any heading", any_heading=True), 8, 7, 12.0, 60.0, 1.0)
     assert "from view to view; check the heading column" in setup_text([found], on_map=True)[0]
+    equal = setup_text([replace(found, heading_off_deg=0.3, heading_std_deg=8.0)], on_map=True)[0]
+    assert "with any heading (standard deviation 8 deg); check" in equal
     alone = replace(found, setup=Setup("as reported"))
-    assert "the set-up is right" in setup_text([alone], on_map=True)[0]
+    assert "the configuration is right" in setup_text([alone], on_map=True)[0]
 
 
 def test_the_search_ends_when_it_is_told_to(registering, views):

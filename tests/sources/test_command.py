@@ -156,7 +156,7 @@ def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
     source = folder_of(tmp_path / "recorded")
     (source / "truth.csv").write_text("frame,lat_deg,lon_deg\n0.png,north,east\n")
     code, out, err = run("localize", MAP, source, "--out", tmp_path / "fixes.jsonl")
-    assert code == 0 and "2 views: 2 confident" in out and "truth is ignored: line 2" in err
+    assert code == 0 and "2 views: 2 confident" in out and "ground truth is ignored: line 2" in err
 
 
 def truncated(path):
@@ -221,7 +221,7 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     assert re.search(r"heading +(19|20)\.\d deg", out) and re.search(r"height +1[56]\d\.", out)
     code, out, err = run(*one, "--heading", "unknown", "--out", "-")
     (line,) = map(json.loads, out.splitlines())
-    assert code == 0 and line["frame"] == "photo.png" and "1 views: " in err
+    assert code == 0 and line["frame"] == "photo.png" and "1 view: " in err
     unknown = run(*one)
     assert "none: not a number: yaw_deg (missing_telemetry); give --heading unknown" in unknown.out
     plain = json.loads(run(*one, "--heading", "unknown", "--json").out)

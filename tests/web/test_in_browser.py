@@ -99,11 +99,11 @@ def test_the_run_is_drawn_where_it_is(page, columns):
         "●confident",
         "●tracking",
         "—truth",
-        "◯confident and wrong",
+        "◯false fix",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")
     assert figures.startswith("views 6 confident 83.3 % low confidence 0.0 % no fix 16.7 % within")
-    assert figures.endswith("confident and wrong 1")
+    assert figures.endswith("false fixes 1")
 
 
 def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
@@ -140,10 +140,10 @@ def test_the_worst_view_with_its_images_and_values(page, small, ask):
     east_m, north_m = FRAME.en_from_latlon(fix["lat_deg"], fix["lon_deg"])
     error_m = np.hypot(east_m - PLACES_EN_M[WRONG][0], north_m - PLACES_EN_M[WRONG][1])
     for part in (
-        f"tracking, confident, error {metres_text(error_m)}, CONFIDENT AND WRONG",
+        f"tracking, confident, error {metres_text(error_m)}, FALSE FIX",
         f"confidence {fix['confidence']:.3f} within {metres_text(fix['radius_m'])}",
         f"\N{GREEK SMALL LETTER SIGMA} {metres_text(spread_m)}, heading {fix['heading_deg']:.1f}°",
-        f"{metres_text(fix['agl_m'])} high",
+        f"{metres_text(fix['agl_m'])} above ground",
     ):
         assert part in said
     page.click("#more summary")

@@ -89,8 +89,7 @@ GROUPS = {
         ),
     },
     "try it without data": {
-        "demo": ("generate an area, build a map, simulate a flight, localize it and report", ""),
-        "landscape": ("generate orthophotos of a landscape at several dates", "--out landscape"),
+        "demo": ("build a map, simulate a flight over other imagery, localize it and report", ""),
         "simulate": (
             "simulate a flight over an orthophoto of another year",
             "--ortho other-year.tif --route route.kml --agl-m 120 --out flight",
@@ -213,8 +212,8 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     parser.add_argument(
         "--version",
         action="store_true",
-        help="print the version; with --verbose (or --json) also what is installed, what is "
-        "missing for which command, and the processor's abilities",
+        help="print the version; with --verbose (or --json) also the installed packages, the "
+        "extras that commands lack, and the abilities of the processor",
     )
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")

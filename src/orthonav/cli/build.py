@@ -99,8 +99,8 @@ def add_recipe(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--overlap",
         type=float,
-        metavar="SHARE",
-        help="overlap of neighbouring tiles, as a share of their width (default 0.875)",
+        metavar="FRACTION",
+        help="overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
     )
     parser.add_argument(
         "--method",

@@ -45,8 +45,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     coarse.add_argument(
         "--coarse-overlap",
         type=float,
-        metavar="SHARE",
-        help="overlap of neighbouring coarse tiles, as a share of their width (default 0.875)",
+        metavar="FRACTION",
+        help="overlap of neighbouring coarse tiles, as a fraction of their width (default 0.875)",
     )
     coarse.add_argument(
         "--no-coarse",

@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import beside, print_json, progress
+from orthonav.cli.common import beside, counted, print_json, progress
 from orthonav.cli.heights import dem_of, flight_heights
 from orthonav.cli.source import add_source, open_source
 
@@ -84,9 +84,9 @@ def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_trac
         print_json(_plain(found))
         return
     print(_table(found))
-    print(f"from {found.mount.views} views, {found.first} to {found.last}")
+    print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
     if not by_track:
-        print("the views make no track: this is the mean of single views")
+        print("the views do not form a track: this is the mean of single views")
     if found.moved:
         print("the camera moved in its mount before these views; earlier views are not used")
     print(f"written to {options.out}")

@@ -109,9 +109,9 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--agl-std",
         type=float,
-        metavar="SHARE",
+        metavar="FRACTION",
         default=0.05,
-        help="standard deviation of the reported height, as a share of it (default 0.05)",
+        help="standard deviation of the reported height, as a fraction of it (default 0.05)",
     )
     prior = group.add_mutually_exclusive_group()
     prior.add_argument(
@@ -143,14 +143,14 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--other-sensor",
         action="store_true",
-        help="the camera differs from the map's sensor by more than years do (a drone over "
-        "satellite imagery, infrared): fixes are predicted to be rarer",
+        help="camera and map imagery are of different kinds (drone against satellite, infrared): "
+        "predicts fewer fixes",
     )
     group.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
     group.add_argument(
         "--drift",
         type=float,
-        metavar="SHARE",
+        metavar="FRACTION",
         default=0.03,
         help="error of dead reckoning per metre flown without a fix (default 0.03)",
     )

@@ -114,15 +114,15 @@ def add_search(parser: argparse._ActionsContainer) -> None:
         "--budget-ms",
         type=float,
         metavar="MS",
-        help="time budget of a view: no further search begins that would end later than this after "
-        "the first one began (default: no limit); the best place so far is the answer",
+        help="time limit per view (default: none); a search that would exceed it is not started, "
+        "and the result is the best position so far",
     )
     parser.add_argument(
         "--threads",
         type=int,
         default=1,
         metavar="N",
-        help="threads that share the search of a view (default 1); positions do not depend on them",
+        help="threads that search for one view (default 1); positions do not depend on them",
     )
 
 
@@ -147,6 +147,11 @@ def beside(*outputs: Path | None) -> Iterator[None]:
     taken = any(path is not None and is_stdout(path) for path in outputs)
     with redirect_stdout(sys.stderr) if taken else nullcontext():
         yield
+
+
+def counted(number: int, noun: str) -> str:
+    """A number and its noun: `1 view`, `2,000 views`."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def print_json(plain: Any) -> None:

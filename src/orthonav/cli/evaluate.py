@@ -1,8 +1,9 @@
-"""`orthonav evaluate`: accuracy of fixes against the truth."""
+"""`orthonav evaluate`: accuracy of fixes against the ground truth."""
 
 import argparse
 import json
 import logging
+import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -46,8 +47,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="truth.csv",
-        help="true positions (default: truth.csv of --flight); one for all files of fixes, or one "
-        "for each in the same order",
+        help="ground truth: the true positions (default: truth.csv of --flight); one for all files "
+        "of fixes, or one for each in the same order",
     )
     parser.add_argument(
         "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
@@ -203,7 +204,10 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         metrics = measure(comparison, options.radius_m, rpe_distance_m=options.rpe_distance_m)
         track = measure_track(comparison, results, options.radius_m)
         gnss = measure_gnss(comparison, results)
-        flights.append(FlightReport(names[i], comparison, metrics, background, track, worst, gnss))
+        command = _view_command(options, i)
+        flights.append(
+            FlightReport(names[i], comparison, metrics, background, track, worst, gnss, command)
+        )
     return flights
 
 
@@ -212,7 +216,7 @@ def _warn_of_another_run(
 ) -> None:
     """Log a warning where fixes were computed from another map or flight than the given ones.
 
-    Without a flight, it is the flight folder in which the truth is, if any.
+    Without a flight, it is the flight folder that holds the ground truth, if any.
     """
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
@@ -282,6 +286,20 @@ def _write_report(
         version=__version__,
     )
     write_report(out, flights, made_from, whole=whole)
+
+
+def _view_command(options: argparse.Namespace, i: int) -> str:
+    """The command that shows the single views of the flight number `i`; empty without a map."""
+    if options.map is None:
+        return ""
+    words = ["orthonav", "view", str(options.fixes[i]), "--map", str(options.map)]
+    if options.flight:
+        words += ["--flight", str(options.flight[i])]
+    if not options.flight or options.truth[i] != options.flight[i] / "truth.csv":
+        words += ["--truth", str(options.truth[i])]
+    if options.radius_m != 15.0:
+        words += ["--radius-m", f"{options.radius_m:g}"]
+    return shlex.join(words)
 
 
 def map_background(opened: "MapFile") -> "Background":

@@ -302,7 +302,7 @@ def _add_flight(group: argparse._ActionsContainer) -> None:
         type=numbers(3, "LAT,LON,STD_M"),
         metavar="LAT,LON,STD_M",
         help="start position and its standard deviation per axis (degrees, m; default: anywhere "
-        "on the map); over a map with terrain also the place of take-off",
+        "on the map); over a map with terrain also the take-off position",
     )
     group.add_argument(
         "--state",

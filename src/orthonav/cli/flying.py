@@ -85,6 +85,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
+    console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
     for line in plan_lines(options, opened, least):
         console.say(line)
     camera = camera or source.wait_for_camera()

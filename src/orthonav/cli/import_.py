@@ -5,7 +5,7 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from orthonav.cli.common import print_json, progress
+from orthonav.cli.common import counted, print_json, progress
 from orthonav.cli.heights import dem_of, geoid_for
 from orthonav.cli.source import add_source, open_source
 
@@ -85,6 +85,6 @@ def run(options: argparse.Namespace) -> None:
         print_json({**plain, **asdict(done)})
     else:
         print(
-            f"{done.views} views, {done.complete} with heading, tilt and height, "
+            f"{counted(done.views, 'view')}, {done.complete} with heading, tilt and height, "
             f"{done.with_truth} with a position\nwritten to {options.out}"
         )

@@ -13,7 +13,7 @@ from orthonav.cli.changed import (
     check_comparable,
     report_changes,
 )
-from orthonav.cli.common import add_search, beside, print_json, progress, search_plan
+from orthonav.cli.common import add_search, beside, counted, print_json, progress, search_plan
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
@@ -65,15 +65,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="fixes.jsonl",
-        help="file to write; -: stdout, and the summary on stderr; without it the positions of "
-        "photographs named one by one are printed",
+        help="file to write (-: stdout, with the summary on stderr); without it the command prints "
+        "the positions, if photographs are given one by one",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.add_argument(
         "--no-diagnosis",
         dest="diagnosis",
         action="store_false",
-        help="where few views are confident, do not try other headings and heights to find out why",
+        help="if few views are confident, do not try other headings and heights to find the cause",
     )
     _add_views(parser.add_argument_group("placing views"))
     _add_track(parser.add_argument_group("tracking"))
@@ -380,14 +380,14 @@ def _print_counts(
     named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
     why = f" ({named})" if named else ""
     print(
-        f"{counts.views} views: {counts.confident} confident ({least}), {counts.low} of low "
-        f"confidence, {counts.none} without a position{why}; "
+        f"{counted(counts.views, 'view')}: {counts.confident} confident ({least}), "
+        f"{counts.low} of low confidence, {counts.none} without a position{why}; "
         f"median {median_ms or 0:.1f} ms per view"
     )
     for line in advice:
         print(f"! {line}")
     for each in options.export:
-        print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
+        print(f"{counted(counts.confident, 'camera position')}: {each.partition('=')[2]}")
     guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
     if options.out is not None:
         print(f"written to {'stdout' if is_stdout(options.out) else options.out}{guesses}")

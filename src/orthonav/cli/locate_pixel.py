@@ -19,8 +19,8 @@ log = logging.getLogger(__name__)
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.epilog = (
-        "The 95 % ellipse is rather too large than too small; it holds no error of the terrain, "
-        "nor the height of houses and trees."
+        "The 95 % ellipse is conservative. It excludes errors of the terrain and the height of "
+        "buildings and trees."
     )
     parser.add_argument(
         "fixes", type=Path, metavar="fixes.jsonl", help="fixes, as written by `orthonav localize`"

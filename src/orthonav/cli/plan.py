@@ -42,8 +42,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--overlap",
         type=float,
         default=0.875,
-        metavar="SHARE",
-        help="overlap of neighbouring tiles, as a share of their width (default 0.875)",
+        metavar="FRACTION",
+        help="overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
     )
     parser.add_argument(
         "--no-registration",

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from orthonav.cli.common import counted
+
 MAX_SHOWN = 12
 
 
@@ -12,13 +14,14 @@ def plan_text(plain: dict[str, Any]) -> str:
         lines.append(_row("route", _route(plain["route"])))
     if plain["view"] is not None:
         lines += _view(plain["view"])
-    lines += _map(plain["map"], None if plain["route"] is None else plain.get("out", "FILE"))
+    out = None if plain.get("out") == "-" else plain.get("out")
+    lines += _map(plain["map"], None if plain["route"] is None else out or "FILE")
     if plain["terrain"] is not None:
         lines += _terrain(plain["terrain"])
     for caution in plain["cautions"]:
         lines.append(_row("caution", caution["text"]))
     if "out" in plain:
-        lines.append(_row("written", plain["out"]))
+        lines.append(_row("written", out or "to stdout"))
     return "\n".join(lines)
 
 
@@ -28,14 +31,14 @@ def _row(name: str, text: str) -> str:
 
 def _route(route: dict[str, Any]) -> str:
     name = f"{route['name']}, " if route["name"] else ""
-    text = f"{name}{_count(route['waypoints'], 'waypoint')}, {route['length_m'] / 1000:.2f} km"
+    text = f"{name}{counted(route['waypoints'], 'waypoint')}, {route['length_m'] / 1000:.2f} km"
     if route["duration_s"] is not None:
         seconds = route["duration_s"]
         text += f", {seconds:.0f} s" if seconds < 300 else f", {seconds / 60:.0f} min"
     if route["heights_above"]:
         text += f", heights above {' and '.join(map(_reference, route['heights_above']))}"
     if route["legs_with_own_band"]:
-        text += f", {_count(route['legs_with_own_band'], 'leg')} with a band of its own"
+        text += f", {counted(route['legs_with_own_band'], 'leg')} with a band of its own"
     if route["legs_with_own_band"] < max(1, route["waypoints"] - 1):
         text += f", search band {route['band_m']:.0f} m"
     return text
@@ -104,7 +107,3 @@ def _terrain(legs: list[dict[str, Any]]) -> list[str]:
 
 def _degrees(value: float) -> str:
     return f"{value:.6f}".rstrip("0").rstrip(".")
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'' if number == 1 else 's'}"

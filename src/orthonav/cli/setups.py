@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from orthonav.onboard.setups import Tried
 
 BUDGET_S = 15.0
-"""After so long no further view is placed: the search for another set-up takes at most 20 s."""
+"""After so long no further view is localized: the search for the cause takes at most 20 s."""
 _SCATTERED_DEG = 20.0
 """Headings that differ by a constant scatter less about it: compasses err by some degrees."""
 
@@ -64,7 +64,7 @@ class Counts:
 
     @property
     def few(self) -> bool:
-        """Whether so few views are confident that the set-up may be wrong."""
+        """Whether so few views are confident that the configuration may be wrong."""
         from orthonav.onboard.setups import FEW
 
         return self.confident < FEW * self.views
@@ -109,7 +109,7 @@ class SetupAdvice:
     def advice(
         self, results: "Sequence[ViewResult]", accept: "Acceptance", shown: "Progress"
     ) -> "tuple[list[str], list[dict[str, Any]]]":
-        """Sentences on what to check, and the set-ups that were tried as JSON values.
+        """Sentences on what to check, and the configurations that were tried as JSON values.
 
         Both are empty where enough views are confident.
         """
@@ -129,9 +129,9 @@ class SetupAdvice:
         try:
             tried, ended = self._tried(accept, shown)
         except KeyboardInterrupt:  # skips the search; the results are written
-            return [*lines, "the search for another set-up was interrupted"], []
+            return [*lines, "the search for another configuration was interrupted"], []
         if ended:
-            lines.append(f"the search for another set-up was ended after {BUDGET_S:.0f} s")
+            lines.append(f"the search for another configuration was ended after {BUDGET_S:.0f} s")
         if tried:
             lines += setup_text(tried, on_map=self._nearest is not None)
         return lines, [
@@ -140,12 +140,12 @@ class SetupAdvice:
         ]
 
     def _tried(self, accept: "Acceptance", shown: "Progress") -> "tuple[list[Tried], bool]":
-        """The set-ups that were tried, and whether the time for it ran out."""
+        """The configurations that were tried, and whether the time for it ran out."""
         from orthonav.onboard.setups import try_setups
 
         options, end_s = self._options, time.monotonic() + BUDGET_S
         reporter(options)(
-            "few views are confident: trying other set-ups on some of them for up to "
+            "few views are confident: trying other configurations on some of them for up to "
             f"{BUDGET_S:.0f} s (Ctrl-C or --no-diagnosis skips this)"
         )
         tried = try_setups(
@@ -156,7 +156,7 @@ class SetupAdvice:
             heading_known=options.heading == "known",
             tracked=bool(options.track or options.smooth),
             stop=lambda: time.monotonic() > end_s,
-            progress=lambda share: shown("set-ups", share),
+            progress=lambda share: shown("configurations", share),
         )
         return tried, time.monotonic() > end_s
 
@@ -185,7 +185,7 @@ def setup_text(tried: "Sequence[Tried]", *, on_map: bool) -> list[str]:
             "camera and the ground"
         )
         tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
-        return [f"no other set-up explains it ({tested}); {where}"]
+        return [f"no other configuration explains it ({tested}); {where}"]
     found = f"{last.confident} of {last.views} views of low confidence become confident"
     lines = [f"{found} {_explanation(last)}"]
     return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
@@ -198,22 +198,23 @@ def _listed(tried: "Iterable[Tried]") -> str:
 def _explanation(found: "Tried") -> str:
     setup, parts, checks = found.setup, [], []
     if setup.name == "as reported":
-        return "if placed one by one: the set-up is right, but the views make no track"
+        return (
+            "if localized one by one: the configuration is right, but the views do not form a track"
+        )
     if setup.without_prior:
         return "without the prior; check the prior positions"
     if setup.radians:
-        return "with the headings taken as radians"
+        return "if the headings are read as radians"
     if setup.mirrored:
         return "if mirrored left to right, with any heading; check where the images come from"
     if setup.any_heading:
         off, std = found.heading_off_deg, found.heading_std_deg
         constant = std < _SCATTERED_DEG
-        apart = (
-            f"{off:+.0f} deg from the reported one (standard deviation {std:.0f} deg)"
-            if constant
-            else "which differs from the reported one from view to view"
-        )
-        parts.append(f"with any heading, {apart}")
+        apart = ", which differs from the reported one from view to view"
+        if constant:
+            apart = f", {off:+.0f} deg from the reported one" if round(off) else ""
+            apart += f" (standard deviation {std:.0f} deg)"
+        parts.append(f"with any heading{apart}")
         checks.append("the heading column" + " and the mounting of the camera" * constant)
     if setup.factor != 1.0:
         ratio = found.height_ratio

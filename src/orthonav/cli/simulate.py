@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from orthonav.cli.common import ROUTE_HELP, add_dem, add_orthos, print_json, progress
+from orthonav.cli.common import ROUTE_HELP, add_dem, add_orthos, counted, print_json, progress
 from orthonav.cli.heights import dem_of
 
 EVERYDAY = (
@@ -87,8 +87,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--agl-std",
         type=float,
         default=0.0,
-        metavar="SHARE",
-        help="standard deviation of the reported height, as a share of it (default 0)",
+        metavar="FRACTION",
+        help="standard deviation of the reported height, as a fraction of it (default 0)",
     )
     errors.add_argument(
         "--tilt-std-deg",
@@ -111,9 +111,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     errors.add_argument(
         "--velocity-drift",
         type=float,
-        metavar="SHARE",
-        help="standard deviation of the scale error (a share) and the direction error (rad) of the "
-        "reported velocity (default: no velocity is reported)",
+        metavar="FRACTION",
+        help="standard deviation of the scale error (a fraction) and the direction error (rad) of "
+        "the reported velocity (default: no velocity is reported)",
     )
     tilt = parser.add_argument_group("unreported tilt")
     tilt.add_argument(
@@ -138,8 +138,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--agl-bias",
         type=float,
         default=0.0,
-        metavar="SHARE",
-        help="reported height minus true height, as a share of it: 0.05 is 5 %%",
+        metavar="FRACTION",
+        help="reported height minus true height, as a fraction of it: 0.05 is 5 %%",
     )
     biases.add_argument(
         "--pitch-bias-deg",
@@ -164,14 +164,14 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--cloud-share",
         type=float,
         default=0.0,
-        metavar="SHARE",
-        help="share of the views with clouds, 0 to 1 (default 0)",
+        metavar="FRACTION",
+        help="fraction of the views with clouds, 0 to 1 (default 0)",
     )
     effects.add_argument(
         "--exposure-std",
         type=float,
         default=0.15,
-        metavar="SHARE",
+        metavar="FRACTION",
         help="standard deviation of the relative exposure (default 0.15)",
     )
     effects.add_argument(
@@ -259,4 +259,4 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         print_json({"flight": str(options.out), "views": views})
     else:
-        print(f"{views} views written to {options.out}")
+        print(f"{counted(views, 'view')} written to {options.out}")

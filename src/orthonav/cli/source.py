@@ -89,7 +89,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         help="field of view across the width of the images, where the camera is not known",
     )
     group.add_argument(
-        "--agl-m", type=float, help="height above ground of all views, in place of a recorded one"
+        "--agl-m", type=float, help="height above ground of all views, instead of a recorded one"
     )
     group.add_argument(
         "--ground-alt-m",

@@ -44,7 +44,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="truth.csv",
-        help="true positions (default: those of the flight folder, if any)",
+        help="ground truth: the true positions (default: those of the flight folder, if any)",
     )
     parser.add_argument(
         "--mount",

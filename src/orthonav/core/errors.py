@@ -41,7 +41,7 @@ class MapVersionError(MapFileError):
 
 
 class FlightError(OrthonavError, ValueError):
-    """A flight folder, its telemetry, its truth or one of its images is broken."""
+    """A flight folder, its telemetry, its ground truth or one of its images is broken."""
 
 
 class CameraError(OrthonavError, ValueError):

@@ -26,9 +26,9 @@ recorded flights are off by several degrees (docs/tracking.md)."""
 MIN_YAW_STD_DEG = 2.0
 """Least deviation of a reported heading that searches allow for."""
 TILE_YAW_STD_DEG = 5.0
-"""The same default where views are placed by their tiles alone. It differs on purpose: 5 deg make
-three headings 6 deg apart, which is what docs/decisions/embedding.md measured; 7 deg would make
-five, and change every figure of the embedding alone."""
+"""The same default where views are localized by their tiles alone. It differs on purpose: 5 deg
+make three headings 6 deg apart, as measured in docs/decisions/embedding.md; 7 deg would make five,
+and change every figure of the embedding alone."""
 DEFAULT_AGL_STD = 0.08
 """Standard deviation of a reported height that comes without one, over the height."""
 DEFAULT_TILT_STD_DEG = 3.0
@@ -264,7 +264,7 @@ class ViewResult:
 
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
-    track (`searching`, `tracking`, `coasting`, `lost`), None where views are placed one by one.
+    track (`searching`, `tracking`, `coasting`, `lost`), None where views are localized one by one.
     `accepted`: whether a fix met the criterion of `--accept`, None where none was given.
     """
 

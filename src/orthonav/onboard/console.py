@@ -25,11 +25,12 @@ class Console:
     """Takes lines and never blocks. Thread-safe.
 
     `is_terminal`: whether a person may be reading. `is_open`: whether there is a stream at all.
+    `quiet`: warnings only.
     """
 
     def __init__(self, stream: TextIO | None, clocks: Clocks, *, quiet: bool = False) -> None:
-        """`stream`: usually stderr; None where it is closed. `quiet`: warnings only."""
-        self._clocks, self._quiet = clocks, quiet
+        """`stream`: usually stderr; None where it is closed."""
+        self._clocks, self.quiet = clocks, quiet
         self._begun_ns = clocks.mono_ns()
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_LINES)
         descriptor = _descriptor(stream)
@@ -42,7 +43,7 @@ class Console:
 
     def say(self, text: str) -> None:
         """Write a line, unless quiet."""
-        if not self._quiet:
+        if not self.quiet:
             self.put(text)
 
     def warn(self, text: str) -> None:

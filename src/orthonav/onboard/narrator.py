@@ -287,7 +287,7 @@ def _counted(counts: Counter[str], sends: bool) -> str:
     """Views, and what became of them."""
     reasons = {name[9:]: n for name, n in counts.most_common() if name.startswith("withheld ")}
     good = f"{counts['']} sent" if sends else f"{counts['']} with a position (none is sent)"
-    text = f"{counts['views']} views, {good}"
+    text = f"{counts['views']} view{'' if counts['views'] == 1 else 's'}, {good}"
     if not reasons:
         return text
     named = ", ".join(f"{name} {number}" for name, number in reasons.items())

@@ -1,8 +1,8 @@
-"""Other set-ups, tried on views that are not confident: which value of the telemetry is wrong?
+"""Other configurations, tried on views that are not confident, to find the wrong value.
 
 A wrong heading, height, focal length or a mirrored image lowers the confidence of every view, and
-so does a map of another area. A few of the views of low confidence are placed again with one value
-changed at a time. The change that makes them confident names the value to check.
+so does a map of another area. A few of the views of low confidence are localized again with one
+value changed at a time. The change that makes them confident names the value to check.
 """
 
 import math
@@ -23,20 +23,20 @@ from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 
 V = TypeVar("V", bound=RecordedView)
 FEW = 0.5
-"""Below this share of confident views the set-up may be wrong, and from this share on a change
+"""Below this fraction of confident views the configuration may be wrong; a change that reaches it
 explains it."""
 SAMPLE = 8
-"""At most so many views are placed again."""
+"""At most so many views are localized again."""
 _GIVE_UP = 4
 """A change that makes none of so many views confident is left."""
 _RETRIED = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidence")
-"""Reasons of views without a position that another set-up may give one."""
+"""Reasons of views without a position that another configuration may give one."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """One change of the set-up. `changed` makes the view as it then is; `factor` is that of the
-    height, 1 where it stays."""
+    """One change of the configuration. `changed` makes the view as it then is; `factor` is that of
+    the height, 1 where it stays."""
 
     name: str
     any_heading: bool = False
@@ -79,7 +79,7 @@ _ORDER = (
 
 @dataclass(frozen=True)
 class Tried:
-    """What a change did: `views` were placed again, `confident` of them are.
+    """What a change did: `views` were localized again, `confident` of them are.
 
     `heading_off_deg`, `heading_std_deg`: mean and standard deviation of the heading found, less the
     reported one. `height_ratio`: median of the height found over the reported one. All three are
@@ -144,7 +144,7 @@ def try_setups(
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Tried]:
-    """What each change of the set-up does to the views, in the order in which they were tried.
+    """What each change of the configuration does to the views, in the order of the trials.
 
     `stop` is asked before each view and ends the search: the last change may then have been tried
     on fewer views, and may be missing. `accepts` says whether an outcome is confident. The first

@@ -160,7 +160,7 @@ def read_truth(path: Path) -> dict[str, tuple[float, float]]:
 
     Raises `MissingFileError` or `FlightError`, naming the line.
     """
-    path = require_file(path, "truth")
+    path = require_file(path, "ground truth")
     truth: dict[str, tuple[float, float]] = {}
     for line, row in csv_rows(path, ("frame", "lat_deg", "lon_deg")):
         lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])

@@ -146,7 +146,7 @@ class FlownHeights:
         use_prior: bool = True,
     ) -> None:
         """`area_deg`: latitudes and longitudes spread over the area searched. `take_off`: latitude,
-        longitude and standard deviation (m) of the place of take-off."""
+        longitude and standard deviation (m) of the take-off position."""
         self._terrain, self._area_deg = terrain, area_deg
         self._use_prior = use_prior
         known = None
@@ -237,7 +237,7 @@ def warn_of_mismatch(off_m: float) -> None:
     if abs(off_m) > MISMATCH_M:
         log.warning(
             "heights above take-off and above sea level differ by %.0f m over this terrain: check "
-            "its vertical datum, the place of take-off and the altitude of the autopilot",
+            "its vertical datum, the take-off position and the altitude of the autopilot",
             off_m,
         )
 
@@ -278,7 +278,7 @@ class TerrainFit:
             self._say(
                 "datum",
                 "by the views the aircraft is %.0f m %s than reported over this terrain: check its "
-                "vertical datum, the place of take-off and the altitude of the autopilot",
+                "vertical datum, the take-off position and the altitude of the autopilot",
                 abs(middle_m),
                 "higher" if middle_m > 0 else "lower",
             )

@@ -64,7 +64,7 @@ class Camera:
             raise CameraError(f"camera focal length must be above 0 px: {self}")
         if not 0 <= self.focal_std <= MAX_FOCAL_STD:
             raise CameraError(
-                f"camera focal_std must be a share of 0 to {MAX_FOCAL_STD}, got {self.focal_std}"
+                f"camera focal_std must be a fraction, 0 to {MAX_FOCAL_STD}, got {self.focal_std}"
             )
         if self.model not in ("brown", "fisheye"):
             raise CameraError(f"camera model must be brown or fisheye, got '{self.model}'")

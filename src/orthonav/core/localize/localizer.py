@@ -40,7 +40,7 @@ class Localizer:
     ) -> None:
         """Take an opened map; raises `MapFileError` if this program cannot fly it.
 
-        Without `registration`, or where the map has no registration layer, views are placed by
+        Without `registration`, or where the map has no registration layer, views are localized by
         their tiles only; `position` is then the rule by which scores of tiles become a position.
         Without `flying`, maps whose representation is too slow to fly are accepted too: for
         experiments with maps of one's own, because such a representation loads networks from this

@@ -155,7 +155,7 @@ class RegistrationLocalizer:
         ground = self.on_ground(prepared)
         found = self.best(prepared, prior, ground)
         if found is None:
-            detail = "no place of the map could be compared with the view"
+            detail = "no part of the map could be compared with the view"
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
             return RegisteredView(prepared, NoFix("no_match", detail))

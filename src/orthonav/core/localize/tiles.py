@@ -84,7 +84,7 @@ class TileLocalizer:
             return refused
         rows = self._allowed(prior, [each.offset_en_m for each in rectified])
         if rows is not None and rows.size == 0:
-            return NoFix("outside_map", "no tile of the map lies where the prior says")
+            return NoFix("outside_map", "no tile of the map lies within the prior")
         match = self.matcher.match(self.embedded(rectified), rows)
         if not math.isfinite(match.evidence["score"]):
             return NoFix("internal_error", "the map's embeddings are not finite")

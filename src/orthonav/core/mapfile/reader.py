@@ -147,12 +147,12 @@ class MapFile:
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
-        """South, west, north and east of the first sheet, degrees."""
+        """West, south, east and north of the first sheet, degrees."""
         sheet = self.manifest.sheets[0]
         west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
         corners_en_m = [(x, y) for x in (west_m, east_m) for y in (south_m, north_m)]
         lat, lon = sheet.frame.latlon_from_en(corners_en_m)
-        return float(lat.min()), float(lon.min()), float(lat.max()), float(lon.max())
+        return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
 
     def contains(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether a position is on the first sheet."""

@@ -213,7 +213,10 @@ class Tracker:
             tilt_std_deg=tilt_std_deg,
             vel_en_mps=vel_en_mps,
         )
-        return self.locate(view)
+        found = self.locate(view)
+        if isinstance(found, NoFix) and found.reason == "missing_telemetry":
+            return replace(found, detail=found.detail.replace("yaw_deg", "heading_deg"))
+        return found
 
     def __repr__(self) -> str:
         return f"Tracker({self._localizer.opened.path}, {self.state.value})"
@@ -250,7 +253,7 @@ class Tracker:
         """
         before, telemetry = filtered
         if smoothed is None:
-            return NoFix("searching", "no place was found")
+            return NoFix("searching", "no position was found")
         spread = float(np.trace(smoothed.covariance[:2, :2]))
         if isinstance(before, Fix) and spread > float(np.trace(before.cov_en_m2)):
             return before
@@ -268,7 +271,7 @@ class Tracker:
         """The estimate of the mixture as a fix, recorded for smoothing."""
         estimate = self.mixture.estimate(self._radius_m(telemetry))
         self.state = State.SEARCHING if estimate is None else estimate.state
-        outcome: Fix | NoFix = refused or NoFix("searching", "no place has been found yet")
+        outcome: Fix | NoFix = refused or NoFix("searching", "no position has been found yet")
         if estimate is not None:
             more = {
                 "hypotheses": float(len(self.mixture.hypotheses)),

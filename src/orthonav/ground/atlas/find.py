@@ -132,7 +132,7 @@ class PlaceFinder:
         return self._outcome()
 
     def _expected(self, view: View, coarse: RectifiedView, time_ns: int) -> list[SearchRegion]:
-        """Where the likeliest chains expect the view."""
+        """Where the most likely one chains expect the view."""
         found = []
         chains = self._agreement.chains[:FOLLOWED]
         for each in chains:
@@ -171,12 +171,12 @@ class PlaceFinder:
         agreement = self._agreement
         best = agreement.best
         if best is None:
-            return NoFix("no_match", "no place of the atlas could be compared with the view")
+            return NoFix("no_match", "no part of the atlas could be compared with the view")
         if not agreement.agreed or agreement.confidence < CONFIDENT:
             return NoFix(
                 "searching",
                 f"{len(agreement.chains)} places are possible; {best.views:.1f} views support the "
-                "likeliest",
+                "most likely one",
             )
         seen = tuple((self._views[each.key], each) for each in best.latest(REPLAYED))
         return FoundPlace(seen, START_PX * self._search.atlas.recipe.gsd_m, agreement.confidence)

@@ -47,7 +47,7 @@ def reliability_picture(calibration: ConfidenceCalibration) -> Drawing:
         else:
             above.text(0.5, 0.5, "no fix states a confidence", ha="center", bbox=BACKING)
         above.set(xlim=(-0.015, 1.015), ylim=(-0.02, 1.04))
-        above.set(ylabel="share with an error\nwithin the stated radius")
+        above.set(ylabel="fraction with an error\nwithin the stated radius")
         _draw_counts(below, calibration)
         below.set(xlabel="stated confidence")
         figure.align_ylabels()
@@ -69,19 +69,19 @@ def nees_picture(consistency: CovarianceConsistency) -> Drawing:
             _draw_band(axes, x, expected, nees.size)
             shares = 100 * np.arange(nees.size + 1) / nees.size
             steps = (np.append(_NEES_AXIS[0], nees), shares)
-            label = f"right fixes ({nees.size})"
+            label = f"correct fixes ({nees.size})"
             axes.step(*steps, where="post", color=RIGHT, linewidth=2, label=label)
             axes.plot([nees[-1], _NEES_AXIS[1]], [100, 100], color=RIGHT, linewidth=2)
             _draw_levels(axes, consistency)
             _draw_summary(axes, consistency)
         else:
-            said = "no right fix has a usable covariance"
+            said = "no correct fix has a usable covariance"
             axes.text(0.5, 0.5, said, ha="center", transform=axes.transAxes, bbox=BACKING)
         axes.text(0.02, 0.955, "under-confident", va="top", transform=axes.transAxes, **_SIDE)
         axes.text(0.98, 0.04, "over-confident", ha="right", transform=axes.transAxes, **_SIDE)
         axes.set(xscale="log", xlim=(_NEES_AXIS[0], high), ylim=(0, 104))
         axes.set(xlabel="normalized error squared, eᵀC⁻¹e (no unit)")
-        axes.set(ylabel="share of right fixes below it (%)")
+        axes.set(ylabel="percentage of correct fixes below it")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
@@ -107,7 +107,7 @@ def _draw_verdict(axes: "Axes", calibration: ConfidenceCalibration) -> None:
     text = (
         f"ECE {calibration.ece:.3f} · Brier {calibration.brier:.3f}\n"
         f"mean confidence {calibration.mean_confidence:.2f}, "
-        f"share right {calibration.share_right:.2f}"
+        f"fraction correct {calibration.share_right:.2f}"
     )
     axes.set_title(text, fontsize=9, color=SOFT, linespacing=1.4)
 

@@ -128,8 +128,8 @@ def calibration_figures(metrics: Metrics) -> tuple[Figure, Figure]:
         Figure(
             "reliability",
             f"Reliability diagram of confidence: {confidence_text(metrics)}",
-            "Share of correct fixes over their confidence, with 95 % intervals (Wilson); dashed: "
-            "ideal; orange: the gap. Below: fixes per bin.",
+            "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); "
+            "dashed: ideal; orange: the difference. Below: fixes per bin.",
             calibration_plots.reliability_picture(metrics.calibration),
         ),
         Figure(
@@ -151,9 +151,9 @@ def criteria_header(metrics: Metrics) -> tuple[str, ...]:
         "at least",
         "accepted",
         "of all views",
-        f"of these within {radius}",
-        f"of all within {radius} accepted",
-        f"of these wrong by > {far}",
+        f"precision within {radius}",
+        "recall",
+        f"wrong by > {far}",
     )
 
 
@@ -180,9 +180,10 @@ def confidence_text(metrics: Metrics) -> str:
         return "unknown, no fix states one"
     n_default = calibration.n_fixes - calibration.n_own_radius
     default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
+    stated = "1 fix states" if calibration.n_fixes == 1 else f"{calibration.n_fixes} fixes state"
     return (
-        f"{calibration.n_fixes} fixes state {calibration.mean_confidence:.3f} on average, and "
-        f"{calibration.share_right:.3f} of them are within the stated radius{default}; "
+        f"{stated} a mean confidence of {calibration.mean_confidence:.3f}; the fraction within the "
+        f"stated radius is {calibration.share_right:.3f}{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
 
@@ -235,8 +236,8 @@ def nees_text(nees: float, low: float, high: float) -> str:
 
 def _accepted(row: CriterionRow, radius_m: float) -> str:
     return (
-        f"{percent_text(row.share_accepted)} of views accepted, {percent_text(row.accuracy)} of "
-        f"them within {radius_m:g} m ({percent_text(row.recall)} of all that are); "
+        f"{percent_text(row.share_accepted)} of views accepted, precision within {radius_m:g} m "
+        f"{percent_text(row.accuracy)}, recall {percent_text(row.recall)}; "
         f"{row.n_far} of {row.n_accepted} wrong by more than {row.far_m:g} m "
         f"({percent_text(row.share_far)})"
     )

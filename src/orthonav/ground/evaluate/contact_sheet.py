@@ -303,7 +303,7 @@ def _few_greys() -> "Colormap":
 
 
 def _draw_marks(axes: "Axes", marked: dict[str, NDArray[np.float64]]) -> None:
-    """A cross at the estimate, a ring at the truth, where they lie within the picture."""
+    """A cross at the estimate, a ring at the true position, where they lie within the picture."""
     styles = {"estimate": ("+", RIGHT, 15.0), "truth": ("o", WRONG, 10.0)}
     for name, at in marked.items():
         mark, colour, size = styles[name]

@@ -40,11 +40,12 @@ _COLUMNS = (
 class FlightReport:
     """One evaluated flight.
 
-    `comparison`: results with their truth; `metrics`: figures of these.
+    `comparison`: results with their true positions; `metrics`: figures of these.
     `background`: image in the plane of `comparison`; optional.
-    `track`: metrics of the track; None where views were placed one by one.
+    `track`: metrics of the track; None where views were localized one by one.
     `worst`: rows of the contact sheet; empty where images were not requested.
     `gnss`: GNSS beside the map; None where it was not recorded.
+    `view_command`: command that shows single views; empty without a map.
     """
 
     name: str
@@ -54,6 +55,7 @@ class FlightReport:
     track: TrackMetrics | None = None
     worst: tuple[Row, ...] = ()
     gnss: GnssMetrics | None = None
+    view_command: str = ""
 
 
 def total(flights: Sequence[FlightReport]) -> Metrics:

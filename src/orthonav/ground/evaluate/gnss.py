@@ -30,7 +30,7 @@ _LEARNT = {
 
 @dataclass(frozen=True, eq=False)
 class GnssMetrics:
-    """GNSS and map against the truth, over the compared views (N,).
+    """GNSS and map against ground truth, over the compared views (N,).
 
     `seconds_s`: time since the first view. `errors_m`: of GNSS. `map_errors_m`: of the fixes.
     `differences_m`: distance between both; NaN where one of them is missing, as above.

@@ -207,7 +207,7 @@ def wrong_key(far_m: float) -> str:
 def compare(
     truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
 ) -> Comparison:
-    """Results matched with the truth by frame name.
+    """Results matched with ground truth by frame name.
 
     `local` is the plane of the positions, by default centred on the first true position. A true
     position that is not finite counts as missing. Raises `FlightError` where no result has a
@@ -244,7 +244,7 @@ def compare(
 def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
     """Metrics of a file of fixes (`fixes.jsonl`) against the true positions of a `truth.csv`.
 
-    Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the truth seem
+    Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the file seem
     to be swapped, or `ValueError` for a radius that is not positive.
     """
     known, results = read_truth(Path(truth)), read_results(Path(fixes))
@@ -384,7 +384,7 @@ def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> Crite
 
 
 def worst_views(comparison: Comparison, n: int = 10, wrong_above_m: float = FAR_M) -> list[int]:
-    """Indices of the `n` fixes with the largest error, confident and wrong ones first."""
+    """Indices of the `n` fixes with the largest error, false fixes first."""
     fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
     wrong = comparison.confident_wrong(wrong_above_m)
     order = np.lexsort((-comparison.errors_m[fixes], ~wrong[fixes]))

@@ -1,6 +1,6 @@
 """Figures of an evaluation: map, error curve, criteria, errors over time.
 
-Colour shows confidence and the mark shows the error; confident and wrong fixes stand out by both.
+Colour shows confidence and the mark shows the error; false fixes stand out by both.
 """
 
 import math
@@ -57,7 +57,7 @@ def fix_classes(
         (f"low confidence, {beyond}", off & ~confident, LOW_CONFIDENCE, "x", 5.5),
         ("confident", near & confident, RIGHT, "o", 5.0),
         (f"confident, {beyond}", off & confident & ~wrong, RIGHT, "x", 5.5),
-        ("confident and wrong", wrong, WRONG, "X", 7.5),
+        ("false fix", wrong, WRONG, "X", 7.5),
     ]
 
 
@@ -99,7 +99,7 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
         note = f"{100 * metrics.accuracy:.0f} % within {radius_m:g} m"
         axes.annotate(note, (radius_m, 100 * metrics.accuracy), (8, lift), **OFFSET, color=WRONG)
         axes.set(xscale="log", xlim=(low, high), ylim=(0, 107))
-        axes.set(xlabel="error (m)", ylabel="share of all views (%)")
+        axes.set(xlabel="error (m)", ylabel="percentage of all views")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
 
@@ -118,8 +118,8 @@ def criteria_picture(metrics: Metrics) -> Drawing:
         lowest = min((float(tail.min()) for tail in tails if tail.size), default=0.0)
         bottom = max(0.0, math.floor(lowest * 10 - 0.5) * 10)
         axes.set(xlim=(0, 102), ylim=(min(bottom, 85.0), 101.5))
-        axes.set(xlabel="share of all views accepted (%)")
-        axes.set(ylabel=f"of these within {metrics.radius_m:g} m (%)")
+        axes.set(xlabel="percentage of all views accepted")
+        axes.set(ylabel=f"percentage of these within {metrics.radius_m:g} m")
         if drawn:
             _draw_thresholds(axes, metrics)
             axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
@@ -207,7 +207,9 @@ def _draw_positions(
         "markerfacecolor": "white",
         "zorder": 4,
     }
-    axes.plot(*truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label=_if("truth", ~none))
+    axes.plot(
+        *truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label=_if("ground truth", ~none)
+    )
     for order, (label, chosen, colour, mark, size) in enumerate(fix_classes(comparison, radius_m)):
         if not chosen.any():
             continue
@@ -218,7 +220,9 @@ def _draw_positions(
         style: dict[str, Any] = {"color": colour, "markersize": size, "zorder": 5 + order / 10}
         label += f" ({outside} outside)" if outside else ""
         axes.plot(*fixes[chosen].T, mark, **style, label=label)
-    axes.plot(*truth[none].T, color=TRUTH, markersize=4.5, label=_if("truth, no fix", none), **ring)
+    axes.plot(
+        *truth[none].T, color=TRUTH, markersize=4.5, label=_if("ground truth, no fix", none), **ring
+    )
 
 
 def _draw_criterion(axes: "Axes", curve: CriterionCurve) -> None:

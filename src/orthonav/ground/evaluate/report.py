@@ -124,7 +124,7 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
         ),
         (
             f"{metrics.n_confident_wrong} of {metrics.n_confident}",
-            "confident fixes are wrong" + f" ({bound})" * (metrics.n_confident > 0),
+            "false fixes among confident fixes" + f" ({bound})" * (metrics.n_confident > 0),
             "bad" if metrics.n_confident_wrong else "",
         ),
         (
@@ -179,6 +179,7 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
     """What the template shows of one flight."""
     return {
         "name": flight.name,
+        "view_command": flight.view_command,
         "figures": drawn.general,
         "track": (
             *(track_rows(flight.track) if flight.track else ()),
@@ -250,14 +251,14 @@ def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
             "error-curve",
             f"Error curve: {percent_text(metrics.accuracy)} of all views within "
             f"{metrics.radius_m:g} m",
-            "Share of all views with a fix within an error.",
+            "Percentage of all views with a fix whose error is at most the value on the axis.",
             plots.error_curve_picture(comparison, metrics),
         ),
         Figure(
             "accepted-against-accuracy",
-            "Share of views accepted against accuracy among them, per confidence criterion",
-            "Share of views that a stricter criterion accepts, and how many of them are correct, "
-            "with thresholds; the ring marks a confidence of 0.9.",
+            "Percentage of views accepted against accuracy among them, per confidence criterion",
+            "Percentage of views that a stricter criterion accepts, and percentage of these that "
+            "are correct, with thresholds; the ring marks a confidence of 0.9.",
             plots.criteria_picture(metrics),
         ),
         *calibration_figures(metrics),

@@ -1,4 +1,4 @@
-"""Metrics of a tracked flight (`ViewResult.state`), given the truth.
+"""Metrics of a tracked flight (`ViewResult.state`), given ground truth.
 
 States and confidence are those of all results, errors those of the views with a true position. A
 view represents the time and the path until the next one. Where times are unknown or do not rise,

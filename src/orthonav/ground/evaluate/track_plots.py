@@ -64,7 +64,7 @@ def track_figures(
         ),
         Figure(
             "track-ahead-and-right",
-            f"Errors ahead of the truth: {spread_text(track.along)}; "
+            f"Errors ahead of the true position: {spread_text(track.along)}; "
             f"to the right of it: {spread_text(track.across)}",
             "Errors ahead and to the right of the true position. Errors of heading or mount appear "
             "as constants, whatever the course.",
@@ -75,7 +75,7 @@ def track_figures(
         figures.append(
             Figure(
                 "track-biases",
-                "Estimated biases of reported heading, height and tilt over time",
+                "Estimated biases of reported heading, height and tilt (pitch and roll)",
                 "Estimated biases, to be added to the reported values.",
                 biases_picture(series),
             )
@@ -100,7 +100,7 @@ def track_map_picture(
         lines[0::3], lines[1::3] = comparison.truth_en_m[wrong], comparison.fix_en_m[wrong]
         axes.plot(*lines.T, color=WRONG, linewidth=1.8 if wrong.sum() < 30 else 0.9, zorder=3)
         axes.plot(*comparison.truth_en_m.T, color="white", linewidth=3.4, zorder=2)
-        axes.plot(*comparison.truth_en_m.T, ".-", **_TRUTH, label="truth")
+        axes.plot(*comparison.truth_en_m.T, ".-", **_TRUTH, label="ground truth")
         _draw_ellipses(axes, comparison, series, box)
         for state, (colour, mark) in STATE_STYLES.items():
             here = np.array([each == state for each in series.states])
@@ -135,7 +135,7 @@ def error_picture(comparison: Comparison, series: TrackSeries, radius_m: float) 
 
 
 def signed_picture(series: TrackSeries) -> Drawing:
-    """Errors ahead and to the right of the truth over time, scaled to the tracking views."""
+    """Errors ahead and to the right of the ground truth over time, scaled to the tracking views."""
 
     def draw(figure: "mpl.Figure") -> None:
         parts = figure.subplots(2, 1, sharex=True)

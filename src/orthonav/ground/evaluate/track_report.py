@@ -44,8 +44,8 @@ def track_rows(track: TrackMetrics) -> tuple[tuple[str, str], ...]:
             f"{track.n_confident_wrong} confident or tracking views wrong by more than {far} and "
             "their own radius",
         ),
-        ("ahead of the truth", spread_text(track.along)),
-        ("right of the truth", spread_text(track.across)),
+        ("ahead of the ground truth", spread_text(track.along)),
+        ("right of the ground truth", spread_text(track.across)),
         ("covariance", consistency_text(track.consistency)),
     )
 

@@ -223,7 +223,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
 
 
 def unwarped(path: Path, dataset: Any) -> str | None:
-    """What a raster is placed by, if not by a geotransform, and how to warp it; else None."""
+    """What georeferences a raster, if not by a geotransform, and how to warp it; else None."""
     points = len(dataset.gcps[0])
     if not _transform(path, dataset).is_identity or not (points or dataset.rpcs):
         return None
@@ -231,7 +231,7 @@ def unwarped(path: Path, dataset: Any) -> str | None:
     if points:
         found, option = f"{points} ground control points", "-tps"
     return (
-        f"is placed by {found} only, which are no grid; warp it first: gdalwarp {option} "
+        f"is georeferenced by {found} only; warp it to a grid first: gdalwarp {option} "
         f"'{path.name}' warped.tif"
     )
 

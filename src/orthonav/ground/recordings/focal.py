@@ -176,7 +176,7 @@ def _of_plane(optics: Optics, width_px: int, height_px: int) -> FocalLength | No
     as_width = FocalLength(
         optics.focal_mm / (optics.plane * unit_mm) * width_px,
         _PLANE_STD,
-        "EXIF, with the sensor's width in place of its resolution",
+        "EXIF, with the sensor's width instead of its resolution",
     )
     believed = as_width.field_deg(max(width_px, height_px)) <= MAX_FIELD_DEG
     return as_width if believed else found

@@ -128,7 +128,7 @@ def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
     try:
         truth = read_truth(path) if path.exists() else {}
     except FlightError as error:  # a flight can be localized without truth
-        warnings.append(f"truth is ignored: {error}")
+        warnings.append(f"ground truth is ignored: {error}")
     return Recording(
         kind="flight",
         path=folder.path,

@@ -207,7 +207,7 @@ def _whole(named: Path, path: Path, warnings: list[str]) -> "Path | _CutMcap":
     journal = named.with_name(f"{named.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         warnings.append(
-            f"bag was not closed, and what is only in {journal.name} is not read; write it into "
+            f"bag was not closed, and data in {journal.name} are not read; write them into "
             f"the bag first: sqlite3 {named.name} 'pragma wal_checkpoint(truncate)': {path}"
         )
     if not _is_cut(named):

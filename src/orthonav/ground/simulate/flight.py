@@ -118,8 +118,8 @@ class Errors:
         for name, limit in {**limits, **biases}.items():
             value, least = getattr(self, name), -limit if name in biases else 0.0
             if value is not None and not least <= value <= limit:
-                share = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
-                hint = f" (a share of {share}: 0.05 is 5 %)" if share else ""
+                whole = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
+                hint = f" (a fraction of {whole}: 0.05 is 5 %)" if whole else ""
                 raise FlightError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
 
     def mount_deg(self, seed: int) -> Array:
@@ -301,7 +301,7 @@ def _check(request: SimulateRequest) -> None:
         raise FlightError(f"turn radius must be 0 to 100,000 m, got {request.turn_radius_m}")
     if not 0 <= request.cloud_share <= 1:
         raise FlightError(
-            f"cloud_share must be 0 to 1 (a share of the views), got {request.cloud_share}"
+            f"cloud_share must be 0 to 1 (a fraction of the views), got {request.cloud_share}"
         )
     if not 0 <= request.camera_pitch_deg <= MAX_PITCH_DEG:
         raise FlightError(

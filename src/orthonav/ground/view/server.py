@@ -109,7 +109,7 @@ class Pages:
         fields = parse_qs(query, max_num_fields=10)
         asked = [fields.get(name, [""])[0] for name in ("x", "y")]
         if not all(re.fullmatch(r"0(\.\d{1,9})?|1(\.0{1,9})?", each) for each in asked):
-            return _error(HTTPStatus.BAD_REQUEST, "x and y are shares, 0 to 1")
+            return _error(HTTPStatus.BAD_REQUEST, "x and y must be fractions, 0 to 1")
         return _json(self._run.ground(int(index), *map(float, asked)))
 
     def _view_png(self, index: str, query: str) -> Response:

@@ -263,10 +263,10 @@ export function sentence(store, i) {
   if (c.reason[i]) parts.push(`no fix: ${c.reason[i]}`);
   else parts.push(described(store, i));
   if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
-  if (c.wrong[i]) parts.push("CONFIDENT AND WRONG");
+  if (c.wrong[i]) parts.push("FALSE FIX");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
   if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
-  if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} high`);
+  if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} above ground`);
   if (Number.isFinite(c.ms[i])) parts.push(`${number(c.ms[i], 0)} ms`);
   if (health && health.level !== "OK") parts.push(`health ${health.level}: ${health.reasons.join(", ")}`);
   if (c.err2) parts.push(`second run: ${second(store, i)}`);

@@ -52,7 +52,7 @@ export class List {
     const c = store.columns;
     const choices = [["all", "all views", store.count], ["confident", "confident", store.stats.confident]];
     if (store.stats.withTruth) {
-      choices.push(["wrong", "confident and wrong", store.stats.wrong]);
+      choices.push(["wrong", "false fixes", store.stats.wrong]);
       choices.push(["far", `error above ${metres(store.run.radius_m)}`, many((i) => c.err[i] > store.run.radius_m)]);
     }
     choices.push(["doubt", "low confidence: best guesses", store.stats.fixes - store.stats.confident]);

@@ -189,7 +189,7 @@ function drawFigures(store) {
     for (const [name, part] of [["CEP50", 0.5], ["CEP95", 0.95]]) {
       rows.push([name, both.map((errors) => metres(quantile(errors, part))).join(" / ")]);
     }
-    rows.push(["confident and wrong", stats.wrong]);
+    rows.push(["false fixes", stats.wrong]);
   }
   if (stats.withGnss || stats.gnssAlarms) rows.push(["GNSS alarms", stats.gnssAlarms]);
   find("figures").replaceChildren(...rows.map(([name, value]) => {
@@ -211,7 +211,7 @@ function drawLegend(store) {
   for (const state of store.run.states) {
     if (states.has(state)) rows.push([MARKS[state], NAMES[state], "var(--ink)"]);
   }
-  if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "confident and wrong", "var(--wrong)"]);
+  if (store.stats.withTruth) rows.push(["—", "ground truth", "var(--truth)"], ["◯", "false fix", "var(--wrong)"]);
   if (store.stats.withGnss) rows.push(["—", "GNSS", "var(--gnss)"]);
   if (store.run.second) rows.push(["■", `second run: ${store.run.second}`, "var(--second)"]);
   find("legend").replaceChildren(...rows.map(([mark, name, paint]) => {
@@ -225,7 +225,7 @@ function drawLegend(store) {
 function about(run) {
   const parts = [`orthonav ${run.version}`, `map ${run.map_name}`];
   parts.push(run.images ? `images ${run.images}` : "no images (--flight)");
-  parts.push(run.truth ? `truth ${run.truth}` : "no truth (--truth)");
+  parts.push(run.truth ? `ground truth ${run.truth}` : "no ground truth (--truth)");
   return parts.join(", ");
 }
 

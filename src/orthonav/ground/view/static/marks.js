@@ -135,7 +135,7 @@ export const Marks = L.Layer.extend({
     context.globalAlpha = 1;
   },
 
-  /** Confident and wrong: a ring, and a line to the true position. */
+  /** A false fix: a ring, and a line to the true position. */
   _ring(rings, view, i, x, y, size) {
     const c = this._store.columns;
     rings.moveTo(x + size + 3.5, y);
