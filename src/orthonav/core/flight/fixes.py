@@ -25,6 +25,45 @@ from orthonav.core.files import require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.records import Evidence, Fix, NoFix, ViewResult
 
+KEYS = (
+    "frame",  # name of the image in the flight folder
+    "time_s",  # time of exposure
+    "status",  # "fix" or "no_fix"
+    "confident",  # false: the position is the best guess; null for no_fix, like all down to agl_m
+    "lat_deg",  # WGS84
+    "lon_deg",
+    "cov_en_m2",  # [[east-east, east-north], [north-east, north-north]]
+    "confidence",  # probability that the error is below radius_m, 0 to 1
+    "radius_m",
+    "heading_deg",  # clockwise from true north, as estimated
+    "agl_m",  # metres above ground, as estimated
+    "reason",  # short word for programs; null for a fix
+    "detail",  # one sentence for people; null for a fix
+    "evidence",  # names and numbers
+    "latency_ms",
+)
+GROUND_KEYS = (
+    "ground_lat_deg",  # what the middle of the picture shows
+    "ground_lon_deg",
+    "ground_cov_en_m2",  # rows as in cov_en_m2; null where unknown, absent in earlier files
+)
+POSE_KEYS = (
+    "pitch_deg",  # as estimated; 0 looks straight down, positive ahead
+    "roll_deg",  # 0 looks straight down, positive left
+    "pose_cov",  # upper triangle (21) of 6 x 6, row by row: metres east, north, up, degrees of
+)  # heading, pitch, roll; null where they were not estimated together
+TRACK_KEYS = (
+    "tracked",  # true: the position is estimated from all views so far
+    "state",  # one of `STATES`
+)
+STATES = ("searching", "tracking", "coasting", "lost")
+_NULL_IN_FIX = {"reason": None, "detail": None}
+_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:11])
+MAX_LINE_BYTES = 2**20
+"""Limit of a line; the evidence of a view takes about 1000 bytes."""
+MAX_RESULTS = 1_000_000
+"""Limit of lines: as many as a flight folder may have views."""
+_TIME_LIMIT_S = 2**63 / 1e9
 FIRST_BYTES = 2**16
 """Longest first line that is read."""
 View = TypeVar("View", bound=RecordedView)
@@ -101,45 +140,6 @@ def read_identity(path: Path) -> Identity:
     return Identity()
 
 
-KEYS = (
-    "frame",  # name of the image in the flight folder
-    "time_s",  # time of exposure
-    "status",  # "fix" or "no_fix"
-    "confident",  # false: the position is the best guess; null for no_fix, like all down to agl_m
-    "lat_deg",  # WGS84
-    "lon_deg",
-    "cov_en_m2",  # [[east-east, east-north], [north-east, north-north]]
-    "confidence",  # probability that the error is below radius_m, 0 to 1
-    "radius_m",
-    "heading_deg",  # clockwise from true north, as estimated
-    "agl_m",  # metres above ground, as estimated
-    "reason",  # short word for programs; null for a fix
-    "detail",  # one sentence for people; null for a fix
-    "evidence",  # names and numbers
-    "latency_ms",
-)
-GROUND_KEYS = (
-    "ground_lat_deg",  # what the middle of the picture shows
-    "ground_lon_deg",
-    "ground_cov_en_m2",  # rows as in cov_en_m2; null where unknown, absent in earlier files
-)
-POSE_KEYS = (
-    "pitch_deg",  # as estimated; 0 looks straight down, positive ahead
-    "roll_deg",  # 0 looks straight down, positive left
-    "pose_cov",  # upper triangle (21) of 6 x 6, row by row: metres east, north, up, degrees of
-)  # heading, pitch, roll; null where they were not estimated together
-TRACK_KEYS = (
-    "tracked",  # true: the position is estimated from all views so far
-    "state",  # one of `STATES`
-)
-STATES = ("searching", "tracking", "coasting", "lost")
-_NULL_IN_FIX = {"reason": None, "detail": None}
-_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:11])
-MAX_LINE_BYTES = 2**20
-"""Limit of a line; the evidence of a view takes about 1000 bytes."""
-MAX_RESULTS = 1_000_000
-"""Limit of lines: as many as a flight folder may have views."""
-_TIME_LIMIT_S = 2**63 / 1e9
 UNKNOWN = Identity()
 """Of a run whose map and flight are not stated."""
 

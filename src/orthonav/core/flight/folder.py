@@ -1,4 +1,4 @@
-"""Reading a flight folder."""
+"""Flight folders, read and written."""
 
 import csv
 import json

@@ -194,6 +194,21 @@ _STATUS_FIX, _STATUS_NO_FIX = 0, -1
 
 
 @dataclass(frozen=True)
+class Message:
+    """A message of the log. `time_ns`: time of exposure. `index`: index of the view."""
+
+    topic: Topic
+    time_ns: int
+    data: bytes
+    index: int = 0
+
+    @property
+    def is_view(self) -> bool:
+        """Whether it is a full image, which is dropped first where space is short."""
+        return self.topic is VIEW
+
+
+@dataclass(frozen=True)
 class LoggedView:
     """A view in a log."""
 

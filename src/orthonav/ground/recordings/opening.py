@@ -1,4 +1,4 @@
-"""Detection of the kind of a recording, and opening it."""
+"""Opening a recording of any kind, importing it, and its heights over a terrain."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +37,7 @@ from orthonav.ground.recordings.video import open_video
 
 _VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")
 _TS_PACKET_BYTES = 188
+READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 def open_source(path: Path | Sequence[Path], options: SourceOptions | None = None) -> Recording:
@@ -153,9 +154,6 @@ def _flight_views(
             load=view.grey,
             data=view.path.read_bytes,
         )
-
-
-READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 @dataclass(frozen=True)

@@ -273,7 +273,11 @@ class _Ended(io.RawIOBase):
 
 
 def bound_inflation() -> None:
-    """Limit decompression by `rosbags` to the stated size of a chunk and `MAX_CHUNK_BYTES`."""
+    """Limit decompression by `rosbags` to the stated size of a chunk and `MAX_CHUNK_BYTES`.
+
+    It decompresses a whole chunk before it compares its size with the stated one, so a small
+    malicious file could exhaust memory. Violations raise `ValueError`, as damage does there.
+    """
     mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
     mcap.DECOMPRESSORS.update(lz4=_lz4, zstd=_zstd)
     bag = needed("rosbags.rosbag1.reader", WHAT)
@@ -281,7 +285,8 @@ def bound_inflation() -> None:
 
 
 def check_held(readers: Iterable[Any]) -> None:
-    """Raises `ValueError` where chunks state too many bytes, singly or those of the same time.
+    """Raises `ValueError` where chunks state too many bytes, singly or those of the same time,
+    which are held at once.
 
     `readers` are those of an opened recording (`AnyReader.readers`).
     """
