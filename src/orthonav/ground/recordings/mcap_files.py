@@ -1,8 +1,8 @@
 """MCAP files that may be incomplete, damaged or malicious, read chunk by chunk.
 
-The readers of the mcap library trust the lengths that records state, and end at the first damaged
-one. Here every length is checked against a limit and the file before anything is allocated, and
-damaged chunks are skipped; the library reads the records. The format: https://mcap.dev/spec.
+The readers of the mcap library trust the lengths inside records, and end at the first damaged one.
+Here every length is checked against a limit and the file before anything is allocated, and damaged
+chunks are skipped. The format: https://mcap.dev/spec.
 """
 
 import contextlib
@@ -138,7 +138,7 @@ def inflated(kind: bytes, data: bytes, most: int) -> bytes:
         with decompressor.stream_reader(data) as stream:
             return bytes(stream.read(most))
     if kind:
-        raise ValueError(f"compression {kind!r:.20} is not known")
+        raise ValueError(f"compression {kind[:20]!r} is not known")
     return data[:most]
 
 
