@@ -266,7 +266,7 @@ class TerrainFit:
         known = np.isfinite(off_m)
         holes, views = int((~known).sum()), len(known)
         if holes > HOLES_SHARE * views:
-            self._say("holes", "the terrain has no height below %d of %d views", holes, views)
+            self._say("the terrain has no height below %d of %d views", holes, views)
         if views - holes >= MIN_VIEWS:
             self._judge(off_m[known], agl_m[known])
 
@@ -276,7 +276,6 @@ class TerrainFit:
         log.debug("heights by views less reported ones: %.1f m +- %.1f m", middle_m, spread_m)
         if abs(middle_m) > OFF_M:
             self._say(
-                "datum",
                 "by the views the aircraft is %.0f m %s than reported over this terrain: check its "
                 "vertical datum, the take-off position and the altitude of the autopilot",
                 abs(middle_m),
@@ -284,13 +283,12 @@ class TerrainFit:
             )
         if spread_m > max(SPREAD_M, SPREAD_SHARE * float(np.median(agl_m))):
             self._say(
-                "place",
                 "heights by the views scatter by %.0f m about those reported over this terrain: it "
                 "may be displaced, or not show this ground",
                 spread_m,
             )
 
-    def _say(self, kind: str, said: str, *values: object) -> None:
-        if kind not in self._said:
-            self._said.add(kind)
+    def _say(self, said: str, *values: object) -> None:
+        if said not in self._said:
+            self._said.add(said)
             log.warning(said, *values)
