@@ -19,9 +19,8 @@ from orthonav.cli.signed import checked_signature
 from orthonav.core.errors import CameraError, OutputError, VariantError
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
-from orthonav.core.flight.identity import Identity
-from orthonav.core.flight.latency import MOST_MS, CameraLatency, read_latency
-from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.flight.fixes import Identity
+from orthonav.core.flight.mount import MOST_MS, CameraLatency, Mount, read_latency, read_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.localize import Localizer

@@ -188,7 +188,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.errors import VariantError
-    from orthonav.core.flight.identity import FlightDigest, Identity
+    from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.core.flight.mount import MountedFlight
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import open_map
@@ -275,7 +275,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     """Localize on an atlas without a prior; a fix needs the agreement of several views."""
     require_extras("localize --atlas")
     from orthonav.core.errors import VariantError
-    from orthonav.core.flight.identity import FlightDigest, Identity
+    from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.locate import AtlasLocator

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.latency import CameraLatency
+from orthonav.core.flight.mount import CameraLatency
 from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.recordings.flightlog import LoggedFlight
