@@ -85,7 +85,7 @@ def test_images_of_a_live_camera_carry_their_arrival():
     device = Device([noisy(0), np.dstack([noisy(1)] * 3), None])
     camera = LiveCamera(0, time.clocks, size_px=(320, 240), capture=lambda _: device)
     first = camera.read()
-    assert first.exposed_ns == first.arrival.arrived_ns == time.now_ns
+    assert first.exposed_ns == time.now_ns
     assert first.time_ns == UTC_NS + first.exposed_ns
     time.go(1.0)
     time.utc_ahead_ns += 3600 * S  # the clock is set while we fly
@@ -95,6 +95,20 @@ def test_images_of_a_live_camera_carry_their_arrival():
     third = camera.read()
     assert third.grey is None and third.problem.reason == "bad_image"
     assert device.settings[cv2.CAP_PROP_FRAME_WIDTH] == 320
+
+
+def test_images_that_stop_for_a_while_are_interruptions():
+    def interruptions(intervals_s):
+        time, device = Time(), Device([noisy(0)] * len(intervals_s))
+        camera, found = LiveCamera(0, time.clocks, capture=lambda _: device), []
+        for each in intervals_s:
+            time.go(each)
+            found.append(camera.read().interruptions)
+        return found
+
+    assert interruptions([0.1, 0.2] * 20) == [0] * 40
+    assert interruptions([0.1] * 10 + [2.0] + [0.1] * 5) == [0] * 10 + [1] * 6
+    assert interruptions([1.0] * 10) == [0, *[1] * 9]  # a slow camera
 
 
 def test_a_camera_that_stops_comes_back():
@@ -111,7 +125,8 @@ def test_a_camera_that_stops_comes_back():
     assert newest.taken == 3 and newest.outages == 2
     assert pauses[:3] == [0.5, 1.0, 2.0] and pauses[3] == 0.5
     assert all(each.released for each in opened)
-    assert newest.take(0).number == 3 and newest.is_over
+    last = newest.take(0)
+    assert last.number == 3 and last.interruptions > 0 and newest.is_over
 
 
 def test_a_camera_is_retried_after_a_fault_of_its_driver(caplog):

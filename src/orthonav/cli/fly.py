@@ -78,7 +78,7 @@ def _add_camera(group: argparse._ActionsContainer) -> None:
         "--camera-latency-ms",
         metavar="MS|FILE",
         help="live cameras: time from exposure to arrival, or the file of `orthonav calibrate "
-        "--latency`; without it nothing is sent until it has been measured in flight",
+        "--latency`; without it nothing is sent",
     )
     group.add_argument(
         "--mount-deg",

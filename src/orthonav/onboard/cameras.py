@@ -8,9 +8,11 @@ import logging
 import math
 import threading
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any, Protocol
 
 import cv2
@@ -21,13 +23,15 @@ from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.files import require_file
 from orthonav.core.flight import decode_image, open_flight
 from orthonav.core.records import NoFix, Telemetry
-from orthonav.onboard.arrival import Arrival, ArrivalWatch
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+GAP_S, GAP_INTERVALS = 0.5, 3.0
+"""A longer time without images, also in usual intervals, may change the latency. Shorter ones are
+usual on a busy computer."""
 FROZEN_LEVELS = 0.25
 """Mean difference in grey levels below which two images are the same: noise alone is four times
 as large."""
@@ -51,7 +55,8 @@ class CameraImage:
     `problem`: reason why it could not be decoded.
     `telemetry`: telemetry that came with the image, from a recording or from ROS.
     `vehicle`: state of the aircraft that `telemetry` was made of, from ROS.
-    `arrival`: of an image of a live camera, whose time of exposure is not known otherwise.
+    `interruptions`: of a live camera: how often images stopped for a while, or the camera was
+    opened again; the latency may have changed. None where the time of exposure is known.
     """
 
     number: int
@@ -62,7 +67,7 @@ class CameraImage:
     problem: NoFix | None = None
     telemetry: Telemetry | None = None
     vehicle: VehicleState | None = None
-    arrival: Arrival | None = None
+    interruptions: int | None = None
 
 
 class CameraGoneError(CameraError):
@@ -97,7 +102,9 @@ class LiveCamera:
         self._opener = capture or _capture
         self._capture: Any = None
         self._number = 0
-        self._arrivals = ArrivalWatch()
+        self._interruptions = 0
+        self._last_ns: int | None = None
+        self._intervals_s: deque[float] = deque([GAP_S / GAP_INTERVALS], maxlen=31)
         # UTC may be set in flight; the times of views must not jump with it.
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
@@ -105,12 +112,11 @@ class LiveCamera:
         """See `ImageSource.read`."""
         if self._capture is None:  # first image, or after the camera was gone
             self._capture = self._open()
-            self._arrivals.opened()
         if not self._capture.grab():
             self.close()
             raise CameraGoneError(f"camera delivers no images: {self._name}")
         arrived_ns = self._clocks.mono_ns()
-        arrival = self._arrivals.arrived(arrived_ns, self._stamp_s())
+        self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
         self._number += 1
         grey = _grey(frame) if found else None
@@ -122,7 +128,7 @@ class LiveCamera:
             arrived_ns + self._utc_minus_mono_ns,
             grey,
             problem,
-            arrival=arrival,
+            interruptions=self._interruptions,
         )
 
     def close(self) -> None:
@@ -130,11 +136,15 @@ class LiveCamera:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+            self._interruptions += 1
 
-    def _stamp_s(self) -> float:
-        """Timestamp of the image in the stream; NaN where there is none."""
-        stamp_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3
-        return stamp_s if stamp_s > 0 else math.nan
+    def _count_interruptions(self, arrived_ns: int) -> None:
+        before_ns, self._last_ns = self._last_ns, arrived_ns
+        if before_ns is None:
+            return
+        gap_s = (arrived_ns - before_ns) / 1e9
+        self._interruptions += gap_s > max(GAP_S, GAP_INTERVALS * median(self._intervals_s))
+        self._intervals_s.append(gap_s)
 
     def _open(self) -> Any:
         capture = self._opener(self._name)
