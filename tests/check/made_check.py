@@ -22,6 +22,7 @@ from orthonav.ground.check.outcome import (
 
 FILES = {"index.html", "check.json", "check.tif", "check.geojson", "figures"}
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
+DIGEST = "0123456789abcdef" * 4
 CONDITIONS = Conditions(
     width_m=240.0,
     height_m=180.0,
@@ -41,7 +42,7 @@ NO_GO = Verdict(
         Reason("lost", "In stretch 3 dead reckoning drifts farther than is allowed.", Word.NO_GO),
         Reason("dates", "Only the map's own date was tried.", Word.MARGINAL),
         Reason("mean", "The mean probability is high.", Word.GO),
-        Reason("lookalikes", "One pair of places look alike, which costs fixes.", Word.GO),
+        Reason("lookalikes", "One pair of ambiguous places costs fixes.", Word.GO),
     ),
 )
 
@@ -153,6 +154,7 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
             command=f"orthonav check {name}",
             version="0.1.0",
             terms=("© IGN, Licence Ouverte 2.0",),
+            map_sha256=DIGEST,
         ),
         "conditions": CONDITIONS,
         "verdict": NO_GO,
@@ -182,7 +184,7 @@ def tiny(frame):
 
 
 def small_route(frame, **changed):
-    """A route of some kilometres that ends in a blind stretch, in a band of 300 m."""
+    """A route of some kilometres that ends in a gap, in a band of 300 m."""
     cells = made_cells(20, 20, 50.0, seed=3)
     cells.probability[:, 17:] = 0.2
     cells.low[:, 17:] = 0.1

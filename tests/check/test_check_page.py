@@ -23,7 +23,7 @@ from orthonav.ground.check.write.figures import MAX_SIDE_PX, jpeg, map_image, vi
 from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN, _known_cells
 from orthonav.ground.check.write.plain import to_plain
 from orthonav.ground.check.write.risk import RISKS, segments, shade
-from orthonav.ground.check.write.wording import better_sentence, remedies, share_text
+from orthonav.ground.check.write.wording import better_sentence, probability_text, remedies
 from orthonav.ground.report import Drawing, metres_text
 from orthonav.ground.report.leaflet import load_leaflet
 from orthonav.ground.report.page import static_text
@@ -173,8 +173,10 @@ def test_all_sections_are_there(page, folder):
         "NO-GO",
         "What may help:",
         "Checked for",
-        "Blind stretches",
-        "Lookalikes",
+        "Gaps without fixes",
+        "Ambiguous places",
+        "The check does not consider",
+        "Sign-off",
         "How to read this",
         "Tolerated:",
     ):
@@ -185,16 +187,27 @@ def test_all_sections_are_there(page, folder):
     assert sum(t == "h1" for t, _ in page.elements) == 1
     images = [a for t, a in page.elements if t == "img" and "alt" in a]
     assert sum(bool(each["alt"]) for each in images) == 3
-    assert "Blind stretches" not in (folder / "tiny" / "index.html").read_text(encoding="utf-8")
+    assert "Gaps without fixes" not in (folder / "tiny" / "index.html").read_text(encoding="utf-8")
+
+
+def test_who_signs_sees_what_was_checked(folder):
+    text = (folder / "small_route" / "index.html").read_text(encoding="utf-8")
+    signed = text[text.index("Sign-off") :]
+    digest = hashlib.sha256((folder / "small_route" / "check.json").read_bytes()).hexdigest()
+    for said in (made_check.DIGEST, digest, "orthonav check area.onav", "Organisation"):
+        assert said in signed
 
 
 def test_a_go_needs_no_help_and_a_no_go_names_what_it_tried(frame):
     assert remedies(made_check.tiny(frame)) == []
     result = made_check.small_route(frame)
-    assert remedies(result) == [better_sentence(result.alternatives, "agl_m")]
+    assert remedies(result)[0] == better_sentence(result.alternatives, "agl_m")
     lost = BlindStretch(100, 1100, 5, 55, 0.2, drift_m=20, allowed_m=15)
     (sentence,) = remedies(replace(result, alternatives=(), stretches=(lost,)))
     assert "drifts by at most 1.5 % (assumed: 2 %)" in sentence
+    ended = replace(lost, ends_lost=True)
+    (sentence,) = remedies(replace(result, alternatives=(), stretches=(ended,)))
+    assert sentence.startswith("End the route before km 0.1")
     (sentence,) = remedies(replace(result, alternatives=(), stretches=()))
     assert sentence.startswith("No other height was tried")
 
@@ -230,11 +243,11 @@ def test_the_route_has_the_colours_of_the_cells():
         np.testing.assert_allclose(to_rgb(risk.colour), wanted, atol=0.02)
 
 
-def test_lookalikes_are_no_reason_to_go(folder):
+def test_ambiguous_places_are_no_reason_to_go(folder):
     """They cost fixes, so they have no green tick."""
     text = (folder / "small_route" / "index.html").read_text(encoding="utf-8")
     found = re.findall(r'<li class="is-(\w[\w-]*)"><b [^>]*>(.)</b> ([^<]*)', text)
-    (kind,) = {(kind, mark) for kind, mark, said in found if "look alike" in said}
+    (kind,) = {(kind, mark) for kind, mark, said in found if "ambiguous places" in said}
     assert kind == ("info", "i")
     assert 'setAttribute("aria-label", "North is up")' in text
 
@@ -382,7 +395,7 @@ def test_scripts_write_numbers_as_python_does(browser):
     assert [text.replace("\N{EN DASH}", "-") for text in texts] == [
         metres_text(each) for each in numbers
     ]
-    assert percents == [share_text(each) for each in shares]
+    assert percents == [probability_text(each) for each in shares]
 
 
 @pytest.mark.long

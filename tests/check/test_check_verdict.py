@@ -141,7 +141,7 @@ def test_expected_drift(drift_m, prior_std_m, expected):
     along = replace(ALONG, drift_m=drift)
     findings = FINE | dict(along=along, allowed_m=prior_std_m)
     assert judged(findings) == (expected, {"fixes": Word.GO, "drift": expected})
-    assert any("2.0 km" in each.text for each in verdict_of(**findings).reasons)
+    assert any("at km 2.0" in each.text for each in verdict_of(**findings).reasons)
 
 
 @pytest.mark.parametrize(
@@ -150,18 +150,18 @@ def test_expected_drift(drift_m, prior_std_m, expected):
         (
             (stretch(400, 12),),
             Word.GO,
-            "One blind stretch of 400 m (20 s), starting at 1.0 km; dead",
+            "One gap of 400 m without fixes (20 s), from km 1.0; dead",
         ),
-        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2 blind stretches, the longest of 900 m"),
-        ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts by 60 m"),
-        ((stretch(4000, 120),), Word.NO_GO, "off by 120 m after 4000 m"),
-        ((stretch(400, 12, ends_lost=True),), Word.MARGINAL, "the route ends in one"),
-        ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "2 blind stretches"),
+        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2 gaps, the longest of 900 m"),
+        ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts by 60 m (limit 50 m)"),
+        ((stretch(4000, 120),), Word.NO_GO, "drifts by 120 m in 4000 m (limit 50 m)"),
+        ((stretch(400, 12, ends_lost=True),), Word.MARGINAL, "the route ends in a gap"),
+        ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "2 gaps"),
         ((stretch(9000, 270, allowed_m=float("inf")),), Word.GO, "bridges"),
     ],
     ids=["one", "two", "long", "longer", "at the end", "one of two", "whole map searched"],
 )
-def test_blind_stretches(stretches, expected, said):
+def test_gaps(stretches, expected, said):
     findings = FLOWN | dict(stretches=stretches)
     word, reasons = judged(findings)
     assert word is expected and reasons["blind"] is expected
@@ -178,20 +178,13 @@ def test_lookalikes_never_worsen_the_verdict():
     assert judged(FINE | dict(lookalikes=some[1:])) == (Word.GO, {"fixes": Word.GO})
 
 
-@pytest.mark.parametrize(
-    "mean, start",
-    [
-        (0.85, "One view has an 85 % chance"),
-        (0.72, "One view has a 72 % chance"),
-        (0.11, "One view has only an 11 % chance"),
-        (0.08, "One view has only an 8 % chance"),
-    ],
-)
-def test_the_chance_of_a_fix_is_a_sentence(mean, start):
-    low = mean - 0.06
-    rest = f" of a confident, correct fix on the map (mean), at least {100 * low:.0f} % on nine"
-    said = verdict_of(**(FINE | dict(mean=mean, low=low))).reasons[0].text
-    assert said == f"{start}{rest} of ten scenes."
+def test_the_mean_is_told_with_its_bound_and_what_go_requires():
+    start = "Mean probability of a confident, correct fix per image on the map: "
+    for mean, low, rest in (
+        (0.85, 0.64, "85 % (90 % lower bound 64 %)."),
+        (0.72, 0.5, "72 % (90 % lower bound 50 %; GO requires 60 %)."),
+    ):
+        assert verdict_of(**(FINE | dict(mean=mean, low=low))).reasons[0].text == start + rest
 
 
 def test_the_worst_reason_decides():

@@ -143,8 +143,8 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--other-sensor",
         action="store_true",
-        help="the camera differs from the map's sensor by more than years do (a drone over "
-        "satellite imagery, infrared): fixes are predicted to be rarer",
+        help="camera and map imagery are of different kinds (drone against satellite, infrared): "
+        "predicts fewer fixes",
     )
     group.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
     group.add_argument(

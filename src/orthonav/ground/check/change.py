@@ -28,7 +28,7 @@ are 0.06 below what is measured there; a shift of all logarithms by 0.1 halves t
 predictions of real imagery too high.
 """
 MAX_SHARE = 0.95
-"""Largest share of its own detail that ground keeps: no two dates are identical."""
+"""Largest fraction of its own detail that ground keeps: no two dates are identical."""
 
 
 def another_year(

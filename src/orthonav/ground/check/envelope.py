@@ -15,7 +15,7 @@ YAW_OFF_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
 AGL_OFF = (-0.2, -0.1, 0.0, 0.1, 0.2)
 """Errors tried: about one to four default standard deviations."""
 TOLERATED = 0.85
-"""An error is tolerated while the share of fixes stays above this part of that without error."""
+"""An error is tolerated while the rate of fixes stays above this part of that without error."""
 HEIGHTS = (0.5, 0.7, 1.4, 2.0)
 """Other heights tried, as parts of the planned one: steps of about the square root of two."""
 
@@ -63,5 +63,5 @@ def heights_of(
 
 
 def right_share(trials: Sequence[Trial]) -> float:
-    """Share of trials that were confident and correct; NaN without trials."""
+    """Fraction of trials that were confident and correct; NaN without trials."""
     return float(np.mean([each.right for each in trials])) if trials else float("nan")

@@ -25,7 +25,7 @@ BANDWIDTH_SPACINGS = 0.9
 OTHER_DATE_WEIGHT = 3.0
 """Weight of a trial with imagery of a second date, which needs no simulated ageing."""
 SAME_COVERAGE = 0.12
-"""Standard deviation of the weights over the share of a view that the map covers."""
+"""Standard deviation of the weights over the fraction of a view that the map covers."""
 INTERVAL, INTERVAL_SIGMAS = (0.1, 0.9), 1.2816
 """Ends of the 80 % interval, and the same in standard deviations of a normal distribution."""
 JEFFREYS = 0.3
@@ -67,9 +67,9 @@ class Predictor:
     ) -> None:
         """`trials` of the map's own imagery, `other_date` of a second date.
 
-        `coverage` returns the share (N,) of a view over places (N, 2) that the map covers; trials
-        count for places of similar coverage. `recalibrated` turns shares (N,) of trials into those
-        of views of another date, whose logit varies from scene to scene by `scenes_std`.
+        `coverage` returns the fraction (N,) of a view over places (N, 2) that the map covers;
+        trials count for places of similar coverage. `recalibrated` turns rates (N,) of trials into
+        those of views of another date, whose logit varies from scene to scene by `scenes_std`.
         """
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)

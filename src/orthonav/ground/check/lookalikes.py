@@ -1,4 +1,4 @@
-"""Lookalikes: pairs of places that can be mistaken for each other, as trials found them."""
+"""Ambiguous places: pairs of places that can be mistaken for each other, as trials found them."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from orthonav.ground.check.outcome import Lookalike
 from orthonav.ground.check.trials import Trial
 
 SIMILAR = 0.8
-"""A rival place is a lookalike when it scores this share of the best place."""
+"""A rival place is ambiguous if it reaches this fraction of the best score."""
 MAX_PAIRS = 40
 _WRONG_CONFIDENCE = 0.5
 """One wrong trial of this confidence is enough; otherwise a second trial must agree."""

@@ -60,10 +60,10 @@ class Cells:
     `probability`: probability of a correct, confident fix of one view in the cell, 0 to 1.
     `low`, `high`: 80 % interval of `probability`.
     `error_m`: expected error of such a fix (root mean square).
-    `wrong`: share of nearby trials that were confident and wrong, 0 to 1.
+    `wrong`: fraction of nearby trials that were false fixes.
     `trials`: number of views tried in the cell, second date excluded.
     `persistence`: expected correlation of the ground's gradients with another year, 0 to 1.
-    `changed`: share that changed since the map was made, 0 to 1; 0 where nothing is known of it.
+    `changed`: fraction that changed since the map was made; 0 where nothing is known of it.
     """
 
     west_m: float
@@ -84,10 +84,10 @@ CELL_VALUES = {
     "low": "lower end of its 80 % interval",
     "high": "upper end of its 80 % interval",
     "error_m": "expected error of such a fix, root mean square, metres",
-    "wrong": "share of trials that were confident and wrong",
+    "wrong": "fraction of trials that were false fixes",
     "trials": "number of views tried",
     "persistence": "expected correlation of the ground with another year, 0 to 1",
-    "changed": "share that changed since the map was made",
+    "changed": "fraction that changed since the map was made",
 }
 """Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
 
@@ -117,14 +117,14 @@ class Along:
 
 @dataclass(frozen=True)
 class BlindStretch:
-    """A part of the route where a fix is unlikely.
+    """A gap: a part of the route where a fix is unlikely.
 
     `start_m`, `end_m`, `start_s`, `end_s`: distance and time from the start of the route.
     `probability`: mean probability of a fix in it.
     `drift_m`: error of dead reckoning at its end.
     `allowed_m`: largest error there at which the next view is still searched in the right place;
     infinite without a prior.
-    `ends_lost`: the route ends inside the stretch.
+    `ends_lost`: the route ends inside the gap.
     """
 
     start_m: float
@@ -143,17 +143,17 @@ class BlindStretch:
 
     @property
     def recoverable(self) -> bool:
-        """Whether views can be placed again after it."""
+        """Whether views can be localized again after it."""
         return not self.ends_lost and self.drift_m <= self.allowed_m
 
 
 @dataclass(frozen=True)
 class Lookalike:
-    """Two places that can be mistaken for each other.
+    """A pair of ambiguous places, which can be mistaken for each other.
 
     `place_latlon_deg`, `other_latlon_deg`: latitude and longitude.
     `apart_m`: distance between them.
-    `similarity`: score of the other place as a share of that of the true one, 0 to 1.
+    `similarity`: score of the other place divided by that of the true one, 0 to 1.
     `trials`: number of trials that found the pair.
     `within_prior`: a view of one place would also be searched at the other.
     """
@@ -168,13 +168,13 @@ class Lookalike:
 
 @dataclass(frozen=True, eq=False)
 class Envelope:
-    """Share of correct, confident fixes over errors of heading and height.
+    """Fraction of correct, confident fixes over errors of heading and height.
 
     `yaw_off_deg` (A,): heading errors added to the reported heading.
-    `agl_off` (B,): height errors added to the reported height, as a share of it.
-    `share` (A, B): share of correct, confident fixes.
+    `agl_off` (B,): height errors added to the reported height, as a fraction of it.
+    `share` (A, B): fraction of correct, confident fixes.
     `tolerated_yaw_deg`, `tolerated_agl_low`, `tolerated_agl_high`: largest error of each alone at
-    which the share stays at 85 % or more of the share without error.
+    which `share` stays at 85 % or more of that without error.
     """
 
     yaw_off_deg: Array
@@ -220,6 +220,7 @@ class Verdict:
 class CheckedInputs:
     """What was checked, as text for reports; empty where it does not apply.
 
+    `map_sha256`: digest of the map's manifest, as `orthonav verify` prints it.
     `height`: where the height above ground comes from.
     `terms`: attribution and licence of each imagery source.
     """
@@ -233,6 +234,7 @@ class CheckedInputs:
     command: str = ""
     version: str = ""
     terms: tuple[str, ...] = ()
+    map_sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,7 +108,7 @@ class MapCoverage:
         return np.asarray((numbers >= 0) & self.valid.ravel()[numbers])
 
     def seen_share(self, points_en_m: Array, side_m: float) -> Array:
-        """Share (N,) of views of a side, taken over points (N, 2), that the map covers."""
+        """Fraction (N,) of views of a side, taken over points (N, 2), that the map covers."""
         side = max(1, round(side_m / self.pixels.side_m))
         padded = np.pad(self.valid.astype(np.float32), side)
         share = cv2.blur(padded, (side, side), borderType=cv2.BORDER_CONSTANT)
@@ -116,7 +116,7 @@ class MapCoverage:
         return np.where(numbers >= 0, np.asarray(share, np.float64).ravel()[numbers], 0.0)
 
     def cell_share(self, cells: CellGrid) -> Array:
-        """Share (rows, cols) of every cell that the map covers."""
+        """Fraction (rows, cols) of every cell that the map covers."""
         unit_m, fine = self.pixels.side_m, _SAMPLES_PER_CELL
         left = (cells.west_m - self.pixels.west_m) / unit_m
         top = (self.pixels.north_m - cells.north_m) / unit_m

@@ -1,4 +1,4 @@
-"""Recalibration: predicted shares of located views from the shares of trials that were located.
+"""Recalibration: predicted fix rates from the fix rates of trials.
 
 Trials show the map's own imagery with simulated ageing. Real ground changes more or less than that.
 The relation is fitted to real scenes of two dates: `python -m benchmarks.check_trust --fit`.
@@ -19,7 +19,7 @@ LEAST, MOST = 0.01, 0.99
 
 @dataclass(frozen=True)
 class Recalibration:
-    """Logit of the predicted share: `shift` + `slope` times that of trials + corrections.
+    """Logit of the predicted rate: `shift` + `slope` times that of trials + corrections.
 
     `narrow`: for every halving of the width of a view below `FULL_VIEW_PX`; `no_prior`: without a
     prior position; `std`: standard deviation of the logit from scene to scene, 0 or more.
@@ -32,7 +32,7 @@ class Recalibration:
     std: float
 
     def __call__(self, share: Array, view_px: float, has_prior: bool) -> Array:
-        """Predicted shares (N,) from those of trials, for views `view_px` pixels of the map."""
+        """Predicted rates (N,) from those of trials, for views `view_px` pixels of the map."""
         octaves = max(0.0, math.log2(FULL_VIEW_PX / max(view_px, 1.0)))
         added = self.shift + self.narrow * octaves + self.no_prior * (not has_prior)
         return np.asarray(np.clip(expit(self.slope * logit(share) + added), LEAST, MOST))
@@ -49,7 +49,7 @@ class Recalibration:
 
 
 def logit(share: Array) -> Array:
-    """Logarithm of the odds of shares, which are held between `LEAST` and `MOST`."""
+    """Logarithm of the odds of rates, which are held between `LEAST` and `MOST`."""
     held = np.clip(share, LEAST, MOST)
     return np.asarray(np.log(held / (1 - held)))
 

@@ -36,7 +36,7 @@ class CheckRequest:
     `camera`: camera calibration.
     `agl_m`: height above ground, 1 to 50,000 m; None: the shorter side of a view covers one tile.
     `yaw_std_deg`: standard deviation of the reported heading, 0 to 90; None: heading unknown.
-    `agl_std`: standard deviation of the reported height, a share of it, 0 to 0.5.
+    `agl_std`: standard deviation of the reported height, a fraction of it, 0 to 0.5.
     `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
     `accept`: confidence that a fix needs, 0.01 to 0.999.
     `speed_mps`: ground speed.
@@ -84,7 +84,7 @@ class CheckRequest:
         limits: dict[str, tuple[float | None, float, float, str]] = {
             "height above ground": (self.agl_m, 1.0, 50_000.0, "m"),
             "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, "deg"),
-            "agl_std": (self.agl_std, 0.0, 0.5, "(a share of the height: 0.05 is 5 %)"),
+            "agl_std": (self.agl_std, 0.0, 0.5, "(a fraction of the height: 0.05 is 5 %)"),
             "prior_std_m": (self.prior_std_m, 0.0, 1e6, "m"),
             "accept": (self.accept, 0.01, 0.999, ""),
             "speed_mps": (self.speed_mps, 0.1, 10_000.0, "m/s"),

@@ -1,4 +1,4 @@
-"""Predictions along a route: probability, drift, and blind stretches."""
+"""Predictions along a route: probability, drift, and gaps."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,12 +13,12 @@ from orthonav.ground.planning.route import along_polyline_en_m
 
 Array = NDArray[np.float64]
 BLIND = 0.5
-"""A stretch is blind below this probability: more likely no fix than a fix."""
+"""A gap lies below this probability: more likely no fix than a fix."""
 POINTS_PER_VIEW = 4.0
 """Points along the route per side of a view, as many as cells."""
 MAX_POINTS = 4000
 _REACHED = 1e-6
-"""A shorter rest of the route, as a share of the distance between points, is none."""
+"""A shorter rest of the route, as a fraction of the distance between points, is none."""
 ACROSS = 5
 """Points across the band at every point along it."""
 NEGLIGIBLE = 1e-9
@@ -99,7 +99,7 @@ def expected_drift(
 def blind_stretches(
     along: Along, conditions: Conditions, view_side_m: float
 ) -> tuple[BlindStretch, ...]:
-    """Stretches of at least one side of a view with a probability below `BLIND`, in order."""
+    """Gaps: stretches of at least one side of a view with a probability below `BLIND`, in order."""
     blind = along.probability < BLIND
     edges = np.flatnonzero(np.diff(np.concatenate([[0], blind.astype(int), [0]])))
     last = len(blind) - 1

@@ -58,7 +58,7 @@ MIN_VIEWS = 20
 MAX_ASPECT = 8.0
 """Largest ratio of the sides of a view."""
 MIN_COVERED = 0.25
-"""A cell of which the map covers less than this share counts as outside the map."""
+"""A cell of which the map covers less than this fraction counts as outside the map."""
 MAX_CELLS_AROUND = 250_000
 """Limit of cells in the box around a band, most of them empty."""
 
@@ -66,7 +66,7 @@ MAX_CELLS_AROUND = 250_000
 def check_map(
     request: CheckRequest, progress: Progress = no_progress
 ) -> tuple[CheckResult, MapFile]:
-    """Check a map; `progress` is called with the stage and its share done, 0..1.
+    """Check a map; `progress` is called with the stage and the fraction done, 0 to 1.
 
     Raises `MapFileError` where the map cannot be checked, `AreaError` where the route or the other
     date lie outside the map or views are too large for it, `CameraError` for footprints that are
@@ -88,7 +88,7 @@ def check(map_path: Path | str, *, progress: Progress = no_progress, **asked: An
 
 class _Check:
     def __init__(self, request: CheckRequest, opened: MapFile, progress: Progress) -> None:
-        self.request, self.progress = request, progress
+        self.request, self.opened, self.progress = request, opened, progress
         if len(opened.manifest.sheets) != 1:
             raise MapFileError(f"only maps of one sheet can be checked: {opened.path}")
         registration = registration_of(opened)
@@ -207,7 +207,7 @@ class _Check:
         )
         route = request.route
         return CheckResult(
-            about=request.about,
+            about=replace(request.about, map_sha256=self.opened.manifest.sha256),
             conditions=self.conditions,
             frame=self.sheet.frame,
             cells=cells,
@@ -328,7 +328,7 @@ class _Check:
         return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
 
     def _changed(self, grid: CellGrid) -> Array:
-        """Share (rows, cols) of every cell that changed since the map was made."""
+        """Fraction (rows, cols) of every cell that changed since the map was made."""
         if self.request.changes is None:
             return np.zeros((grid.rows, grid.cols))
         whole = self.coverage.cell_share(grid)

@@ -60,7 +60,7 @@ class Trial:
     `right`, `wrong`: the fix is accepted, and within the radius of the map or not.
     `found_en_m`: position of the fix.
     `rival_en_m`: best other place at least a quarter of a view away.
-    `rival_share`: its score as a share of the best score; NaN without a rival.
+    `rival_share`: its score divided by the best score; NaN without a rival.
     """
 
     en_m: tuple[float, float]

@@ -25,7 +25,7 @@ from orthonav.ground.imagery.raster import SheetRaster
 EVERY_PX, PERSISTENCE_LEVELS = 8, 3
 """Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""
 MIN_VALID = 0.3
-"""Views that see less of the map than this share are skipped: the localizer refuses them."""
+"""Views that see less of the map than this fraction are skipped: the localizer refuses them."""
 _DONOR_DRAWS = 12
 
 Grey = NDArray[np.uint8]
@@ -42,7 +42,7 @@ class TrialPlan:
     `second_date`: views are cut from the orthophoto of a second date, not from the map's imagery
     with simulated ageing.
     `yaw_off_deg`: additional heading error, to either side at random.
-    `agl_off`: additional height error, a share of the height.
+    `agl_off`: additional height error, a fraction of the height.
     """
 
     request: CheckRequest

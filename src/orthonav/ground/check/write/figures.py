@@ -16,7 +16,7 @@ from orthonav.ground.check.outcome import Along, BlindStretch, CheckResult, Enve
 from orthonav.ground.check.write.plain import summarize
 from orthonav.ground.check.write.risk import EDGE_PX, RISKS, segments, shade
 from orthonav.ground.check.write.shapes import stretch_en_m
-from orthonav.ground.check.write.wording import share_text, tolerance_sentence
+from orthonav.ground.check.write.wording import probability_text, tolerance_sentence
 from orthonav.ground.report import Background, Figure, draw_axes, draw_figure, draw_map, map_size_in
 from orthonav.ground.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
 
@@ -41,7 +41,7 @@ Box = tuple[float, float, float, float]
 _BACKGROUND_PX = 900
 _STEPS = 20
 _NUMBERED = 0.01
-"""Recoverable stretches shorter than this share of the route get no number in the profile."""
+"""Recoverable stretches shorter than this fraction of the route get no number in the profile."""
 _LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
 
 
@@ -59,8 +59,8 @@ def _map(result: CheckResult, image: Background) -> Figure:
     west, south, east, north = visible_box(result)
     visible = west, east, south, north
     width, height = map_size_in(visible, 7.0, (4.0, 3.0))
-    marks = ["Black with a number: blind stretches."] if result.stretches else []
-    marks += ["Dotted: lookalikes."] if result.lookalikes else []
+    marks = ["Black with a number: gaps."] if result.stretches else []
+    marks += ["Dotted: pairs of ambiguous places."] if result.lookalikes else []
     background = replace(image, grey=shrunk(image.grey, _BACKGROUND_PX))
 
     def draw(axes: "Axes") -> None:
@@ -73,8 +73,8 @@ def _map(result: CheckResult, image: Background) -> Figure:
 
     return Figure(
         "map",
-        f"Map of the probability of a fix, mean {share_text(result.mean)} over "
-        f"{result.area_km2:.2f} square kilometres; {len(result.stretches)} blind stretches",
+        f"Map of the probability of a fix, mean {probability_text(result.mean)} over "
+        f"{result.area_km2:.2f} square kilometres; {len(result.stretches)} gaps without fixes",
         "Probability of a correct, confident fix of one view; white where unknown. "
         + " ".join(marks),
         draw_axes((width + 1.0, height), draw),
@@ -107,7 +107,7 @@ def _draw_cells(axes: "Axes", result: CheckResult) -> None:
 
 
 def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
-    """The route in classes of risk; blind stretches in black, with numbers."""
+    """The route in classes of risk; gaps in black, with numbers."""
     points = along.points_en_m
     drawn = segments(along.probability)
     for number, risk in enumerate(RISKS):
@@ -143,13 +143,13 @@ def _draw_lookalikes(axes: "Axes", result: CheckResult) -> None:
 
 
 def _profile(result: CheckResult, along: Along) -> Figure:
-    share = summarize(result)["route_share_from_0_9"]
+    likely = probability_text(summarize(result)["route_share_from_0_9"])
     return Figure(
         "profile",
-        f"Probability and expected drift along the route; {share_text(share)} of "
-        f"it at {CONFIDENT:g} or more, {len(result.stretches)} blind stretches",
+        f"Probability and expected drift along the route; {likely} of "
+        f"it at {CONFIDENT:g} or more, {len(result.stretches)} gaps without fixes",
         "Probability along the route with its 80 % interval and the lowest across the band; below, "
-        "the expected position error (one standard deviation). Shaded: blind stretches.",
+        "the predicted position error (1 sigma). Shaded: gaps without fixes.",
         draw_figure((10.0, 5.0), lambda figure: _draw_profile(figure, result, along)),
     )
 
@@ -211,14 +211,14 @@ def _envelope(envelope: Envelope) -> Figure:
         axes.set(xlabel="error of reported height (%)", ylabel="error of reported heading (deg)")
         axes.grid(visible=False)
         assert axes.figure is not None
-        axes.figure.colorbar(shown, ax=axes, label="share of correct, confident fixes")
+        axes.figure.colorbar(shown, ax=axes, label="fraction of correct, confident fixes")
 
     size = (min(10.0, max(5.6, 2.2 + 0.62 * cols)), min(8.0, max(3.4, 1.2 + 0.42 * rows)))
     return Figure(
         "envelope",
-        "Share of correct, confident fixes over errors of reported heading and height. "
+        "Rate of correct, confident fixes over errors of reported heading and height. "
         + tolerance_sentence(envelope),
-        "Share of correct, confident fixes (%) over errors of reported heading and height.",
+        "Rate of correct, confident fixes (%) over errors of reported heading and height.",
         draw_axes(size, draw),
     )
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +43,10 @@ def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
     leaflet = load_leaflet()
     image = map_image(opened, visible_box(result))
     drawn = figures(result, image)
-    page = page_of(result, image, drawn, leaflet)
+    plain = _writable(to_json(result))
+    page = page_of(result, image, drawn, leaflet, sha256(plain.encode()).hexdigest())
     with replacing_folder(out, is_ours=lambda folder: _foreign(folder) is None) as folder:
-        for name, text in ((JSON, to_json(result)), (GEOJSON, to_geojson(result)), (PAGE, page)):
+        for name, text in ((JSON, plain), (GEOJSON, to_geojson(result)), (PAGE, page)):
             write_text(folder / name, _writable(text))
         with replacing(folder / TIF) as temporary:
             temporary.write_bytes(tif_bytes(result))

@@ -18,9 +18,9 @@ from orthonav.ground.check.write.wording import (
     better_sentence,
     conditions_text,
     lookalike_sentence,
+    probability_text,
     remedies,
     seconds_text,
-    share_text,
     stretch_row,
     stretch_sentence,
     tolerance_sentence,
@@ -38,7 +38,7 @@ LAYERS = {
     "probability": "probability of a fix",
     "low": "probability, lower end of its interval",
     "error_m": "expected error of a fix",
-    "wrong": "confident and wrong",
+    "wrong": "rate of false fixes",
     "persistence": "expected persistence of the ground",
     "changed": "changed since the map was made",
 }
@@ -53,17 +53,26 @@ INPUTS = (
 )
 """Conditions shown beside the results."""
 DOWNLOADS = {
-    "check.geojson": "GeoJSON: route, blind stretches, cells, lookalikes",
-    "check.tif": "GeoTIFF: a band per layer",
-    "check.json": "JSON: everything on this page",
+    "check.geojson": "GeoJSON: route, gaps, cells, ambiguous places",
+    "check.tif": "GeoTIFF: a band per layer of the map",
+    "check.json": "JSON: all results and conditions",
 }
 """Files beside the page."""
 ZERO_IF_UNKNOWN = frozenset({"trials", "changed"})
 """Values that are 0, not None, in cells of which nothing is known."""
 
 
-def page_of(result: CheckResult, image: Background, figures: list[Figure], leaflet: Leaflet) -> str:
-    """The page as HTML. Raises `MissingExtraError` without Jinja2."""
+def page_of(
+    result: CheckResult,
+    image: Background,
+    figures: list[Figure],
+    leaflet: Leaflet,
+    json_sha256: str,
+) -> str:
+    """The page as HTML; `json_sha256` is the digest of the `check.json` beside it.
+
+    Raises `MissingExtraError` without Jinja2.
+    """
     about = result.about
     scripts = (leaflet.script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
     conditions = conditions_text(result.conditions, result.band_m)
@@ -92,7 +101,7 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
         "inputs": [(name, conditions[name]) for name in INPUTS],
         "remedies": remedies(result),
         "downloads": DOWNLOADS,
-        "made_from": _made_from(result),
+        "checked": _checked(result, json_sha256),
         "data": _page_data(result, image),
         "image": data_url(jpeg(image.grey), "image/jpeg"),
     }
@@ -104,11 +113,11 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
     summary = summarize(result)
     km2 = result.area_km2
     area = f"{km2:.3g} km²" if km2 < 100 else f"{km2:.0f} km²"
-    shown = [(share_text(result.mean), f"mean probability of a fix over {area}")]
+    shown = [(probability_text(result.mean), f"mean probability of a fix over {area}")]
     if result.along is not None:
         route = f"of {metres_text(summary['route_m'])} at a probability of {CONFIDENT:g} or more"
         shown += [
-            (share_text(summary["route_share_from_0_9"]), route),
+            (probability_text(summary["route_share_from_0_9"]), route),
             _longest(result, summary["longest_stretch"]),
         ]
     shown.append((metres_text(summary["error_m"]), "expected error of a correct fix"))
@@ -116,18 +125,18 @@ def _cards(result: CheckResult) -> list[tuple[str, str]]:
         shown.append((str(int(result.cells.trials.sum())), "trial views"))
     else:
         worst_m = float(result.along.drift_m.max())
-        shown.append((metres_text(worst_m), "largest expected position error along the route"))
-    shown.append((str(len(result.lookalikes)), "pairs of lookalikes"))
+        shown.append((metres_text(worst_m), "largest predicted position error along the route"))
+    shown.append((str(len(result.lookalikes)), "pairs of ambiguous places"))
     return shown
 
 
 def _longest(result: CheckResult, number: int | None) -> tuple[str, str]:
     if number is None:
-        return "0", "blind stretches along the route"
+        return "0", "gaps without fixes along the route"
     longest = result.stretches[number - 1]
     duration = seconds_text(longest.end_s - longest.start_s)
     error = metres_text(longest.drift_m)
-    text = f"longest blind stretch: {duration}, error {error} after it"
+    text = f"longest gap without fixes: {duration}, error {error} after it"
     return metres_text(longest.length_m), text
 
 
@@ -156,7 +165,7 @@ def _alternatives(result: CheckResult) -> list[Plain]:
             "rows": [
                 (
                     metres_text(each.value),
-                    share_text(each.probability),
+                    probability_text(each.probability),
                     "● chosen" if each.chosen else "-",
                 )
                 for each in found
@@ -167,16 +176,19 @@ def _alternatives(result: CheckResult) -> list[Plain]:
     ]
 
 
-def _made_from(result: CheckResult) -> list[tuple[str, str]]:
+def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
+    """What was checked, and with what: the rows above the signature."""
     about = result.about
     return [
         ("map", about.map_name),
+        ("SHA-256 of the map's manifest", about.map_sha256),
         ("imagery", about.imagery),
-        ("recipe", about.recipe),
+        ("build parameters", about.recipe),
         ("second date", about.other_date),
         ("route", about.route_name),
         ("command", about.command),
         ("orthonav", about.version),
+        ("SHA-256 of check.json", json_sha256),
     ]
 
 

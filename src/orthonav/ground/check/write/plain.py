@@ -18,8 +18,8 @@ from orthonav.ground.check.outcome import CELL_VALUES, Cells, CheckResult
 
 FORMAT, VERSION = "orthonav-check", 1
 _DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}
-"""Decimals by the last word of a name: a centimetre; shares and others have `_SHARE`."""
-_SHARE, _EXACT = 3, 6
+"""Decimals by the last word of a name: a centimetre; fractions and others have `_FRACTION`."""
+_FRACTION, _EXACT = 3, 6
 
 Array = NDArray[np.float64]
 Plain = dict[str, Any]
@@ -66,7 +66,7 @@ def to_plain(result: CheckResult) -> Plain:
 
 
 def stretches_to_plain(result: CheckResult) -> list[Plain]:
-    """The blind stretches, numbered from 1."""
+    """The gaps, numbered from 1."""
     return [
         {
             "number": number,
@@ -79,7 +79,7 @@ def stretches_to_plain(result: CheckResult) -> list[Plain]:
 
 
 def lookalikes_to_plain(result: CheckResult) -> list[Plain]:
-    """The lookalikes, numbered from 1."""
+    """The pairs of ambiguous places, numbered from 1."""
     return [
         {"number": number, **plain(asdict(each))}
         for number, each in enumerate(result.lookalikes, start=1)
@@ -89,13 +89,13 @@ def lookalikes_to_plain(result: CheckResult) -> list[Plain]:
 def summarize(result: CheckResult) -> Plain:
     """The key figures of a check, which the page, the terminal and `check.json` share.
 
-    `route_share_from_0_9`: share of the length with a probability of `CONFIDENT` or more, 0 to 1.
+    `route_share_from_0_9`: fraction of the length with a probability of `CONFIDENT` or more.
     `error_m`: expected error of a correct fix (root mean square), along the route or over the map.
-    `longest_stretch`: number of the longest blind stretch, from 1. Without a route its figures are
+    `longest_stretch`: number of the longest gap, from 1. Without a route its figures are
     NaN, 0 or None.
     """
     along, cells, stretches = result.along, result.cells, result.stretches
-    route_m = share = math.nan
+    route_m = likely = math.nan
     if along is None or not len(along.distance_m):
         error_m = _rms(cells.error_m.ravel(), cells.probability.ravel())
     else:
@@ -103,7 +103,7 @@ def summarize(result: CheckResult) -> Plain:
         weights = _length_per_point_m(along.distance_m)
         known = np.isfinite(along.probability)
         confident = np.where(known, along.probability, 0.0) >= CONFIDENT
-        share = float(weights[confident].sum() / weights.sum()) if known.any() else math.nan
+        likely = float(weights[confident].sum() / weights.sum()) if known.any() else math.nan
         error_m = _rms(along.error_m, weights * np.nan_to_num(along.probability))
     longest = max(stretches, key=lambda each: each.length_m, default=None)
     return {
@@ -113,7 +113,7 @@ def summarize(result: CheckResult) -> Plain:
         "error_m": error_m,
         "route_m": route_m,
         "route_s": route_m / result.conditions.speed_mps,
-        "route_share_from_0_9": share,
+        "route_share_from_0_9": likely,
         "blind_stretches": len(stretches),
         "unrecoverable_stretches": sum(not each.recoverable for each in stretches),
         "longest_stretch": None if longest is None else stretches.index(longest) + 1,
@@ -192,7 +192,7 @@ def plain(value: Any, digits: int | None = None) -> Any:
     if isinstance(value, Mapping):
         return {
             name: plain(
-                each, _DIGITS.get(name.rpartition("_")[2], _SHARE) if digits is None else digits
+                each, _DIGITS.get(name.rpartition("_")[2], _FRACTION) if digits is None else digits
             )
             for name, each in value.items()
         }

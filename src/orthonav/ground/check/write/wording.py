@@ -19,19 +19,19 @@ from orthonav.ground.report.numbers import metres_text
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
     Word.GO: "This route can be flown with this map.",
-    Word.MARGINAL: "This route can be flown with this map, but with care; see the reasons.",
+    Word.MARGINAL: "This route does not meet all requirements for GO; see the reasons.",
     Word.NO_GO: "Do not rely on this map for this route; see the reasons.",
 }
 AREA_VERDICTS = {
-    Word.GO: "Views can be placed on this map.",
-    Word.MARGINAL: "Views can be placed on parts of this map; see the reasons.",
+    Word.GO: "Views can be localized on this map.",
+    Word.MARGINAL: "Views can be localized on parts of this map; see the reasons.",
     Word.NO_GO: "Do not rely on this map; see the reasons.",
 }
-WHAT = {"agl_m": "height above ground", "band_m": "width of the band"}
+WHAT = {"agl_m": "height above ground", "band_m": "band width"}
 """Parameters that an alternative changes, in words."""
 CLEARLY = 0.05
 """Smaller differences may be chance, because an alternative rests on few trials."""
-MAX_STRETCHES = 8
+MAX_STRETCHES = 7
 _MAX_REASONS = 5
 _WIDTH = 100
 SIMULATED = "Predicted from this map alone, with simulated ageing."
@@ -45,7 +45,7 @@ def verdict_sentence(result: CheckResult) -> str:
     return f"{sentences[result.verdict.word]} {height}"
 
 
-def share_text(value: float) -> str:
+def probability_text(value: float) -> str:
     """A probability in whole percent, `-` if unknown; 100 % only if it really is."""
     if not math.isfinite(value):
         return "-"
@@ -64,7 +64,7 @@ def seconds_text(value: float) -> str:
 
 
 def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    """A blind stretch as a row of a table: number, ends, length, duration, probability, drift,
+    """A gap as a row of a table: number, ends, length, duration, probability, drift,
     allowed drift and outcome."""
     outcome = "recovers" if stretch.recoverable else "lost"
     return (
@@ -73,7 +73,7 @@ def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
         f"{stretch.end_m / 1000:.2f} km",
         metres_text(stretch.length_m),
         seconds_text(stretch.end_s - stretch.start_s),
-        share_text(stretch.probability),
+        probability_text(stretch.probability),
         metres_text(stretch.drift_m),
         metres_text(stretch.allowed_m),
         "the route ends in it" if stretch.ends_lost else outcome,
@@ -81,19 +81,19 @@ def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
 
 
 def stretch_sentence(number: int, stretch: BlindStretch) -> str:
-    """A blind stretch in one sentence."""
+    """A gap in one sentence."""
     _, _, _, length, duration, probability, drift, allowed, outcome = stretch_row(number, stretch)
     return (
-        f"Blind stretch {number}: {length}, {duration}, probability {probability}, error {drift} "
-        f"at its end, allowed {allowed}: {outcome}."
+        f"Gap {number}: {length}, {duration}, probability {probability}, error {drift} at its end "
+        f"(limit {allowed}): {outcome}."
     )
 
 
 def lookalike_sentence(number: int, pair: Lookalike) -> str:
-    """A pair of lookalikes in one sentence."""
+    """A pair of ambiguous places in one sentence."""
     where = "within" if pair.within_prior else "outside"
     return (
-        f"Lookalikes {number}: {metres_text(pair.apart_m)} apart, similarity "
+        f"Ambiguous places {number}: {metres_text(pair.apart_m)} apart, similarity "
         f"{pair.similarity:.2f}, {pair.trials} trials, {where} the prior."
     )
 
@@ -104,8 +104,13 @@ def tolerance_sentence(envelope: Envelope) -> str:
     return (
         f"Tolerated: a heading error of up to {envelope.tolerated_yaw_deg:g}°, or a reported "
         f"height from {100 * low:.0f} % too low to {100 * high:.0f} % too high. With either error "
-        "alone, the share of correct, confident fixes stays at 85 % or more of that without error."
+        "alone, the rate of correct, confident fixes stays at 85 % or more of that without error."
     )
+
+
+def _tilt_error_m(conditions: Conditions) -> float:
+    """Error of fixes from that of the reported tilt, root mean square of both axes."""
+    return math.sqrt(2) * conditions.agl_m * math.tan(math.radians(conditions.tilt_std_deg))
 
 
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
@@ -125,9 +130,10 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             if prior is None
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
-        "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)",
+        "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)"
+        f", displaces fixes by {metres_text(_tilt_error_m(conditions))}",
         "sensor": (
-            "differs from the map's by more than years do (assumed)"
+            "of another kind than the map's (assumed)"
             if conditions.other_sensor
             else "like the map's, of another year"
         ),
@@ -149,11 +155,13 @@ def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
     if not known or chosen is None:
         return ""
     best = max(known, key=lambda each: each.probability)
+    value = metres_text(chosen.value)
     if best.probability < chosen.probability + CLEARLY:
-        return f"No other {WHAT[what]} tried is better than {metres_text(chosen.value)}."
+        return f"No other {WHAT[what]} that was tried is clearly better than {value}."
     return (
-        f"A {WHAT[what]} of {metres_text(best.value)} instead of {metres_text(chosen.value)} would "
-        f"be better: {share_text(best.probability)} instead of {share_text(chosen.probability)}."
+        f"A {WHAT[what]} of {metres_text(best.value)} is better: mean probability "
+        f"{probability_text(best.probability)}, against {probability_text(chosen.probability)} at "
+        f"{value}{' (fewer trials)' * (what == 'agl_m')}."
     )
 
 
@@ -169,7 +177,12 @@ def remedies(result: CheckResult) -> list[str]:
         assumed = f"{100 * result.conditions.drift:g} %"
         found.append(
             f"Dead reckoning that drifts by at most {100 * drift:.1f} % (assumed: {assumed}) "
-            "bridges all blind stretches."
+            "bridges all gaps."
+        )
+    if any(each.ends_lost and each.start_m > 0 for each in result.stretches):
+        start_km = result.stretches[-1].start_m / 1000
+        found.append(
+            f"End the route before km {start_km:.1f}, or extend it to where fixes are likely."
         )
     tried = any(each.what == "agl_m" for each in result.alternatives)
     heights = "None of the other heights tried is better" if tried else "No other height was tried"
@@ -177,7 +190,7 @@ def remedies(result: CheckResult) -> list[str]:
 
 
 def text(result: CheckResult) -> str:
-    """Verdict, reasons, key figures and blind stretches, in about 25 lines at most.
+    """Verdict, reasons, key figures and gaps, in about 25 lines at most.
 
     Control characters in names are replaced.
     """
@@ -188,7 +201,8 @@ def text(result: CheckResult) -> str:
     lines += ["", *(f"{name:<{width}}  {value}" for name, value in rows)]
     lines += _stretches(result)
     helpful = remedies(result)
-    lines += ["", "what may help:", *(f"  {each}" for each in helpful)] if helpful else []
+    if helpful:
+        lines += ["", "what may help:", *(line for each in helpful for line in _item(each))]
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
 
 
@@ -196,10 +210,17 @@ def _reasons(result: CheckResult) -> list[str]:
     reasons = result.verdict.reasons
     lines = []
     for each in reasons[:_MAX_REASONS]:
-        wrapped = textwrap.wrap(" ".join(each.text.split()), _WIDTH - 4, max_lines=2) or [""]
-        lines += [f"  - {wrapped[0]}", *(f"    {rest}" for rest in wrapped[1:])]
+        lines += _item(each.text)
     more = len(reasons) - _MAX_REASONS
     return [*lines, f"  - and {more} more"] if more > 0 else lines
+
+
+def _item(sentence: str) -> list[str]:
+    """A sentence as an item of a list, in at most two lines; "%" stays with its number."""
+    joined = " ".join(sentence.split()).replace(" %", "\N{NO-BREAK SPACE}%")
+    wrapped = textwrap.wrap(joined, _WIDTH - 4, max_lines=2) or [""]
+    first, *rest = (line.replace("\N{NO-BREAK SPACE}", " ") for line in wrapped)
+    return [f"  - {first}", *(f"    {line}" for line in rest)]
 
 
 def _figures(result: CheckResult) -> list[tuple[str, str]]:
@@ -207,17 +228,21 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
     dates = "also of a second date" if result.second_date else "simulated ageing"
     rows = [
         ("map", result.about.map_name),
-        ("area", f"{result.area_km2:.2f} km2, mean probability {share_text(result.mean)}"),
+        ("area", f"{result.area_km2:.2f} km2, mean probability {probability_text(result.mean)}"),
         ("views", f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m on the ground, {dates}"),
     ]
     if result.along is not None:
         length = f"{metres_text(summary['route_m'])}, {seconds_text(summary['route_s'])}"
-        share = f"{share_text(summary['route_share_from_0_9'])} of it at {CONFIDENT:g} or more"
-        rows.append(("route", f"{length}; {share}"))
+        likely = probability_text(summary["route_share_from_0_9"])
+        rows.append(
+            ("route", f"{length}; {likely} of it with a probability of {CONFIDENT:g} or more")
+        )
     rows.append(("error", f"{metres_text(summary['error_m'])} expected for a correct fix"))
     if result.lookalikes:
         near = sum(each.within_prior for each in result.lookalikes)
-        rows.append(("lookalikes", f"{len(result.lookalikes)} pairs, {near} within the prior"))
+        rows.append(
+            ("ambiguous", f"pairs of places: {len(result.lookalikes)}, within the prior: {near}")
+        )
     return rows
 
 
@@ -225,17 +250,19 @@ def _stretches(result: CheckResult) -> list[str]:
     if result.along is None:
         return []
     if not result.stretches:
-        return ["", "no blind stretches"]
+        return ["", "no gaps without fixes"]
     worst_first = sorted(result.stretches, key=lambda each: (each.recoverable, -each.length_m))
     worst = worst_first[:MAX_STRETCHES]
     rows: list[tuple[str, ...]] = [
-        ("#", "from", "to", "length", "duration", "prob.", "drift", "allowed", "")
+        ("#", "from", "to", "length", "duration", "prob.", "drift", "limit", "")
     ]
     for number, each in enumerate(result.stretches, start=1):
         if each in worst:
             rows.append(stretch_row(number, each))
     more = len(result.stretches) - len(worst)
-    head = f"blind stretches ({len(result.stretches)})" + (f", the {len(worst)} worst" * (more > 0))
+    head = f"gaps without fixes ({len(result.stretches)})" + (
+        f", the {len(worst)} worst" * (more > 0)
+    )
     return ["", head, *_columns(rows)]
 
 

@@ -18,7 +18,7 @@ function rowsOf(east, north, index) {
     rows.push(["error of a fix", metres(route.error_m[index])]);
     rows.push(["position error", metres(route.drift_m[index])]);
     const blind = data.stretches.find(({ start_m: start, end_m: end }) => far >= start && far <= end);
-    if (blind) rows.push(["blind stretch", `${blind.number}${blind.recoverable ? "" : ", not recovered"}`]);
+    if (blind) rows.push(["gap", `${blind.number}${blind.recoverable ? "" : ", not recovered"}`]);
   }
   if (cell < 0) return [...rows, ["cell", "not checked"]];
   const here = (name) => grids[name][cell];
@@ -27,7 +27,7 @@ function rowsOf(east, north, index) {
     rows.push(["probability", between(here("probability"), here("low"), here("high"))]);
     rows.push(["error of a fix", metres(here("error_m"))]);
   }
-  rows.push(["confident and wrong", percent(here("wrong"))]);
+  rows.push(["rate of false fixes", percent(here("wrong"))]);
   rows.push(["expected persistence", percent(here("persistence"))]);
   if (here("changed") > 0) rows.push(["changed since the map", percent(here("changed"))]);
   rows.push(["views tried", known(here("trials")) ? String(here("trials")) : "–"]);
@@ -63,7 +63,9 @@ function showLegend(name, title) {
     const ends = make("div", "", legend);
     ends.className = "ends";
     const text = name === "error_m" ? metres : percent;
-    for (const [value, more] of [[0, ""], [most / 2, ""], [most, drawn.most[name] ? " +" : ""]]) make("span", text(value) + more, ends);
+    for (const part of [0, 0.25, 0.5, 0.75, 1]) {
+      make("span", text(part * most) + (part === 1 && drawn.most[name] ? " +" : ""), ends);
+    }
   }
   if (!route) return;
   make("b", "probability along the route", legend);

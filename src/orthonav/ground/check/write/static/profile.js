@@ -1,4 +1,4 @@
-// The profile along the route: probability above, expected position error below.
+// The profile along the route: probability above, predicted position error below.
 
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const COLOURS = { strong: "ink", mark: "mark", soft: "soft", line: "line", paper: "paper" };
