@@ -35,8 +35,7 @@ from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.outputs import MessageOptions, Messenger
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import MessageOptions, Messenger, Publisher
 from orthonav.onboard.run import Locator
 from orthonav.onboard.telemetry import TelemetryBuffer
 

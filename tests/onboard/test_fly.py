@@ -45,14 +45,13 @@ from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
+from orthonav.onboard.console import Inputs, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.narrator import Inputs, Narrator
-from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger, Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode
 

@@ -17,11 +17,15 @@ from fake_autopilot import UTC_NS, S, Time, fix
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.records import NoFix, ViewResult
-from orthonav.onboard.messages.correlation import messages_averaged
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    EstimateError,
+    NavigationEstimate,
+    messages_averaged,
+)
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.local import Autopilot, Origin, north_east_m
 from orthonav.onboard.messages.mavlink import Packer, Target
+from orthonav.onboard.messages.mavlink_local import Autopilot, Origin, north_east_m
 from orthonav.onboard.messages.nmea import Quality
 from orthonav.onboard.outputs import (
     KINDS,

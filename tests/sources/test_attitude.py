@@ -21,7 +21,7 @@ from orthonav.core.geo.attitude import (
 )
 from orthonav.core.geo.camera import attitude_of, enu_from_camera
 from orthonav.core.records import DEFAULT_TILT_STD_DEG
-from orthonav.onboard.aiding import AIDED_TILT_STD_DEG, UNAIDED_TILT_STD_DEG
+from orthonav.onboard.telemetry import AIDED_TILT_STD_DEG, UNAIDED_TILT_STD_DEG
 
 angles = st.floats(-180, 180)
 

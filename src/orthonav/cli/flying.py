@@ -30,18 +30,17 @@ from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
-from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread, NewestImage
+from orthonav.onboard.console import Inputs, Narrator
 from orthonav.onboard.fly import FlyOptions, LogSink, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.local import Origin
 from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
+from orthonav.onboard.messages.mavlink_local import Origin
 from orthonav.onboard.messages.nmea import Quality
-from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import (
     KINDS,
     LOCAL,
@@ -50,13 +49,14 @@ from orthonav.onboard.outputs import (
     MessageOptions,
     Messenger,
     NmeaOut,
+    PositionOutput,
+    Publisher,
+    ViewOutput,
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
-from orthonav.onboard.publisher import PositionOutput, Publisher, ViewOutput
-from orthonav.onboard.run import Locator
-from orthonav.onboard.serials import require_newest
-from orthonav.onboard.state import load
+from orthonav.onboard.run import Locator, MountCorrected, model_of
+from orthonav.onboard.state import load, require_newest
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)

@@ -34,6 +34,7 @@ from orthonav.onboard.health import (
     HealthReporter,
     Notifier,
     Snapshot,
+    StartCheck,
     TelemetryDiagnosis,
     judge,
     mismatch,
@@ -41,9 +42,8 @@ from orthonav.onboard.health import (
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.mavlink import dialect, status_texts
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
-from orthonav.onboard.start_check import StartCheck
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
 
 log = logging.getLogger(__name__)

@@ -15,10 +15,8 @@ from typing import Any
 
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
-from orthonav.onboard.aiding import Aiding
 from orthonav.onboard.gnss.mavlink import gnss_sample
 from orthonav.onboard.messages.estimate import Clock, EstimateError
-from orthonav.onboard.messages.local import Autopilot, Origin
 from orthonav.onboard.messages.mavlink import (
     COMPONENT_ID,
     Message,
@@ -28,8 +26,10 @@ from orthonav.onboard.messages.mavlink import (
     dialect,
     signing_timestamp,
 )
+from orthonav.onboard.messages.mavlink_local import Autopilot, Origin
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import (
+    Aiding,
     Clocks,
     ClockSync,
     TelemetryBuffer,
