@@ -38,7 +38,7 @@ from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
-from orthonav.onboard.messages import correlation
+from orthonav.onboard.messages import estimate as estimates
 from orthonav.onboard.messages.estimate import FilterCovariance, estimate_from_result
 from orthonav.onboard.run import localize_flight
 
@@ -326,8 +326,8 @@ def main(arguments: Sequence[str]) -> int:
         f"{SETTLING_S:g} s after its first position on; smallest and largest flight in brackets",
         "recorded flights: the error of the reference is part of the error",
     )
-    for averaging_s in options.averaging_s or [correlation.AVERAGING_S]:
-        correlation.AVERAGING_S = averaging_s
+    for averaging_s in options.averaging_s or [estimates.AVERAGING_S]:
+        estimates.AVERAGING_S = averaging_s
         rows = _generated(options, options.work) + _recorded(options.work)
         title = f"Filters that take positions as independent, averaging {averaging_s:g} s"
         section = Section(title)

@@ -189,7 +189,7 @@ def test_flight_folders_have_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
     write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
-    telemetry = list(recorded_images(tmp_path, 1.0))
+    telemetry = list(recorded_images(tmp_path))
     assert [each.time_ns for each in telemetry] == [row.time_ns for row in rows]
     assert [each.telemetry for each in telemetry] == rows
     np.testing.assert_array_equal(telemetry[2].load(), noisy(2))
@@ -202,13 +202,13 @@ def test_an_incomplete_image_is_a_bad_image(tmp_path):
     (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "note.txt").write_text("no picture")
     time = Time()
-    telemetry = recorded_images(tmp_path, 4.0)
+    telemetry = recorded_images(tmp_path)
     source = Playback(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
     seen = [source.read() for _ in range(4)]
     assert [each and each.frame for each in seen] == ["0.jpg", "1.jpg", "2.jpg", None]
     assert seen[1].grey is None and seen[1].problem.reason == "bad_image"
     assert "cut short" in seen[1].problem.detail
-    assert seen[2].exposed_ns - seen[0].exposed_ns == S // 2
+    assert seen[2].exposed_ns - seen[0].exposed_ns == S
     (tmp_path / "0.jpg").unlink()
     assert (
         Playback(
@@ -223,26 +223,25 @@ def test_an_incomplete_image_is_a_bad_image(tmp_path):
     )
 
 
-def test_a_video_has_its_own_times_and_can_be_thinned(tmp_path):
+def test_a_video_has_its_own_times(tmp_path):
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
     for number in range(4):
         writer.write(np.dstack([np.full((240, 320), 40 * number, np.uint8)] * 3))
     writer.release()
-    found = list(recorded_images(path, None))
+    found = list(recorded_images(path))
     assert [each.time_ns for each in found] == [0, S // 10, S // 5, 3 * S // 10]
     assert [round(float(each.load().mean()) / 40) for each in found] == [0, 1, 2, 3]
-    assert [each.time_ns for each in recorded_images(path, 5.0)] == [0, S // 5]
 
 
 def test_invalid_sources_are_refused(tmp_path):
     with pytest.raises(MissingFileError):
-        recorded_images(tmp_path / "nothing", 1.0)
+        recorded_images(tmp_path / "nothing")
     with pytest.raises(FlightError, match="no images"):
-        recorded_images(tmp_path, 1.0)
+        recorded_images(tmp_path)
     (tmp_path / "x.mp4").write_bytes(b"no video")
     with pytest.raises(FlightError, match="video"):
-        recorded_images(tmp_path / "x.mp4", 1.0)
+        recorded_images(tmp_path / "x.mp4")
 
 
 def test_a_missing_device_is_gone_for_now():
@@ -293,7 +292,7 @@ def test_a_camera_reads_in_a_thread(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), noisy(0))
     time, stopping = Time(), threading.Event()
     source = Playback(
-        recorded_images(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
+        recorded_images(tmp_path), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
     )
     thread = CameraThread(source, stopping)
     assert thread.newest.take(5).frame == "a.png"

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import search_plan
 from orthonav.cli.flying_console import awaited, camera_line, opened_console, plan_lines
@@ -32,7 +32,7 @@ from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
 from orthonav.onboard.cameras import CameraThread, NewestImage
 from orthonav.onboard.console import Inputs, Narrator
-from orthonav.onboard.fly import FlyOptions, LogSink, Runner
+from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
@@ -58,6 +58,9 @@ from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.run import Locator, MountCorrected, model_of
 from orthonav.onboard.state import load, require_newest
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
+
+if TYPE_CHECKING:
+    from orthonav.onboard.log import FlightLog
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0
@@ -236,14 +239,14 @@ def _source(
             clocks,
             size_px=(camera.width_px, camera.height_px),
         )
-    if not (options.pace > 0 and (options.rate_hz is None or options.rate_hz > 0)):
-        raise VariantError("--pace and --rate-hz must be above 0")
+    if not options.pace > 0:
+        raise VariantError("--pace must be above 0")
     due_ns: Callable[[int], int | None] = cameras.own_pace(clocks, options.pace)
     if options.file_clock == "autopilot":
         if link is None:
             raise VariantError("--file-clock autopilot needs --autopilot")
         due_ns = cameras.autopilot_pace(link.boot_ns, clocks, options.pace)
-    images = cameras.recorded_images(Path(options.source), options.rate_hz)
+    images = cameras.recorded_images(Path(options.source))
     return cameras.Playback(images, due_ns, clocks, stopping.is_set)
 
 
@@ -255,7 +258,6 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
         clocks,
         system_id=options.system_id,
-        component_id=options.component_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
         stamp=Clock(options.stamp),
@@ -339,28 +341,24 @@ def _publisher(
 def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
     """Warn of local messages at a rate at which PX4 does not fuse them."""
     local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
-    rates = [hz for hz in (options.send_rate_hz, options.rate_hz) if hz is not None]
-    if local and rates and min(rates) * PX4_VISION_S <= 1:
+    if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
         log.warning(
             "PX4 fuses %s only at more than %g Hz, got %g Hz: send global-position to PX4, or "
             "raise the rate",
             " and ".join(local),
             1 / PX4_VISION_S,
-            min(rates),
+            options.send_rate_hz,
         )
 
 
-def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> LogSink | None:
+def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
     if options.log is None:
         return None
+    from orthonav.onboard.log import FlightLog  # only where it is asked for
 
-    module = importlib.import_module("orthonav.onboard.log")  # only where it is asked for
     info = {"name": options.map.name, "manifest_sha256": digest}
     most = None if options.log_max_mb is None else round(options.log_max_mb * 1e6)
-    made: LogSink = module.FlightLog(
-        options.log, camera, info, views=options.log_views, max_bytes=most
-    )
-    return made
+    return FlightLog(options.log, camera, info, views=options.log_views, max_bytes=most)
 
 
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:

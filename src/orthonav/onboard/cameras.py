@@ -5,7 +5,6 @@ carries its time of exposure by our monotonic clock.
 """
 
 import logging
-import math
 import threading
 import zlib
 from collections import deque
@@ -252,10 +251,9 @@ def live_name(name: str) -> int | str:
     return int(tail) if tail.isdigit() else name
 
 
-def recorded_images(path: Path, rate_hz: float | None) -> Iterator[RecordedImage]:
-    """Images of a flight folder (at its own times), a folder of images (by name) or a video.
+def recorded_images(path: Path) -> Iterator[RecordedImage]:
+    """Images of a flight folder or a video at their times, or of a folder at `FOLDER_RATE_HZ`.
 
-    `rate_hz`: views per second; by default every frame of a video and `FOLDER_RATE_HZ` of a folder.
     Raises `FlightError` or `MissingFileError` at once where `path` is none of these.
     """
     if (path / "telemetry.csv").is_file():
@@ -264,17 +262,17 @@ def recorded_images(path: Path, rate_hz: float | None) -> Iterator[RecordedImage
             [RecordedImage(v.frame, v.telemetry.time_ns, v.grey, v.telemetry) for v in views]
         )
     if path.is_dir():
-        return _images(path, rate_hz or FOLDER_RATE_HZ)
+        return _images(path)
     if not path.is_file():
         raise MissingFileError(f"no such camera, stream, folder or file: {path}")
     require_file(path, "video")
     capture = _capture(str(path.resolve()))
     if not capture.isOpened():
         raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")
-    return _video(capture, rate_hz or math.inf)
+    return _video(capture)
 
 
-def _images(folder: Path, rate_hz: float) -> Iterator[RecordedImage]:
+def _images(folder: Path) -> Iterator[RecordedImage]:
     paths = sorted(each for each in folder.iterdir() if each.suffix.lower() in SUFFIXES)
     if not paths:
         raise FlightError(f"no images ({', '.join(SUFFIXES)}) in the folder: {folder}")
@@ -283,21 +281,16 @@ def _images(folder: Path, rate_hz: float) -> Iterator[RecordedImage]:
         return lambda: decode_image(path.read_bytes(), str(path))
 
     return iter(
-        [RecordedImage(p.name, round(i / rate_hz * 1e9), loader(p)) for i, p in enumerate(paths)]
+        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), loader(path))
+        for number, path in enumerate(paths)
     )
 
 
-def _video(capture: Any, rate_hz: float) -> Iterator[RecordedImage]:
-    number = due = 0
+def _video(capture: Any) -> Iterator[RecordedImage]:
+    number = 0
     try:
         while capture.grab():
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            if math.isfinite(
-                rate_hz
-            ):  # the same frames as `orthonav.ground.recordings.video` takes
-                if time_ns < due / rate_hz * 1e9 - 1:
-                    continue
-                due = math.floor(time_ns / 1e9 * rate_hz + 1e-6) + 1
             found, frame = capture.retrieve()
             grey = _grey(frame) if found else None
             yield RecordedImage(f"{number:06d}", time_ns, _loaded(grey, number))

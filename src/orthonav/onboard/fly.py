@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,9 @@ from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
 
+if TYPE_CHECKING:
+    from orthonav.onboard.log import FlightLog
+
 log = logging.getLogger(__name__)
 TICK_NS = 10**9
 """Interval of health and state."""
@@ -58,41 +61,6 @@ JUMP_NS = 10**9
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
 Velocity = tuple[float, float]
-
-
-class LogSink(Protocol):
-    """Writes a flight log. An exception degrades the health; the flight continues."""
-
-    @property
-    def lost(self) -> Mapping[str, int]:
-        """Number of messages that could not be written, by kind."""
-
-    def options(self, options: dict[str, Any]) -> None:
-        """Log the options of the flight."""
-
-    def view(
-        self,
-        number: int,
-        frame: str,
-        grey: Grey,
-        telemetry: Telemetry,
-        latency_ms: float | None,
-        withheld: bool,
-    ) -> None:
-        """Log a view, its telemetry, and the latency that was subtracted from its arrival, before
-        it is located, or `withheld`."""
-
-    def result(self, result: ViewResult) -> None:
-        """Log the result of an image."""
-
-    def health(self, health: dict[str, Any]) -> None:
-        """Log the health of the flight."""
-
-    def gnss(self, time_ns: int, cdr: bytes) -> None:
-        """Log a `sensor_msgs/NavSatFix` (CDR) of a GNSS receiver, as received."""
-
-    def close(self) -> None:
-        """Finish the log."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +112,7 @@ class Runner:
         clocks: Clocks,
         *,
         link: AutopilotLink | None = None,
-        sink: LogSink | None = None,
+        sink: "FlightLog | None" = None,
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
@@ -530,7 +498,7 @@ class Runner:
     def _count(self, name: str) -> None:
         self.counter.add(self._clocks.mono_ns(), name)
 
-    def _log(self, call: Callable[[LogSink], None]) -> None:
+    def _log(self, call: "Callable[[FlightLog], None]") -> None:
         """Write to the log; a failure is counted for the health."""
         if self._sink is None:
             return
