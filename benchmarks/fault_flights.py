@@ -11,17 +11,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from examples.simulated_autopilot import Encoder as Autopilot
 
 from benchmarks.fakes import (
     BEGIN_NS,
     SAMPLE_S,
     Array,
-    Autopilot,
     Grey,
     Port,
     S,
     Stream,
     Time,
+    answers,
     wandering,
 )
 from orthonav.core.geo.camera import Camera
@@ -356,7 +357,7 @@ class FaultFlight:
         asked = self._received("TIMESYNC")
         if state is not None:
             frames = telemetry_frames(self.autopilot, state, boot_ns)
-            frames += self.autopilot.answers(asked, self.time.now_ns, self.boot_ahead_ns)
+            frames += answers(self.autopilot, asked, self.time.now_ns, self.boot_ahead_ns)
         if t is not None and self.fault.others is not None:
             frames += self.fault.others(self, true, boot_ns)
         self._hear(*frames)

@@ -20,6 +20,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 import pytest
+from benchmarks.fakes import answers
 from blots import AGL_M, GROUND, known_map, rendered
 from fake_autopilot import (
     MS,
@@ -146,9 +147,9 @@ class Flight:
         """The autopilot sends telemetry and answers TIMESYNC."""
         now = self.time.now_ns + AHEAD_NS
         asked = self.port.sent("TIMESYNC") if not self.port.broken else []
-        answers = self.autopilot.answers(asked, self.time.now_ns, AHEAD_NS)
+        answered = answers(self.autopilot, asked, self.time.now_ns, AHEAD_NS)
         attitude = self.autopilot.attitude(now, yaw_deg=self.yaw_deg)
-        self.hear(self.autopilot.home(now, self.agl_m), attitude, *answers)
+        self.hear(self.autopilot.home(now, self.agl_m), attitude, *answered)
 
     def view(self, grey=None, age_s=0.05, wait_s=0.1):
         """Process one more view; its result."""
