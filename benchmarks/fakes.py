@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthonav.onboard.telemetry import Clocks
 
 READER = Path(__file__).resolve().parents[1] / "tests" / "wire.py"
-MS, S = 10**6, 10**9
+S = 10**9
 BEGIN_NS, UTC_NS = 100 * S, 1_789_000_000 * S
 """Our clock at the start, and UTC minus our clock."""
 SAMPLE_S = 0.02

@@ -10,13 +10,14 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-from benchmarks.fakes import MS, UTC_NS, Port, S, Time
+from benchmarks.fakes import UTC_NS, Port, S, Time
 from examples.simulated_autopilot import Encoder as Autopilot
 
 from orthonav.core.records import Fix
 from wire import TABLES, decode
 
-__all__ = ["MS", "UTC_NS", "Port", "Time"]  # tests import them from here
+__all__ = ["UTC_NS", "Port", "Time"]  # tests import them from here
+MS = 10**6
 
 
 class LiveAutopilot(threading.Thread):
