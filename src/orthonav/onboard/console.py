@@ -20,7 +20,7 @@ import numpy as np
 
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.onboard.cameras import NewestImage
-from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, HealthLimits, Level
+from orthonav.onboard.health import IMAGE_AGE_S, LINK_AGE_S, STATUSTEXT_INTERVAL_NS, Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.mavlink_local import Autopilot
 from orthonav.onboard.telemetry import Clocks
@@ -31,9 +31,8 @@ REMIND_S = 10.0
 """Interval of lines about a missing input."""
 RATE_S = 2.0
 """The rate of a camera is counted over so much time."""
-LOST_S = HealthLimits().image_age_s
+LOST_S = IMAGE_AGE_S
 """A camera without an image for so long is lost."""
-LINK_LOST_S = HealthLimits().link_age_s
 _MOST_AGES = 100_000
 _KINDS = {Autopilot.PX4: " PX4", Autopilot.ARDUPILOT: " ArduPilot", None: ""}
 _STATES = {
@@ -349,7 +348,7 @@ class _AutopilotWatch:
                 why += "; messages are damaged, or not signed with this key"
             return f"heartbeat on {url}{why}"
         ids = f"{status.target.system_id}/{status.target.component_id}"
-        is_heard = status.heard_age_s <= LINK_LOST_S
+        is_heard = status.heard_age_s <= LINK_AGE_S
         if self.is_heard and not is_heard:
             self._console.warn(f"heartbeat lost: nothing heard from autopilot {ids} on {url}")
         elif is_heard and not self.is_heard:

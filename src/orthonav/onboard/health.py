@@ -28,6 +28,17 @@ from orthonav.onboard.state import SPEED_MPS
 log = logging.getLogger(__name__)
 WINDOW_S = 10.0
 """Counts cover so many seconds."""
+IMAGE_AGE_S, TELEMETRY_AGE_S, LINK_AGE_S = 3.0, 3.0, 5.0
+"""Longest time without an image, an attitude, a message."""
+LOW_CONFIDENCE_S, COASTING_S = 10.0, 2.0
+"""Longest time without a confident position, in general and by views that do not show the map."""
+LATENCY_S, SHARE = 0.5, 0.2
+"""95th percentile of the time from exposure to message; share of the images in the window that are
+unusable, late or lack telemetry."""
+HEADING_DEG, LOG_SCALE = 20.0, 0.2
+"""Difference of estimated and reported heading, and of the logarithm of the height."""
+GRACE_S = 5.0
+"""Missing inputs are no reason for so long after the start."""
 STATUSTEXT_INTERVAL_NS = 5 * 10**9
 DIAGNOSIS_INTERVAL_S = 5.0
 DIAGNOSIS_VALID_S = 30.0
@@ -62,32 +73,6 @@ class Health:
         """Text for a ground station."""
         text = f"orthonav {self.level.name}"
         return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
-
-
-@dataclass(frozen=True)
-class HealthLimits:
-    """Thresholds of `judge`; exceeding one is a reason.
-
-    `image_age_s`, `telemetry_age_s`, `link_age_s`: time without an image, an attitude, a message.
-    `low_confidence_s`, `coasting_s`: time without a confident position, in general and by views
-    that do not show the map.
-    `latency_s`: 95th percentile of the time from exposure to message.
-    `share`: share (0 to 1) of the images in the window that are unusable, late or lack telemetry.
-    `heading_deg`: difference of estimated and reported heading.
-    `log_scale`: natural logarithm of the ratio of estimated and reported height.
-    `grace_s`: time after the start during which missing inputs are no reason.
-    """
-
-    image_age_s: float = 3.0
-    telemetry_age_s: float = 3.0
-    link_age_s: float = 5.0
-    low_confidence_s: float = 10.0
-    coasting_s: float = 2.0
-    latency_s: float = 0.5
-    share: float = 0.2
-    heading_deg: float = 20.0
-    log_scale: float = 0.2
-    grace_s: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -132,36 +117,35 @@ class Snapshot:
     latency: str | None = None
 
 
-def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
+def judge(seen: Snapshot) -> Health:
     """Level and reasons."""
-    limits = limits or HealthLimits()
     count = Counter(seen.counts)
-    many = limits.share * max(count["taken"], 1)
-    settled = seen.running_s > limits.grace_s
+    many = SHARE * max(count["taken"], 1)
+    settled = seen.running_s > GRACE_S
     failed = {
-        "no_camera": settled and seen.image_age_s > limits.image_age_s,
-        "link_down": settled and seen.link_age_s > limits.link_age_s,
-        "no_telemetry": settled and seen.telemetry_age_s > limits.telemetry_age_s,
+        "no_camera": settled and seen.image_age_s > IMAGE_AGE_S,
+        "link_down": settled and seen.link_age_s > LINK_AGE_S,
+        "no_telemetry": settled and seen.telemetry_age_s > TELEMETRY_AGE_S,
         "wrong_camera": count["wrong_camera"] > 0,
         "map_file_changed": not seen.map_intact,
         "internal_errors": count["internal_error"] > 0.5 * max(count["processed"], 1),
     }
     degraded = {
-        "heading_mismatch": abs(seen.heading_mismatch_deg) > limits.heading_deg,
-        "height_mismatch": abs(seen.log_scale_mismatch) > limits.log_scale,
+        "heading_mismatch": abs(seen.heading_mismatch_deg) > HEADING_DEG,
+        "height_mismatch": abs(seen.log_scale_mismatch) > LOG_SCALE,
         "start_mismatch": seen.start_off_m > 0,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
-        "coasting": seen.state == "coasting" and seen.low_confidence_s > limits.coasting_s,
+        "coasting": seen.state == "coasting" and seen.low_confidence_s > COASTING_S,
         "low_confidence": seen.state not in ("lost", "searching", "coasting")
-        and seen.low_confidence_s > limits.low_confidence_s,
+        and seen.low_confidence_s > LOW_CONFIDENCE_S,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
-        "slow": seen.latency_s > limits.latency_s or count["late"] > many,
-        "slow_vision": count["slow_vision"] > limits.share * WINDOW_S,
+        "slow": seen.latency_s > LATENCY_S or count["late"] > many,
+        "slow_vision": count["slow_vision"] > SHARE * WINDOW_S,
         "no_origin": settled and not seen.has_origin,
-        "incomplete_message": count["incomplete"] > limits.share * WINDOW_S and seen.has_origin,
+        "incomplete_message": count["incomplete"] > SHARE * WINDOW_S and seen.has_origin,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not seen.synced and not failed["link_down"],

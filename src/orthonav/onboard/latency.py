@@ -36,7 +36,7 @@ FIRST_NS = 5 * 10**9
 tell."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back, at the start and after a time
-without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.BufferLimits`)."""
+without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_S`)."""
 GAP_S = 0.5
 """A latency is compared again after an image was frozen for longer."""
 SETTLED_NS = 8 * 10**9

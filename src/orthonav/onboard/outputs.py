@@ -357,29 +357,16 @@ def open_sink(url: str) -> Sink:
 class NmeaOut:
     """GGA, RMC and GST of every view to one sink, including those without a position."""
 
-    def __init__(
-        self, sink: Sink, *, talker: str = "GP", quality: Quality = Quality.ESTIMATED
-    ) -> None:
-        self._sink, self._talker, self._quality = sink, talker, quality
+    def __init__(self, sink: Sink, *, quality: Quality = Quality.ESTIMATED) -> None:
+        self._sink, self._quality = sink, quality
 
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
         """Write one view; `utc_ns` is its time where there is no estimate. Raises `OSError`."""
-        sentences = [
-            make(
-                estimate,
-                talker=self._talker,
-                quality=self._quality,
-                utc_ns=utc_ns,
-                min_confidence=min_confidence,
-            )
-            for make in (gga, rmc)
-        ]
-        sentences.append(
-            gst(estimate, talker=self._talker, utc_ns=utc_ns, min_confidence=min_confidence)
-        )
-        self._sink.write(b"".join(sentences))
+        options: dict[str, Any] = {"utc_ns": utc_ns, "min_confidence": min_confidence}
+        sentences = [make(estimate, quality=self._quality, **options) for make in (gga, rmc)]
+        self._sink.write(b"".join([*sentences, gst(estimate, **options)]))
 
     def close(self) -> None:
         """Close the sink."""

@@ -34,6 +34,14 @@ _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
 TRAVELLED = slice(4, 7)
 """The displacement in a sample of the local frame, after velocity and down position."""
+KEEP_S = 20.0
+"""Samples are kept for so long: the longest latency of a camera, and some more."""
+ATTITUDE_GAP_S, SLOW_GAP_S = 0.5, 2.0
+"""Longest interval that is interpolated: of attitudes, which change fast, and of the rest."""
+ATTITUDE_HOLD_S, SLOW_HOLD_S = 0.1, 1.5
+"""Time for which the last sample holds."""
+ATTITUDE_AHEAD_S = 0.03
+"""Longest extrapolation of the attitude."""
 FASTEST_MPS = 300.0
 """A faster velocity is an error and is not integrated."""
 Triple = tuple[float, float, float]
@@ -61,26 +69,6 @@ class Clocks:
     mono_ns: Callable[[], int] = time.monotonic_ns
     utc_ns: Callable[[], int] = time.time_ns
     sleep: Callable[[float], None] = time.sleep
-
-
-@dataclass(frozen=True)
-class BufferLimits:
-    """Times in seconds within which samples are used.
-
-    Attitude changes fast; heights and velocities change slowly.
-
-    `keep_s`: age at which samples are discarded.
-    `attitude_gap_s`, `slow_gap_s`: longest interval that is interpolated.
-    `attitude_hold_s`, `slow_hold_s`: time for which the last sample holds.
-    `attitude_ahead_s`: longest extrapolation of the attitude.
-    """
-
-    keep_s: float = 20.0  # the longest latency of a camera that is measured, and some more
-    attitude_gap_s: float = 0.5
-    attitude_hold_s: float = 0.1
-    attitude_ahead_s: float = 0.03
-    slow_gap_s: float = 2.0
-    slow_hold_s: float = 1.5
 
 
 class Travelled(NamedTuple):
@@ -210,20 +198,16 @@ class _Samples:
 class TelemetryBuffer:
     """Samples of the last seconds by the autopilot's clock. Mutable; not to be shared."""
 
-    def __init__(
-        self, limits: BufferLimits | None = None, heights: Sequence[str] = HEIGHT_SOURCES
-    ) -> None:
+    def __init__(self, heights: Sequence[str] = HEIGHT_SOURCES) -> None:
         """`heights` are those of `HEIGHT_SOURCES` that may be used, the best first."""
-        self.limits = limits or BufferLimits()
         self._order = tuple(heights)
         self._parts = 0
         self.clear()
 
     def clear(self) -> None:
         """Discard all samples, as after a restart of the autopilot."""
-        limits = self.limits
-        slow = limits.slow_gap_s, limits.slow_hold_s
-        self._attitude = _Samples(limits.attitude_gap_s, limits.attitude_hold_s)
+        slow = SLOW_GAP_S, SLOW_HOLD_S
+        self._attitude = _Samples(ATTITUDE_GAP_S, ATTITUDE_HOLD_S)
         self._heights = {name: _Samples(*slow) for name in self._order}
         if "amsl" in self._order:
             self._heights[_SECOND_AMSL] = _Samples(*slow)
@@ -322,11 +306,11 @@ class TelemetryBuffer:
 
     @property
     def _ahead_ns(self) -> int:
-        return round(self.limits.attitude_ahead_s * 1e9)
+        return round(ATTITUDE_AHEAD_S * 1e9)
 
     @property
     def _keep_ns(self) -> int:
-        return round(self.limits.keep_s * 1e9)
+        return round(KEEP_S * 1e9)
 
 
 def _known(value: float) -> float | None:

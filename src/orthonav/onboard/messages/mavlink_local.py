@@ -11,6 +11,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT
@@ -24,6 +25,7 @@ from orthonav.onboard.messages.mavlink import (
     microseconds,
     require_confident,
 )
+from orthonav.onboard.telemetry import wxyz_of_angles
 
 _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
 _ESTIMATOR_VISION = 2
@@ -106,7 +108,8 @@ def odometry(
     frames = (_LOCAL_NED, _LOCAL_NED)
     velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
     if autopilot is Autopilot.ARDUPILOT:
-        body_from_ned = _body_from_ned(pose.attitude_rad)
+        roll, pitch, yaw = pose.attitude_rad
+        body_from_ned = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix().T
         frames = (_LOCAL_FRD, _BODY_FRD)
         velocity = body_from_ned @ velocity_ned
         velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
@@ -122,7 +125,7 @@ def odometry(
         x=float32(position[0]),
         y=float32(position[1]),
         z=float32(position[2]),
-        q=[float32(value) for value in _quaternion(pose.attitude_rad)],
+        q=[float32(value) for value in wxyz_of_angles(*pose.attitude_rad).tolist()],
         vx=float32(velocity[0]),
         vy=float32(velocity[1]),
         vz=float32(velocity[2]),
@@ -239,32 +242,6 @@ def _triangle(upper: Array, lower_std: Triple) -> list[float]:
     if not math.isfinite(cov[0, 0]):
         cov[:] = math.nan
     return [float32(value) for value in cov[np.triu_indices(6)].tolist()]
-
-
-def _quaternion(attitude_rad: Triple) -> tuple[float, float, float, float]:
-    """Quaternion w, x, y, z of the rotation from body to NED; NaN where not known."""
-    roll, pitch, yaw = (angle / 2 for angle in attitude_rad)
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
-def _body_from_ned(attitude_rad: Triple) -> Array:
-    """Rotation matrix (3, 3) from NED to forward, right, down."""
-    w, x, y, z = _quaternion(attitude_rad)
-    ned_from_body = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return ned_from_body.T
 
 
 def north_east_m(
