@@ -195,8 +195,14 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.calibrate import MountCorrected, model_of
-    from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
+    from orthonav.onboard.run import (
+        Locator,
+        MountCorrected,
+        SingleViews,
+        localize_flight,
+        model_of,
+        smoothed_track,
+    )
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
