@@ -29,7 +29,7 @@ from orthonav.core.files import Progress
 from orthonav.ground.planning.area import Area
 from orthonav.core.geo.grid import TileGrid
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
-from orthonav.ground.imagery.quiet import quiet
+from orthonav.ground.imagery.source import quiet
 from orthonav.ground.build.block_cache import BlockCache, digest
 from orthonav.ground.build.blocks import Block, Preview, blocks_of, margins, read_block
 from orthonav.ground.build.calibrate import CropSampler
