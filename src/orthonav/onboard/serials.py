@@ -30,17 +30,15 @@ def require_newest(state: Path, signature: Signature, map_path: Path) -> None:
     path = serials_path(state)
     known = _read(path)
     newest = known.get(signature.key_id)
-    serial = -1 if signature.serial is None else signature.serial
-    if newest is not None and serial < newest:
-        has = "no serial number" if signature.serial is None else f"serial number {serial}"
+    if newest is not None and signature.serial < newest:
         raise MapFileError(
-            f"map has {has}, and one with serial number {newest} of the same key was flown; to fly "
-            f"an older map, sign it again or remove {path}: {map_path}"
+            f"map has serial number {signature.serial}, and one with serial number {newest} of the "
+            f"same key was flown; to fly an older map, sign it again or remove {path}: {map_path}"
         )
-    if signature.serial is None or serial == newest:
+    if signature.serial == newest:
         return
     try:
-        write_text(path, json.dumps({**known, signature.key_id: serial}) + "\n")
+        write_text(path, json.dumps({**known, signature.key_id: signature.serial}) + "\n")
     except OutputError as error:
         log.warning("serial number of the map is not remembered: %s", error)
 
