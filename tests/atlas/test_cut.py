@@ -17,8 +17,8 @@ from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.core.tiles.stored import embedder_of
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.coverage import box_deg, check_shown

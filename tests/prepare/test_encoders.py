@@ -169,7 +169,7 @@ def test_a_map_does_not_name_the_machine_that_built_it(monkeypatch):
 
 
 def test_words_of_files_elsewhere_do_not_fly():
-    from orthonav.core.tiles.stored import embedder_of
+    from orthonav.core.tiles.embed import embedder_of
 
     plain = {"name": "bovw", "features": "superpoint", "weights": "/etc", "words": 256}
     with pytest.raises(MapFileError, match="do not fly"):

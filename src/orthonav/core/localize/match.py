@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.ratios import lowe_ratio, peak_ratio, rival_score
 from orthonav.core.tiles.exact import ExactIndex
-from orthonav.core.tiles.peak import TileNeighbours
-from orthonav.core.tiles.position import PositionRule, offset_en_m
+from orthonav.core.tiles.position import PositionRule, TileNeighbours, offset_en_m
 
 BACKGROUND_TILES = 20_000
 """Rivals are taken from about so many tiles of the whole map, evenly spread: enough for the best

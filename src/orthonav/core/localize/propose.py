@@ -11,9 +11,9 @@ from orthonav.core.localize.rectify import RectifiedView
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import Candidate
 from orthonav.core.tiles.bank import Representation, embed_poses
-from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.exact import ExactIndex
-from orthonav.core.tiles.peak import TileNeighbours, parabola_peak
+from orthonav.core.tiles.position import TileNeighbours, parabola_peak
 from orthonav.core.tiles.whitened import WhitenedEmbedder
 
 

@@ -20,9 +20,9 @@ from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.tiles import represent
+from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.exact import rows_within
 from orthonav.core.tiles.position import PositionRule
-from orthonav.core.tiles.stored import embedder_of
 from orthonav.core.variants import variant_from_recipe
 
 HEADING_SIGMAS = 1.5

@@ -266,7 +266,8 @@ def _private_key(path: Path) -> "Ed25519PrivateKey":
         raise MapFileError(f"private key has a passphrase; give one without: {path}") from error
     except Exception as error:
         raise MapFileError(f"not a private key in PEM: {path}") from error
-    return _of_kind(key, ed25519.Ed25519PrivateKey, "private", path)
+    found: Ed25519PrivateKey = _of_kind(key, ed25519.Ed25519PrivateKey, "private", path)
+    return found
 
 
 def _public_key(path: Path) -> "Ed25519PublicKey":
@@ -276,7 +277,8 @@ def _public_key(path: Path) -> "Ed25519PublicKey":
         key = serialization.load_pem_public_key(data)
     except Exception as error:
         raise MapFileError(f"not a public key in PEM: {path}") from error
-    return _of_kind(key, ed25519.Ed25519PublicKey, "public", path)
+    found: Ed25519PublicKey = _of_kind(key, ed25519.Ed25519PublicKey, "public", path)
+    return found
 
 
 def _of_kind(key: Any, kind: type, name: str, path: Path) -> Any:

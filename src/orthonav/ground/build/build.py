@@ -18,7 +18,7 @@ from orthonav import __version__
 from orthonav.core.tiles import embed, represent
 from orthonav.core.localize.logistic import USUAL
 from orthonav.research.caevl_recipe import CaevlRecipe
-from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.network import TripletRecipe
 from orthonav.core.tiles.whitened import WhitenedRecipe, learn
 from orthonav.core.files import Progress

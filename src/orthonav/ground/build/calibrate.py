@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.localize.logistic import FEATURES, LogisticConfidence, fit_few, fit_logistic
-from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.files import Progress
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.match import TileMatcher

@@ -11,7 +11,7 @@ from orthonav.core.tiles.words import WordsRecipe
 from orthonav.core.errors import MissingExtraError, VariantError
 from orthonav.core.extras import needed, pip_line
 from orthonav.ground.build.encoders import EncoderRecipe
-from orthonav.core.tiles.gray import Gray
+from orthonav.core.tiles.represent import Gray
 from orthonav.core.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)

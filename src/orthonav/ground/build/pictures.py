@@ -13,7 +13,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.research.tiles import SheetTiles
 from orthonav.ground.build.blocks import Block, BlockPixels, blocks_of, read_block
-from orthonav.core.tiles.gray import Gray
+from orthonav.core.tiles.represent import Gray
 
 BLOCK_PX = 1024
 
