@@ -17,7 +17,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.registered import Chances, RegisteredConfidence
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.calibrate_registration import RegistrationCalibration
+from orthonav.ground.build.calibrate import RegistrationCalibration
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 
