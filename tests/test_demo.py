@@ -25,7 +25,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr("orthonav.ground.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 30)
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
     quicker = functools.partial(BuildRequest, calibration_views=2)
     monkeypatch.setattr("orthonav.ground.build.BuildRequest", quicker)
 

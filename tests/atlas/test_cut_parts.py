@@ -11,7 +11,7 @@ from orthonav.core.localize.confidence import Chances, LogisticConfidence, Regis
 from orthonav.core.tiles.gradients import OrientedGradients
 from orthonav.ground.atlas.cut_sheets import pooled_registered, pooled_tiles
 from orthonav.ground.atlas.warp import Warp, _turn
-from orthonav.ground.build.blocks import Block
+from orthonav.ground.build.sheet import Block
 
 TILES = [LogisticConfidence(-6.2, (11.0, 12.0)), LogisticConfidence(-4.2, (5.6, 21.7))]
 REGISTERED = [

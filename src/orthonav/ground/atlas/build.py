@@ -38,7 +38,7 @@ from orthonav.ground.atlas.sheet_tasks import (
 )
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map
-from orthonav.ground.build.layout import rounded_gsd_m
+from orthonav.ground.build.sheet import rounded_gsd_m
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 

@@ -13,7 +13,7 @@ from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.warp import SheetSource, outline
-from orthonav.ground.build.layout import MIN_TILE_VALID_SHARE
+from orthonav.ground.build.sheet import MIN_TILE_VALID_SHARE
 from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.world import WorldSheets
 

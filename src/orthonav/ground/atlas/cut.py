@@ -27,18 +27,19 @@ from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.coverage import box_deg, check_covered, check_shown, require_sheets
 from orthonav.ground.atlas.cut_sheets import cut_terrain, opened_sheets, pooled_manifest, recipes
 from orthonav.ground.atlas.warp import SheetSource, Warp, joined_cells, joined_grey
-from orthonav.ground.build.blocks import Block, Preview
-from orthonav.ground.build.build import BuildResult
+from orthonav.ground.build.build import MAX_WORKERS, BuildResult
 from orthonav.ground.build.layer import GreyLayerWriter, Parts
-from orthonav.ground.build.layout import grid_of, tiles_of
-from orthonav.ground.build.parallel import in_order
-from orthonav.ground.build.request import MAX_WORKERS
 from orthonav.ground.build.sheet import (
     PREVIEW_PX,
+    Block,
+    Preview,
     blocks_of_area,
+    grid_of,
+    in_order,
     layer_parts,
     one_opencv_thread,
     put_layer_parts,
+    tiles_of,
 )
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.world import in_box

@@ -22,7 +22,7 @@ from orthonav.ground.atlas.coverage import box_around, box_deg, turned
 from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.build.block_cache import digest
-from orthonav.ground.build.layout import grid_of
+from orthonav.ground.build.sheet import grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.route import Route

@@ -1,7 +1,7 @@
 """Simulated ageing of imagery: the ground as another year might show it.
 
-`orthonav.ground.build.change` changes all ground alike and strongly, to learn confidence from. This
-module changes least where `orthonav.ground.check.persistence` expects structure to last, as
+`orthonav.ground.build.calibrate` changes all ground alike and strongly, to learn confidence from.
+This module changes least where `orthonav.ground.check.persistence` expects structure to last, as
 much as years do on generated landscapes.
 """
 

@@ -19,8 +19,7 @@ from orthonav.core.register.pose import rotation
 from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.check.persistence import MARGIN_PX, default_model, features
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.imagery.raster import SheetRaster
+from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 
 EVERY_PX, PERSISTENCE_LEVELS = 8, 3
 """Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""

@@ -29,7 +29,7 @@ from orthonav.ground.fetch.options import ImageryOptions, SourceSpec, finest_fit
 from orthonav.ground.fetch.remote import CACHE_BYTES, MAX_RANGE, RangeCache, RemoteFile
 from orthonav.ground.fetch.service import CellSource
 from orthonav.ground.fetch.urls import shown
-from orthonav.ground.imagery.raster import WHOLLY_VALID
+from orthonav.ground.imagery.mosaic import WHOLLY_VALID
 from orthonav.ground.planning.area import Area
 
 CELL_PX = 512
