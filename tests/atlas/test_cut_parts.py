@@ -10,7 +10,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.logistic import LogisticConfidence
 from orthonav.core.localize.registered import Chances, RegisteredConfidence
 from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.ground.atlas.cut_sheets import pooled_registered, pooled_tiles
+from orthonav.ground.atlas.cut import pooled_registered, pooled_tiles
 from orthonav.ground.atlas.warp import Warp, _turn
 from orthonav.ground.build.blocks import Block
 

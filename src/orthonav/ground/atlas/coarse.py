@@ -22,8 +22,8 @@ from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedRecipe, pooled_features
 from orthonav.core.variants import make_variant
+from orthonav.ground.atlas.catalog import CoarseRecipe
 from orthonav.ground.atlas.item import canonical, reason
-from orthonav.ground.atlas.recipe import CoarseRecipe
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.layout import MIN_TILE_VALID_SHARE
 from orthonav.ground.build.sheet import SheetReader

@@ -11,19 +11,22 @@ from pathlib import Path
 from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.mapfile import Manifest, open_map
-from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
 from orthonav.ground.atlas.coarse import read_coarse
-from orthonav.ground.atlas.index_manifest import FOLDER as INDEX
-from orthonav.ground.atlas.index_manifest import MANIFEST, read_manifest, stale_sheets
-from orthonav.ground.atlas.item import FILES, Sheet, StoredFile, sheet_of_file, split_name
-from orthonav.ground.atlas.item_files import (
+from orthonav.ground.atlas.index import FOLDER as INDEX
+from orthonav.ground.atlas.index import MANIFEST, read_manifest, stale_sheets
+from orthonav.ground.atlas.item import (
+    FILES,
     ITEMS,
     MAX_SNAPSHOT_BYTES,
     SNAPSHOT,
+    Sheet,
+    StoredFile,
     read_items,
+    sheet_of_file,
     snapshot_of,
+    split_name,
 )
-from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.build.methods import usual_edges
 
