@@ -1,7 +1,7 @@
 """The paper's Table 1: trajectories A to D, their search bands and overlaps; and how it is cut.
 
 The table itself, and the ground resolution taken where the paper states none, are those of the
-presets (`orthonav.ground.planning.routes.presets`).
+presets (`orthonav.ground.planning.route`).
 """
 
 import math

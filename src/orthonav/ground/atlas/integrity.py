@@ -40,7 +40,7 @@ _SUFFIXES = {folder: suffix for folder, suffix, _ in FILES.values()}
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem of an atlas: its kind, such as `missing file`, name of the file, cause or remedy, and
+    """A problem of an atlas: its kind (such as `missing file`), the file, cause or remedy, and
     whether it was removed."""
 
     kind: str
