@@ -25,7 +25,7 @@ from orthonav.ground.atlas.cluster import SerialRunner
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.route import Route
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 SHEET_KM, GSD_M = 1.5, 8.0

@@ -32,7 +32,7 @@ from orthonav.ground.atlas.item import (
 )
 from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.planning.area import Extent
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 
 FORMAT = "orthonav-atlas"
 SCHEMA = 1

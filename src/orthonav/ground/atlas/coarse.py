@@ -29,7 +29,7 @@ from orthonav.ground.build.layout import MIN_TILE_VALID_SHARE
 from orthonav.ground.build.sheet import SheetReader
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area, Extent
-from orthonav.ground.planning.world import in_box
+from orthonav.ground.planning.sheets import in_box
 
 FORMAT = "orthonav-coarse"
 SCHEMA = 1

@@ -66,7 +66,7 @@ from orthonav.ground.build.sheet import (
 )
 from orthonav.ground.build.terrain import TerrainParts, terrain_parts
 from orthonav.ground.planning.area import Area, Extent
-from orthonav.ground.planning.world import WorldSheets, in_box
+from orthonav.ground.planning.sheets import WorldSheets, in_box
 
 log = logging.getLogger(__name__)
 

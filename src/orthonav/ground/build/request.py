@@ -13,7 +13,7 @@ from orthonav.core.tiles.whitened import WhitenedRecipe
 from orthonav.core.errors import AreaError, OutputError, VariantError
 from orthonav.core.files import with_paths
 from orthonav.ground.planning.area import Area, Extent, require_one_area
-from orthonav.ground.planning.estimate import estimate_map
+from orthonav.ground.planning.spacing import estimate_map
 from orthonav.core.geo.grid import TileGrid
 from orthonav.ground.planning.route import Route
 from orthonav.core.geo.swapped import swapped_hint
