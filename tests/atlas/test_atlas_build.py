@@ -13,19 +13,19 @@ import pytest
 from orthonav.core.errors import AreaError, AtlasError, StorageError, WorkerError
 from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas import build as building
-from orthonav.ground.atlas import sheet_tasks as tasks
-from orthonav.ground.atlas.build import build_atlas, build_sheet
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.cluster import SerialRunner
-from orthonav.ground.atlas.coarse import read_coarse
-from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.ground.atlas.sheet_tasks import (
+from orthonav.ground.atlas import build as tasks
+from orthonav.ground.atlas.build import (
     AtlasRequest,
     Imagery,
+    build_atlas,
+    build_sheet,
     plan_sheets,
     request_digest,
     versions,
 )
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.cluster import SerialRunner
+from orthonav.ground.atlas.coarse import read_coarse
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.route import Route
 

@@ -20,11 +20,9 @@ from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.gradients import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.coverage import box_deg, check_shown
-from orthonav.ground.atlas.cut import cut_in_memory, cut_map
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.cut import box_deg, check_shown, cut_in_memory, cut_map
 from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import grid_of
 from orthonav.ground.imagery.mosaic import Mosaic

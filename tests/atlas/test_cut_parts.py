@@ -9,7 +9,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import Chances, LogisticConfidence, RegisteredConfidence
 from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.ground.atlas.cut_sheets import pooled_registered, pooled_tiles
+from orthonav.ground.atlas.cut import pooled_registered, pooled_tiles
 from orthonav.ground.atlas.warp import Warp, _turn
 from orthonav.ground.build.sheet import Block
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from orthonav.ground.check.outcome import CheckedInputs
     from orthonav.ground.check.request import CheckRequest
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.planning.terrain import LegProfile
+    from orthonav.ground.planning.spacing import LegProfile
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -276,7 +276,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
     from orthonav.core.errors import CheckError
-    from orthonav.ground.planning.terrain import LANDING_M
+    from orthonav.ground.planning.spacing import LANDING_M
 
     if options.dem_datum is not None and options.dem is None:
         raise CheckError("--dem-datum needs a terrain model: give --dem too")
@@ -313,7 +313,7 @@ def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProf
     from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
-    from orthonav.ground.planning.terrain import profile
+    from orthonav.ground.planning.spacing import profile
 
     dem = dem_for_route(options, route)
     terrain = TerrainLayer.of(open_map(options.map)) if dem is None else dem

@@ -285,8 +285,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.locate import AtlasLocator
-    from orthonav.ground.atlas.sheet_registration import SheetRegistrar
-    from orthonav.ground.atlas.tile_search import TileSearch
+    from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
     from orthonav.ground.recordings.export import export_all, export_of
     from orthonav.onboard.run import localize_flight
 

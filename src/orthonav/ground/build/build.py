@@ -57,8 +57,8 @@ from orthonav.ground.build.terrain import TerrainParts, terrain_of_dem
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
-from orthonav.ground.planning.estimate import estimate_map
 from orthonav.ground.planning.route import Route
+from orthonav.ground.planning.spacing import estimate_map
 
 MAX_WORKERS = 64
 """Sanity limit on threads."""

@@ -1,25 +1,31 @@
-"""Registering views on the sheets of an atlas, which are opened when they are needed.
+"""Searching a view in a whole atlas: coarse tiles, then registration on sheets.
 
-A view is registered on the part of a sheet around a place, so that evidence is made of that part
-only: the candidates of a view lie on as many sheets as there are, and a whole sheet takes longer to
-make ready than a view to register on it.
+`TileSearch` finds the most similar coarse tiles. `SheetRegistrar` registers the view on the part of
+a sheet around a place, so that evidence is made of that part only: a whole sheet takes longer to
+make ready than a view to register on it. `ViewMatches` weighs the matches: searching a region takes
+ten times as long as judging the place near its middle, so all candidates are judged, those with
+hope are finished, and of these the strongest are searched until one is proven. The others count as
+rivals by what is known of them, as the candidates of one search do within a sheet.
 """
 
 import functools
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE, RegisteredConfidence, logit
 from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import RegistrationLocalizer
-from orthonav.core.localize.place import Place
+from orthonav.core.localize.place import HOPE, MIN_HOPEFUL, Place
+from orthonav.core.localize.policy import DEFAULT_PLAN
+from orthonav.core.localize.rectify import RectifiedView
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView, prepare
 from orthonav.core.mapfile import open_map
@@ -29,8 +35,102 @@ from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import Peak
 from orthonav.core.register.window import GreyPyramid
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.bank import embed_poses
+from orthonav.core.variants import make_variant
 from orthonav.ground.atlas.agreement import Placement, nearest_m
-from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
+from orthonav.ground.atlas.coarse import EDGES
+from orthonav.ground.atlas.index import (
+    WHITENING_NAME,
+    half_whitened,
+    index_file,
+    load_whitening,
+    read_manifest,
+    stale_sheets,
+)
+from orthonav.ground.atlas.vectors import ShardedIndex
+
+PER_POSE = 60
+"""Tiles found for each pose; several neighbouring tiles are one place."""
+EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
+MOST_EFFORT = 0.085, 1500
+"""Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
+finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
+(`python -m benchmarks.atlas_search`)."""
+APART_STRIDES = 1.5
+"""Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
+MAX_LAT_DEG = 89.8
+"""Nearer to a pole a view has no meaningful heading."""
+
+
+class TileSearch:
+    """The index of an atlas with its shards mapped. Not to be shared between threads.
+
+    `unknown` names the sheets that are not in the index, which are not found.
+    """
+
+    def __init__(self, atlas: Atlas) -> None:
+        """Raises `AtlasError` where the atlas has no coarse tiles, or no valid index of them."""
+        if atlas.recipe.coarse is None:
+            raise AtlasError(
+                f"the atlas has no coarse tiles, so views need a prior there: {atlas.url}"
+            )
+        manifest = read_manifest(atlas)
+        if manifest is None:
+            raise AtlasError(
+                f"the atlas has no index: make it with 'orthonav atlas index': {atlas.url}"
+            )
+        self.atlas = atlas
+        self.recipe: CoarseRecipe = atlas.recipe.coarse
+        self.unknown = stale_sheets(atlas, manifest)[0]
+        file = partial(index_file, atlas, manifest)
+        self._embedder = load_whitening(file(WHITENING_NAME))
+        self._representation = make_variant(represent.TABLE, EDGES)
+        self._index = ShardedIndex(file, manifest.shards)
+        if self._embedder.dims != self._index.quantizers.recipe.dims:
+            raise AtlasError(f"files of the index do not fit together: {atlas.url}")
+        efforts = (effort for most, *effort in EFFORTS if len(self._index) <= most)
+        share, rerank = next(efforts, MOST_EFFORT)
+        self._probes = max(1, round(share * manifest.recipe.lists))
+        self._rerank = int(rerank)
+
+    def matches(
+        self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
+    ) -> list[Placement]:
+        """The tiles most similar to a view under any of the poses, best first, apart from each
+        other: their centres, which are the middle of the ground that the view shows.
+
+        `view`: rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log
+        scale of each.
+        """
+        embedded = embed_poses(
+            self._embedder,
+            self._representation,
+            view.grey,
+            view.valid,
+            poses,
+            self.recipe.tile_px,
+        )
+        queries = half_whitened(self._embedder, embedded)
+        per_pose = min(PER_POSE, len(self._index))
+        scores, ids = self._index.search(queries, per_pose, self._probes, self._rerank)
+        pose_of = np.repeat(np.arange(len(poses)), per_pose)
+        flat_scores, flat_ids = scores.reshape(-1), ids.reshape(-1)
+        order = np.argsort(-flat_scores, kind="stable")
+        apart_m = APART_STRIDES * self.recipe.tile_m * (1 - self.recipe.overlap)
+        found: list[Placement] = []
+        for at in order[np.isfinite(flat_scores[order])].tolist():
+            place = self._index.place_deg(int(flat_ids[at]))
+            if place is None or abs(place[0]) > MAX_LAT_DEG or abs(place[1]) > 180:
+                continue
+            if nearest_m(place, [each.latlon_deg for each in found]) < apart_m:
+                continue
+            found.append(Placement(*place, *poses[int(pose_of[at])]))
+            if len(found) == count:
+                break
+        return found
+
 
 log = logging.getLogger(__name__)
 
@@ -271,3 +371,118 @@ class JudgedRegion:
         pose = found.pose
         place = *self._latlon_deg(pose), pose.turn_rad, pose.log_scale
         return SheetMatch(*place, found.scores, self.sheet.confidence)
+
+
+SEARCHED = 4
+"""At most so many candidates are searched: the right one and the best rivals are among them
+(docs/decisions/atlas.md)."""
+PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
+"""Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
+searched."""
+RIVAL_SHARE = 0.25
+"""Matches farther apart than this share of the view's side are different places."""
+LEAST = 1e-5
+"""Least and greatest (1 - LEAST) probability of a match, for finite odds."""
+
+
+class ViewMatches:
+    """The matches of a view `side_m` wide.
+
+    `found`: the strongest of each place, strongest first. `compared`: the regions of candidates
+    that were finished, or searched.
+    """
+
+    def __init__(self, side_m: float) -> None:
+        self._apart_m = RIVAL_SHARE * side_m
+        self._judged: list[JudgedRegion] = []
+        self.compared: list[SearchRegion] = []
+        self.found: list[SheetMatch] = []
+
+    def add_candidates(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
+        """Judge candidates, finish those with hope, search the strongest until one is proven."""
+        judged = [each for each in map(registrar.judged, regions) if each is not None]
+        judged.sort(key=lambda each: -each.look)
+        hopeful = sum(each.look >= HOPE * judged[0].look for each in judged)
+        hopeful = max(hopeful, MIN_HOPEFUL)
+        self._judged = judged[hopeful:]
+        self.compared = [each.region for each in judged[:hopeful]]
+        finished = [(each.finished(), each) for each in judged[:hopeful]]
+        finished.sort(key=lambda each: -each[0].evidence["strength"])
+        found = [match for match, _ in finished]
+        self.found = self._distinct(found)
+        searched: list[SheetMatch] = []
+        for number, (_, region) in enumerate(finished[:SEARCHED]):
+            match = region.searched()
+            if match is None:
+                continue
+            searched.append(match)
+            if nearest_m(match.latlon_deg, [found[number].latlon_deg]) > self._apart_m:
+                found.append(match)  # the place that was judged remains a rival
+            else:
+                found[number] = match
+            self.found = self._distinct(found)
+            if self._proven and self.found[0] in searched:
+                break
+
+    def add_expected(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
+        """Search the regions where a view is expected, the likeliest first, up to one in which the
+        strongest match is proven. One in which a candidate is proven already is not searched."""
+        for region in regions:
+            if not self._proven_in(region) and (found := registrar.searched(region)):
+                self.found = self._distinct([*self.found, found])
+            if self._proven_in(region):
+                break
+
+    @property
+    def _proven(self) -> bool:
+        """Whether the strongest match is proven."""
+        return bool(self.found) and self.log_odds(0) >= PROVEN
+
+    def _proven_in(self, region: SearchRegion) -> bool:
+        """Whether it is, and lies in a region."""
+        return self._proven and region.contains(self.found[0])
+
+    def log_odds(self, number: int) -> float:
+        """Log odds of one of the matches against all others."""
+        one = self.found[number]
+        rivals = [each.evidence for at, each in enumerate(self.found) if at != number]
+        looks = [
+            each.look
+            for each in self._judged
+            if nearest_m(each.latlon_deg, [one.latlon_deg]) > self._apart_m
+        ]
+        confidence = one.confidence or USUAL_CONFIDENCE
+        return logit(confidence(against(one.evidence, rivals, looks)), LEAST)
+
+    def _distinct(self, matches: Sequence[SheetMatch]) -> list[SheetMatch]:
+        """The strongest match of each place, strongest first."""
+        distinct: list[SheetMatch] = []
+        for each in sorted(matches, key=lambda one: -one.evidence["strength"]):
+            others = [one.latlon_deg for one in distinct]
+            if nearest_m(each.latlon_deg, others) > self._apart_m:
+                distinct.append(each)
+        return distinct
+
+
+def against(
+    evidence: Mapping[str, float],
+    rivals: Sequence[Mapping[str, float]],
+    looks: Sequence[float] = (),
+) -> dict[str, float]:
+    """The evidence of a match with the best other match of the whole atlas as its rival.
+
+    `looks`: scores, at the level where views are judged, of places that were not finished. The
+    finest level counts only where the strongest rival was compared there too.
+    """
+    made = dict(evidence)
+    for rival, value in (("rival", "strength"), ("look_rival", "look")):
+        made[rival] = max([made[rival], *(each[value] for each in rivals)])
+    made["look_rival"] = max([made["look_rival"], *looks])
+    strongest = max(rivals, key=lambda each: each["strength"], default=None)
+    if strongest is None or not math.isfinite(made["fine"]):
+        return made
+    if math.isfinite(strongest["fine"]):
+        made["fine_rival"] = max(made["fine_rival"], strongest["fine"])
+    else:
+        made["fine"] = made["fine_rival"] = math.nan
+    return made
