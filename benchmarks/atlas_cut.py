@@ -25,11 +25,11 @@ import cv2
 import numpy as np
 from rasterio.warp import transform as transform_coordinates
 
-import orthonav.ground.simulate.landscape as landscape
 from benchmarks.child import peak_memory_mb
 from benchmarks.corridor import BAND_M, GSD_M, LAMBERT, route_of
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
+from lab import landscape
 from orthonav import __version__
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid

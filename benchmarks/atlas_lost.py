@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 from pyproj import Transformer
 
@@ -36,7 +37,6 @@ from orthonav.ground.atlas.locate import AtlasLocator
 from orthonav.ground.atlas.sheet_registration import SheetRegistrar
 from orthonav.ground.atlas.sheet_tasks import AtlasRequest
 from orthonav.ground.atlas.tile_search import TileSearch
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
 PAST, PRESENT = DEFAULT_DATES[2], DEFAULT_DATES[0]

@@ -26,10 +26,10 @@ import rasterio.shutil
 from rasterio.transform import Affine
 from rasterio.warp import transform as transform_coordinates
 
-import orthonav.ground.simulate.landscape as landscape
 from benchmarks.child import peak_memory_mb
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
+from lab import landscape
 from orthonav.core.files import replacing
 from orthonav.ground.planning.route import Route
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import orthonav.ground.simulate.landscape as landscape
 from benchmarks.flights import Flight, read_views
+from lab import landscape
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 

@@ -24,6 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import ArrayLike, NDArray
 from rasterio.windows import Window
 
@@ -37,7 +38,6 @@ from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
 
 GROUPS = ("slopes", "wrong", "oblique")

@@ -26,6 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES
 from numpy.typing import NDArray
 
 from benchmarks.inputs import DATA, file_of
@@ -39,7 +40,6 @@ from orthonav.ground.check.outcome import Cells
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.landscape import DEFAULT_DATES
 from orthonav.onboard.run import SingleViews, localize_flight
 
 YAW_STD_DEG, AGL_STD = 5.0, 0.05

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES, generate_area, generate_heights
 from numpy.typing import ArrayLike, NDArray
 
 from orthonav.cli.heights import map_heights
@@ -31,7 +32,6 @@ from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.terrain import Dem, open_dem
 from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area, generate_heights
 from orthonav.onboard.run import Locator, SingleViews, localize_flight
 
 SLOPE, AGL_M, SPACING_M = 0.15, 200.0, 40.0

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from lab.landscape import DEFAULT_DATES
 from rasterio.warp import transform_bounds
 
 from benchmarks.inputs import DATA, file_of, map_of
@@ -26,7 +27,6 @@ from orthonav.core.localize.registration import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 TILT_STD_DEG = 1.0

@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
 from orthonav.core.register.evidence import FINE, evidence
@@ -24,7 +25,6 @@ from orthonav.ground.check.persistence import (
     features,
     terms,
 )
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
 Array = NDArray[Any]
 SEEDS = (901, 902, 903, 904)

@@ -56,7 +56,6 @@ CORE_COMMANDS = {
     f"plan --camera CAMERA --agl-m 270 {AREA}": None,
     "evaluate FIXES --truth FLIGHT/truth.csv": None,
     "demo --out new": "geo,report,web",
-    "landscape --out new": "geo",
     "simulate --ortho MAP --random 3 --out new": "geo",
     f"fetch {AREA} --source ign:2021 --out new.tif": "fetch",
     "build --ortho MAP --out new.onav": "geo",

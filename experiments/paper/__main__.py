@@ -1,8 +1,7 @@
 """`python -m experiments.paper`: run the paper's experiments; `report`: tables and plots of them.
 
 Every run leaves one file under `paper_results/<setting>/` and is not run again while it is there.
-`keep` copies these files into the repository and makes `docs/paper-results.md` of what is there;
-`check` names rows that are older than the code they speak of, and rows without a stored result.
+`keep` copies these files into the repository and makes `docs/paper-results.md` of what is there.
 """
 
 import argparse
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
-WHAT = ("run", "report", "keep", "check")
+WHAT = ("run", "report", "keep")
 NETWORKS = ("triplet", "caevl", "autoencoder")
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -38,8 +37,9 @@ def main(arguments: list[str]) -> int:
     for name in THREADS:  # NumPy's BLAS reads it once, in the processes started too
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
-    if options.what in ("keep", "check"):
-        return _stored(options)
+    if options.what == "keep":
+        _keep(options)
+        return 0
     from experiments.paper.tables import report
 
     failed = 0
@@ -56,22 +56,14 @@ def main(arguments: list[str]) -> int:
     return 1 if failed else 0
 
 
-def _stored(options: argparse.Namespace) -> int:
-    """Keep results, or check them; returns the exit code: 1 if the page is not of the rows."""
+def _keep(options: argparse.Namespace) -> None:
+    """Copy results into the repository and write the page."""
     from experiments.paper import page as pages
-    from experiments.paper.stored import keep, stored, tried
+    from experiments.paper.results import keep, stored
 
-    if options.what == "keep":
-        for name in keep(options.out, options.setting, options.tried):
-            _say(f"stored: {name}")
-        pages.PAGE.write_text(pages.page(stored(), tried()), encoding="utf-8")
-    rows = stored()
-    for line in pages.state(rows):
-        print(line)
-    if pages.PAGE.read_text(encoding="utf-8") != pages.page(rows, tried()):
-        _say(f"not made of the stored rows: {pages.PAGE}; run python -m experiments.paper keep")
-        return 1
-    return 0
+    for name in keep(options.out, options.setting):
+        _say(f"stored: {name}")
+    pages.PAGE.write_text(pages.page(stored()), encoding="utf-8")
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
@@ -230,9 +222,7 @@ def _scenes(options: argparse.Namespace, setting: "Setting", wanted: set[str]) -
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
-    parser.add_argument(
-        "what", nargs="?", choices=("run", "report", "keep", "check"), default="run"
-    )
+    parser.add_argument("what", nargs="?", choices=WHAT, default="run")
     parser.add_argument("--setting", choices=("reduced", "gpu", "full"), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(
@@ -270,9 +260,6 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         metavar="N",
         help="epochs of networks; added to a training whose checkpoint was kept",
-    )
-    parser.add_argument(
-        "--tried", metavar="NAME", help="keep the results as rows of another training"
     )
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")

@@ -21,7 +21,6 @@ from experiments.paper import views
 from experiments.paper.results import ACCURACY_M
 from experiments.paper.runs import Workplace, head, placements, save
 from experiments.paper.scenes import Scene
-from experiments.paper.stored import code_of
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import View
@@ -81,7 +80,7 @@ def run(place: Workplace, scene: Scene) -> bool:
         each.name: _placed(each, scene, localizer, map_path, pixels_path, grounds)
         for each in BASELINES
     }
-    save(out, made | {"code": code_of(None, scene.name)}, start)
+    save(out, made, start)
     return True
 
 

@@ -1,6 +1,7 @@
 """Names of scenes, methods and inputs in tables, and which rows are shown."""
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from experiments.paper.methods import Method, tuned
 from experiments.paper.results import Result
@@ -29,16 +30,34 @@ def best_words(found: Sequence[Result]) -> list[Result]:
     words = [each for each in found if each.family == "bovw"]
     best = max(words, key=lambda each: each.accuracy("grid"), default=None)
     shown = [each for each in found if each.family != "bovw" or each is best]
-    order = list(FAMILIES)
-    edges = list(EDGES)
-    return sorted(
-        shown, key=lambda r: (order.index(r.family), r.registration, edges.index(r.edges))
-    )
+    return sorted(shown, key=row_of)
+
+
+class Row(NamedTuple):
+    """A method and its input, as a row of a table; sorted as the tables list them."""
+
+    order: tuple[int, bool, int]
+    family: str
+    edges: str
+    registration: bool
+
+
+def row_of(each: Result) -> Row:
+    """The row of a result."""
+    order = (list(FAMILIES).index(each.family), each.registration, list(EDGES).index(each.edges))
+    return Row(order, each.family, each.edges, each.registration)
+
+
+def row_label(row: Row) -> str:
+    """Name of a method and its input."""
+    if row.family == "gradient":
+        return "orthonav, default" if row.registration else "orthonav, embedding only"
+    return f"{FAMILIES[row.family]}, {EDGES[row.edges]}"
 
 
 def named(each: Result) -> str:
-    """Name of the method, with a star if it was tuned on its scene."""
-    return _plain_name(each) + ("*" if is_tuned(each) else "")
+    """Name of a method and its input, with a star if it was tuned on its scene."""
+    return row_label(row_of(each)) + ("*" if is_tuned(each) else "")
 
 
 def is_tuned(each: Result) -> bool:
@@ -46,21 +65,10 @@ def is_tuned(each: Result) -> bool:
     return tuned(each.family, each.plain["method"]["recipe"], each.scene, each.edges)
 
 
-def _plain_name(each: Result) -> str:
-    name = FAMILIES[each.family]
-    if each.family == "bovw":
-        return f"{name}, k = {each.plain['dims']}"
-    if each.family == "gradient":
-        return f"{name}, default" if each.registration else f"{name}, embedding only"
-    return name
-
-
 def label(method: Method) -> str:
-    """Name of a method and its input."""
+    """The same of a `Method`."""
     edges = method.edges.partition(":")[0]
-    if method.family == "gradient":
-        return "orthonav, default" if method.registration else "orthonav, embedding only"
-    return f"{FAMILIES[method.family]}, {EDGES[edges]}"
+    return row_label(Row((0, False, 0), method.family, edges, method.registration))
 
 
 def by_scene(results: Iterable[Result]) -> list[tuple[str, list[Result]]]:

@@ -1,29 +1,29 @@
 """The page `docs/paper-results.md`: all tables, from the rows in the repository alone."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 
 from benchmarks.record import Table
 
 from experiments.paper.methods import BETWEEN_DATES
 from experiments.paper.results import Result, percent
 from experiments.paper.scenes import SEED
-from experiments.paper.stored import ROOT, expected, made_at, name_of, older
 from experiments.paper.tables import tables
-from experiments.paper.trainings import trainings
-from experiments.paper.trajectories import REDUCED, SETTINGS
+from experiments.paper.trajectories import SETTINGS
 
-PAGE = ROOT / "docs" / "paper-results.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "paper-results.md"
+FIGURES = ("canny", "learnt", "share_canny", "share_learnt")
 HEAD = f"""# Results of the paper's experiments
 
-Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit.
-[The paper's experiments](paper.md) has the protocol and the discussion. Generated landscapes:
-seed {SEED}.
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
+experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
+{SEED}.
 """
 
 
-def page(rows: Sequence[Result], others: Sequence[Result] = ()) -> str:
-    """Text of the page: tables of each setting, other trainings, and the rows that are missing."""
+def page(rows: Sequence[Result]) -> str:
+    """Text of the page: tables of each setting."""
     text = [HEAD]
     for name in SETTINGS:
         found = [row for row in rows if row.plain["setting"]["name"] == name]
@@ -31,45 +31,23 @@ def page(rows: Sequence[Result], others: Sequence[Result] = ()) -> str:
             text.append(f"## The {name} setting\n")
             text += [table.markdown() for table in tables(found)]
     text.append(agreement().markdown())
-    if others:
-        text.append("## Other trainings\n")
-        text.append(trainings(others, rows).markdown())
-    if names := missing(rows):
-        lines = "\n".join(f"- `{name}`" for name in names)
-        text.append(f"## Rows of the reduced setting without a stored result\n\n{lines}\n")
     return "\n".join(text)
 
 
 def agreement() -> Table:
     """How the edges of two dates agree on landscapes that the network was not learnt from."""
     found = json.loads(BETWEEN_DATES.with_suffix(".json").read_text(encoding="utf-8"))
-    rows = [
-        [
-            *(f"{each['gsd_m']:g}", " and ".join(each["dates"])),
-            *(f"{each[name]:.2f}" for name in ("canny", "learnt")),
-            *(percent(each[name]) for name in ("share_canny", "share_learnt")),
-        ]
-        for each in found
-    ]
+    rows = []
+    for gsd_m in sorted({each["gsd_m"] for each in found}):
+        pairs = [each for each in found if each["gsd_m"] == gsd_m]
+        mean = {name: sum(each[name] for each in pairs) / len(pairs) for name in FIGURES}
+        correlations = (f"{mean[name]:.2f}" for name in FIGURES[:2])
+        rows.append([f"{gsd_m:g}", *correlations, *(percent(mean[name]) for name in FIGURES[2:])])
     notes = (
-        "correlation of the edges of two dates, smoothed by a Gaussian of 1 px; share: of pixels "
-        "that are edges, in %; generated landscapes that were not learnt from",
-        "made by python -m experiments.paper.between_dates",
+        "correlation of the edges of two dates, smoothed by a Gaussian of 1 px, mean of three "
+        "pairs; density: pixels that are edges, in %; generated landscapes that were not learnt "
+        "from",
+        "made by `python -m experiments.paper.between_dates`",
     )
-    header = ("m per pixel", "dates", "Canny", "learnt", "share Canny", "share learnt")
+    header = ("m per pixel", "Canny", "learnt", "density Canny", "density learnt")
     return Table("Edges between dates", header, rows, notes)
-
-
-def missing(rows: Sequence[Result]) -> list[str]:
-    """Names of the rows of the reduced setting that have no stored result."""
-    names = {name_of(row) for row in rows if row.plain["setting"]["name"] == REDUCED.name}
-    return [name for name in expected() if name not in names]
-
-
-def state(rows: Sequence[Result]) -> Iterator[str]:
-    """One line for each row that is older than its code, and one naming those without result."""
-    for row in rows:
-        if changed := older(row):
-            yield f"{name_of(row)} ({made_at(row)}) is older than {', '.join(changed)}"
-    if names := missing(rows):
-        yield f"without a stored result: {', '.join(names)}"

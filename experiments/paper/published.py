@@ -13,17 +13,6 @@ ACCURACY = {
     ("autoencoder", SAM): (89.76, 90.40, 98.00, 83.33),
 }
 """Table 2: accuracy at 15 m in per cent for A, B, C and D."""
-COMPARED = (
-    (("autoencoder", CANNY), ("autoencoder", GREY)),
-    (("autoencoder", SEGMENTS), ("autoencoder", CANNY)),
-    (("autoencoder", SAM), ("autoencoder", CANNY)),
-    (("triplet", CANNY), ("triplet", GREY)),
-    (("autoencoder", GREY), ("triplet", GREY)),
-    (("autoencoder", CANNY), ("triplet", CANNY)),
-    (("triplet", GREY), ("bovw", GREY)),
-    (("autoencoder", GREY), ("bovw", GREY)),
-)
-"""Comparisons of Table 2 that the paper speaks of."""
 CONFIDENT = {
     GREY: ((0, 0), (89.5, 72.8), (99.2, 91.3), (82.0, 46.4)),
     CANNY: ((96.0, 12.1), (99.7, 91.0), (98.6, 85.7), (100, 79.7)),
@@ -55,10 +44,10 @@ def accuracy(family: str, edges: str, scene: str) -> str:
     return f"{row[TRAJECTORIES.index(scene)]:.1f}"
 
 
-def confident(edges: str, scene: str) -> str:
-    """The paper's pair of Table 3 as text."""
+def criterion(family: str, edges: str, scene: str) -> str:
+    """The paper's pair of Table 3 as text, "-" where it has none."""
     row = CONFIDENT.get(stands_for(edges))
-    if row is None or scene not in TRAJECTORIES:
+    if row is None or family != "autoencoder" or scene not in TRAJECTORIES:
         return "-"
     right, accepted = row[TRAJECTORIES.index(scene)]
-    return f"{right:.1f} / {accepted:.1f}"
+    return f"{right:g}/{accepted:g}"

@@ -1,4 +1,4 @@
-"""Reads result files and computes the figures of tables and plots."""
+"""Result files: read, written and kept in the repository; the figures of tables and plots."""
 
 import json
 import math
@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.paper.methods import PER_TILE
+from experiments.paper.methods import PER_TILE, Method
+from experiments.paper.trajectories import SETTINGS
+from orthonav.core.files import write_text
+
+ROWS = Path(__file__).resolve().parent / "rows"
+"""Results that the page shows, a folder for each setting."""
+BASELINES, FIELD = "baselines", "field"
+DIGITS = 5
+"""Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
 ACCURACY_M = 15.0
-NEAREST_STRIDES = math.sqrt(0.5)
-"""A position names the correct tile if it is within half a tile spacing on each axis."""
 ACCURACY = 0.95
 COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3, "confidence": 4}
 Array = NDArray[np.float64]
@@ -68,15 +74,56 @@ class Result:
         errors = self.column(placement, "error_m")
         return float((errors <= radius_m).mean()) if errors.size else math.nan
 
-    def right_tile(self, placement: str) -> float:
-        """Share of views whose tile is the nearest one, or as near."""
-        return self.accuracy(placement, NEAREST_STRIDES * self.stride_m + 1e-6)
-
 
 def read(folder: Path) -> list[Result]:
     """All results of a folder, by name of file."""
     paths = sorted(folder.glob("*.json"))
     return [Result(json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+
+
+def stored() -> list[Result]:
+    """All rows in the repository."""
+    return [row for name in SETTINGS for row in read(ROWS / name)]
+
+
+def keep(results: Path, setting: str) -> list[str]:
+    """Copy the results of a setting into the repository; the names of the rows that changed."""
+    changed = []
+    for path in sorted((results / setting).glob("*.json")):
+        target = ROWS / setting / path.name
+        text = path.read_text(encoding="utf-8")
+        if not target.is_file() or target.read_text(encoding="utf-8") != text:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_text(target, text)
+            changed.append(path.stem)
+    return changed
+
+
+def compact(made: dict[str, Any]) -> str:
+    """A result as text: one line per field, numbers rounded to five digits."""
+    lines = [
+        f"{json.dumps(name)}: {json.dumps(rounded(value), separators=(',', ':'))}"
+        for name, value in made.items()
+    ]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def rounded(value: Any) -> Any:
+    """The same with numbers of five digits, and None for those that are not finite."""
+    if isinstance(value, dict):
+        return {str(key): rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.{DIGITS}g}") if abs(value) < float("inf") else None
+
+
+def name_of(row: Result) -> str:
+    """Scene and method of a row, as its file is named."""
+    if not row.family:
+        return f"{row.scene}-{FIELD if FIELD in row.plain else BASELINES}"
+    return f"{row.scene}-{Method(**row.plain['method']).key}"
 
 
 def numbers(values: Sequence[float | None], missing: float) -> Array:

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from experiments.paper import published, views
 from experiments.paper.methods import Method
-from experiments.paper.results import ACCURACY_M
+from experiments.paper.results import ACCURACY_M, compact
 from experiments.paper.rules import compared
 from experiments.paper.scenes import Scene
-from experiments.paper.stored import code_of, compact
 from experiments.paper.trajectories import TILE_PX, Setting
 from orthonav.core.files import write_text
 from orthonav.core.localize import Localizer
@@ -91,7 +90,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
     made["cpu_minutes"] = round((time.process_time() - cpu_s) / 60, 2)
-    written = save(out, made | {"code": code_of(method, scene.name)}, start)
+    written = save(out, made, start)
     if not place.keep_checkpoints:
         (work / "checkpoint.pt").unlink(missing_ok=True)
     return written

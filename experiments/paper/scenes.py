@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 
 from experiments.paper.methods import REDUCED_NETWORKS
@@ -15,7 +16,6 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 SEED = 1
 AGL_M = 2000.0

@@ -108,6 +108,7 @@ def view_of(
 
 
 def telemetry_at(agl_m: float, *, exact: bool = True) -> Telemetry:
-    """Telemetry of every view: north up, nominal height; `exact` tries no other heading."""
+    """Telemetry of every view: north up, nominal height, straight down without an error of pitch
+    and roll; `exact` tries no other heading."""
     std = HEADING_TOLD_DEG if exact else None
-    return Telemetry(0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=std)
+    return Telemetry(0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=std, tilt_std_deg=0.0)

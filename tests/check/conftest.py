@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 
 def blank_east(path, seed):

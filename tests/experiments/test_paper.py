@@ -178,15 +178,10 @@ def test_tables_and_plots_are_made_of_the_files_alone(tmp_path, made):
     }
     (folder / "B-autoencoder-canny.json").write_text(json.dumps(plain))
     text = report(tmp_path, "reduced").read_text()
-    row = next(line for line in text.splitlines() if line.startswith("| Auto-Encoder"))
-    assert [cell.strip() for cell in row.split("|")[2:-1]] == [
-        *("Canny", "90.2", "100", "50", "0", "100", "3 / 4 / 4"),
-    ]
-    confidence = next(
-        line for line in text.splitlines() if line.startswith("| B") and " / " in line
-    )
-    assert "99.7 / 91.0" in confidence
-    assert "67 / 75" in confidence
+    rows = [line.split() for line in text.splitlines() if line.startswith("| Auto-Encoder, Canny")]
+    accuracy, criterion, accepted = (row[4] for row in rows[:3])
+    assert (accuracy, criterion, accepted) == ("100/50/0", "67/75", "25/50")
+    assert " 90.2 |" in text and " 99.7/91 |" in text
     assert (folder / "sensitivity.png").is_file()
     assert (folder / "confidence-B.png").is_file()
     assert report(tmp_path, "full") is None
@@ -211,7 +206,7 @@ def test_ceiling_is_the_part_of_the_square_in_the_circle():
 def test_published_figures_are_found():
     assert published.accuracy("autoencoder", "segments", "B") == "90.4"
     assert published.accuracy("gradient", "gradient", "B") == "-"
-    assert published.confident("canny", "A") == "96.0 / 12.1"
+    assert published.criterion("autoencoder", "canny", "A") == "96/12.1"
 
 
 def test_imagery_too_small_is_refused(area):

@@ -3,7 +3,7 @@
 Couturier and Akhloufi interpolate between neighbouring embeddings too; Di Piazza et al. 2024 found
 no gain from it with a triplet network. With the whitened gradient embedding the score falls
 smoothly around the peak, and a parabola through three neighbours cuts the median error to about a
-third of that of the best tile's centre (`docs/benchmarks.md`).
+third of that of the best tile's centre (`python -m benchmarks --only compare`).
 """
 
 import cv2
