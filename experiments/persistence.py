@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.register.evidence import FINE, evidence
-from orthonav.ground.check.persistence import (
+from orthonav.ground.check.ageing import (
     MODEL,
     PATCH_PX,
     PersistenceModel,

@@ -8,9 +8,8 @@ import rasterio
 
 from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.changes.ground import changed_ground
+from orthonav.ground.changes.ground import SeenCells, changed_ground
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid, read_changes, write_changes
-from orthonav.ground.changes.views import SeenCells
 from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
 
 FRAME = LocalFrame(48.0, 2.0)

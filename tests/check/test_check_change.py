@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from helpers import textured
-from orthonav.ground.check import change
-from orthonav.ground.check.change import another_year, displaced
+from orthonav.ground.check import ageing
+from orthonav.ground.check.ageing import another_year, displaced
 
 SIZE = 192
 
@@ -14,8 +14,8 @@ SIZE = 192
 @pytest.fixture(autouse=True)
 def mild(monkeypatch):
     """No deviation from the expected persistence."""
-    monkeypatch.setattr(change, "FIELD", 0.0)
-    monkeypatch.setattr(change, "VIEW", 0.0)
+    monkeypatch.setattr(ageing, "FIELD", 0.0)
+    monkeypatch.setattr(ageing, "VIEW", 0.0)
 
 
 def kept(one, other):
@@ -65,24 +65,6 @@ def test_what_comes_instead_stays_mirrored():
     mirrored = [np.rot90(ground[:, ::-1], times) for times in range(4)]
     assert max(kept(each, made) for each in turned) < 0.1
     assert max(kept(each, made) for each in mirrored) > 0.4
-
-
-def test_the_same_every_time_and_nothing_touched():
-    grey, donor = textured((SIZE, SIZE), 5), textured((SIZE, SIZE), 6)
-    before = grey.copy(), donor.copy()
-    first, second = (changed(0.4, 3, grey, donor) for _ in range(2))
-    assert_array_equal(first, second)
-    assert (changed(0.4, 4) != first).any()
-    assert_array_equal(grey, before[0])
-    assert_array_equal(donor, before[1])
-    assert first.dtype == np.uint8 and first.shape == grey.shape
-
-
-@pytest.mark.parametrize("grey", [0, 255])
-def test_blank_ground(grey):
-    blank = np.full((SIZE, SIZE), grey, np.uint8)
-    made = changed(0.5, grey=blank, donor=blank)
-    assert made.shape == blank.shape and made.std() < 60
 
 
 def test_what_stands_tilts_away_from_the_middle():

@@ -1,25 +1,22 @@
 """How far heading and height may be off, from trials."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_trials import lost, right
 
-from orthonav.ground.check.envelope import (
+from orthonav.ground.check.findings import (
     AGL_OFF,
     HEIGHTS,
     TOLERATED,
     YAW_OFF_DEG,
     envelope_of,
-    envelope_work,
     heights_of,
     heights_work,
-    right_share,
 )
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.check.views import TrialPlan
+from orthonav.ground.check.trials import TrialPlan
 
 PLAN = TrialPlan(CheckRequest(Path("a.onav")), 100.0)
 PLACES = np.zeros((20, 2))
@@ -37,15 +34,6 @@ def envelope(shares):
     return envelope_of([trials(each) for each in shares.ravel()])
 
 
-def test_work_is_at_the_same_places_for_every_error():
-    work = envelope_work(PLAN, PLACES)
-    assert len(work) == len(YAW_OFF_DEG) * len(AGL_OFF)
-    assert [(plan.yaw_off_deg, plan.agl_off) for plan, _ in work][: len(AGL_OFF)] == [
-        (0.0, off) for off in AGL_OFF
-    ]
-    assert all(places is PLACES and plan.request is PLAN.request for plan, places in work)
-
-
 def test_errors_are_fine_up_to_the_first_that_is_not():
     shares = np.full((len(YAW_OFF_DEG), len(AGL_OFF)), 0.9)
     shares[2, MIDDLE] = 0.9 * TOLERATED - 0.1
@@ -54,13 +42,6 @@ def test_errors_are_fine_up_to_the_first_that_is_not():
     assert found.tolerated_yaw_deg == YAW_OFF_DEG[1]
     assert (found.tolerated_agl_low, found.tolerated_agl_high) == (AGL_OFF[1], AGL_OFF[-2])
     np.testing.assert_allclose(found.share, shares, atol=0.03)
-
-
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_all_errors_are_fine(share):
-    found = envelope(share)
-    assert found.tolerated_yaw_deg == YAW_OFF_DEG[-1]
-    assert (found.tolerated_agl_low, found.tolerated_agl_high) == (AGL_OFF[0], AGL_OFF[-1])
 
 
 def test_where_nothing_is_found_no_error_is_fine():
@@ -81,9 +62,3 @@ def test_heights():
     chosen = [each for each in found if each.chosen]
     assert [(each.value, each.probability) for each in chosen] == [(100.0, 0.7)]
     assert found[0].probability == pytest.approx(0.1)
-
-
-def test_kept_are_the_confident_and_right():
-    some = [right((0, 0)), right((0, 0), error_m=40.0), right((0, 0), confidence=0.8), lost((0, 0))]
-    assert right_share(some) == 0.25
-    assert math.isnan(right_share([]))

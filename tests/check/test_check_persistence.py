@@ -1,23 +1,16 @@
 """Persistence from year to year, predicted from one picture."""
 
-import json
-from importlib import resources
-
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 
-from orthonav.ground.check.persistence import (
+from orthonav.ground.check.ageing import (
     MARGIN_PX,
     MAX_PERSISTENCE,
     MIN_PERSISTENCE,
-    MODEL,
-    default_model,
     features,
-    terms,
 )
-from orthonav.ground.check.views import PERSISTENCE_LEVELS, reported_persistence
+from orthonav.ground.check.trials import reported_persistence
 
 SIZE = 256
 
@@ -74,30 +67,3 @@ def test_blank_ground_has_finite_persistence(grey):
             and predicted.min() >= MIN_PERSISTENCE
             and predicted.max() <= MAX_PERSISTENCE
         )
-
-
-def test_levels():
-    large = np.tile(crops(), (2, 2))
-    assert len(reported_persistence(large, 1.0)) == PERSISTENCE_LEVELS
-    tiny = reported_persistence(crops()[:90, :90], 1.0)
-    assert tiny and all(each.shape == (90, 90) for each in tiny)
-    later = reported_persistence(large, 0.5, first=1)
-    assert len(later) == PERSISTENCE_LEVELS and later[0] is later[1]
-
-
-def test_features_and_weights_fit():
-    found = features(crops(), 1.0, every_px=16)
-    assert found.shape[:2] == (16, 16) and found.dtype == np.float32
-    model = default_model()
-    assert model.mean.shape == model.spread.shape == found.shape[2:]
-    assert terms(found).shape[-1] == len(model.weights)
-    assert (model.spread > 0).all()
-
-
-def test_terms_are_all_products():
-    assert_array_equal(terms(np.array([2.0, 3.0])), [1, 2, 3, 4, 6, 9])
-
-
-def test_a_model_survives_a_file():
-    text = resources.files("orthonav.ground.check").joinpath(MODEL).read_text(encoding="utf-8")
-    assert default_model().to_plain() == json.loads(text)["model"]

@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration
+from orthonav.ground.check.recalibrate import LEARNT, Recalibration
 
 SHARES = np.linspace(0.02, 0.98, 25)
-
-
-def test_plain_changes_nothing():
-    np.testing.assert_allclose(PLAIN(SHARES, 100.0, has_prior=False), SHARES)
 
 
 @pytest.mark.parametrize("view_px", [60.0, 256.0, 500.0])

@@ -18,7 +18,7 @@ from orthonav.ground.view import feed as feed_module
 from orthonav.ground.view import logs as logs_module
 from orthonav.ground.view.feed import LineFeed
 from orthonav.ground.view.logs import LogReader
-from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.view.run import ViewRequest, open_run
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.outputs import JsonOut
 

@@ -14,7 +14,7 @@ import pytest
 from small_run import FRAME, GSD_M, NORTH_M, WEST_M
 
 from orthonav.ground.report.page import static_text
-from orthonav.ground.view.assets import SHARED, load_assets
+from orthonav.ground.view.server import SHARED, load_assets
 
 STATIC = files("orthonav.ground.view").joinpath("static")
 OURS = {entry.name: entry.read_text(encoding="utf-8") for entry in STATIC.iterdir()}

@@ -24,9 +24,8 @@ from small_run import (
 )
 
 from orthonav.core.errors import MissingExtraError, OutputError
-from orthonav.ground.view.assets import load_assets
-from orthonav.ground.view.opening import ViewRequest, open_run
-from orthonav.ground.view.server import Pages, Server
+from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.server import Pages, Server, load_assets
 
 
 def as_json(reply):

@@ -13,7 +13,7 @@ from orthonav.cli import view as view_module
 from orthonav.core.flight.fixes import write_results
 from orthonav.core.flight.identity import Identity
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.view.run import ViewRequest, open_run
 
 
 def refused(done, *words):

@@ -101,7 +101,7 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     from orthonav.core.mapfile import open_map
     from orthonav.core.records import Prior
     from orthonav.core.track.tracker import Tracker
-    from orthonav.ground.evaluate.truth import check_truth
+    from orthonav.ground.evaluate.metrics import check_truth
     from orthonav.onboard.calibrate import MIN_VIEWS, calibrate_mount, confident_views
     from orthonav.onboard.calibrate_views import RecordedSingleViews, calibrate_mount_by_views
     from orthonav.onboard.run import Locator, localize_flight, smoothed_track

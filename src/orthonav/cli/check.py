@@ -186,7 +186,9 @@ def run(options: argparse.Namespace) -> int:
     import json
 
     from orthonav.ground.check.run import check_map
-    from orthonav.ground.check.write import require_free, to_json, verdict_text, write_check
+    from orthonav.ground.check.write import require_free, write_check
+    from orthonav.ground.check.write.plain import to_json
+    from orthonav.ground.check.write.wording import text
 
     require_free(options.out)
     request = _request(options)
@@ -196,7 +198,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print_json(json.loads(to_json(result)))
     else:
-        print(verdict_text(result))
+        print(text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
 

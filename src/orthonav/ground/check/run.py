@@ -16,14 +16,16 @@ from orthonav.core.files import Progress, no_progress
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import MAP_STD_M
-from orthonav.ground.check.envelope import (
+from orthonav.ground.check.estimate import Prediction, Predictor
+from orthonav.ground.check.findings import (
+    blind_stretches,
     envelope_of,
     envelope_work,
+    found_lookalikes,
     heights_of,
     heights_work,
+    predicted_along,
 )
-from orthonav.ground.check.estimate import Prediction, Predictor
-from orthonav.ground.check.lookalikes import found_lookalikes
 from orthonav.ground.check.outcome import (
     Along,
     Alternative,
@@ -40,10 +42,15 @@ from orthonav.ground.check.places import (
     trial_places,
 )
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.check.route import blind_stretches, predicted_along
-from orthonav.ground.check.trials import Trial, registration_of, run_many
+from orthonav.ground.check.trials import (
+    MIN_VALID,
+    Trial,
+    TrialPlan,
+    registration_of,
+    require_overlap,
+    run_many,
+)
 from orthonav.ground.check.verdict import verdict_of
-from orthonav.ground.check.views import MIN_VALID, TrialPlan, require_overlap
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
