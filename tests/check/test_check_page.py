@@ -14,7 +14,7 @@ import pytest
 from made_check import EVIL, FILES, small_route
 
 from orthonav.core.mapfile import open_map
-from orthonav.ground.check.outcome import CELL_VALUES, BlindStretch
+from orthonav.ground.check.outcome import CELL_VALUES
 from orthonav.ground.check.write import write_check
 from orthonav.ground.check.write.figures import (
     MAX_SIDE_PX,
@@ -24,7 +24,7 @@ from orthonav.ground.check.write.figures import (
 )
 from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN
 from orthonav.ground.check.write.plain import check_to_plain
-from orthonav.ground.check.write.wording import better_sentence, probability_text, remedies
+from orthonav.ground.check.write.wording import probability_text
 from orthonav.ground.report.drawing import Drawing
 from orthonav.ground.report.numbers import metres_text
 from orthonav.ground.report.page import static_text
@@ -188,24 +188,10 @@ def test_who_signs_sees_what_was_checked(folder):
         assert said in signed
 
 
-def test_a_go_needs_no_help_and_a_no_go_names_what_it_tried(frame):
-    assert remedies(made_check.tiny(frame)) == []
-    result = made_check.small_route(frame)
-    assert remedies(result)[0] == better_sentence(result.alternatives, "agl_m")
-    lost = BlindStretch(100, 1100, 5, 55, 0.2, drift_m=20, allowed_m=15)
-    (sentence,) = remedies(replace(result, alternatives=(), stretches=(lost,)))
-    assert "drifts by at most 1.5 % (assumed: 2 %)" in sentence
-    ended = replace(lost, ends_lost=True)
-    (sentence,) = remedies(replace(result, alternatives=(), stretches=(ended,)))
-    assert sentence.startswith("End the route before km 0.1")
-    (sentence,) = remedies(replace(result, alternatives=(), stretches=()))
-    assert sentence.startswith("No other height was tried")
-
-
 def test_the_picture_lies_where_the_map_does(opened, frame):
     result = made_check.tiny(frame)
     found = map_image(opened, visible_box(result))
-    west, south, east, north = found.west_m, found.south_m, found.east_m, found.north_m
+    west, south, east, north = found.box
     rows, cols = found.grey.shape
     assert max(rows, cols) <= MAX_SIDE_PX
     assert (east - west) / cols == pytest.approx((north - south) / rows, rel=0.01)
@@ -323,13 +309,6 @@ def test_other_screens(visit, options):
     page = visit("small_route", **options)
     assert page.locator("html.live").count() == 1
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_without_scripts_figures_are_shown(visit):
-    page = visit("small_route", java_script_enabled=False)
-    assert page.locator(".still-part img").count() == 2
-    assert page.locator(".still-part img").first.is_visible()
-    assert not page.locator("#map").is_visible()
 
 
 def test_scripts_write_numbers_as_python_does(browser):

@@ -57,16 +57,6 @@ def test_cells_cover_the_extent_and_no_more(west, north, across, down, side_m):
     ).all()
 
 
-def test_pixels_are_areas():
-    valid = np.zeros((2, 3), np.bool_)
-    valid[1, 2] = True
-    coverage = covering(10.0, 20.0, 4.0, valid)
-    inside = [[18.0, 15.99], [21.99, 12.01]]
-    outside = [[17.99, 14], [22.01, 14], [20, 16.01], [20, 11.99], [-1e9, 14], [20, 1e9]]
-    assert coverage.covers(np.array(inside)).all() and not coverage.covers(np.array(outside)).any()
-    assert coverage.extent_en_m == (18.0, 12.0, 22.0, 16.0) and coverage.area_m2 == 16.0
-
-
 def test_covered_share_of_every_cell():
     valid = np.random.default_rng(1).random((60, 80)) < 0.5
     valid[:, 40:] = False
@@ -78,12 +68,6 @@ def test_covered_share_of_every_cell():
     assert (coverage.cell_share(grid)[3:, :2] == 1).all()
     beyond = CellGrid.over((-200.0, 0.0, -40.0, 120.0), 20.0)
     assert (coverage.cell_share(beyond) == 0).all()
-
-
-def test_a_map_that_shows_nothing():
-    coverage = covering(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_))
-    with pytest.raises(AreaError, match="has no imagery"):
-        _ = coverage.extent_en_m
 
 
 @pytest.mark.parametrize(

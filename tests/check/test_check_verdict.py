@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.ground.check.outcome import Along, BlindStretch, Lookalike, Word
+from orthonav.ground.check.outcome import Along, BlindStretch, Word
 from orthonav.ground.check.verdict import verdict_of
 
 ZEROS = np.zeros(11)
@@ -151,22 +151,3 @@ def test_gaps(stretches, expected, said):
     word, reasons = judged(findings)
     assert word is expected and reasons["blind"] is expected
     assert any(said in each.text for each in verdict_of(**findings).reasons)
-
-
-def test_lookalikes_never_worsen_the_verdict():
-    like = Lookalike((46.0, 3.0), (46.01, 3.0), 1100.0, 0.9, 4, True)
-    some = (like, replace(like, within_prior=False), replace(like, trials=1))
-    assert judged(FINE | dict(lookalikes=some)) == (
-        Word.GO,
-        {"fixes": Word.GO, "lookalikes": Word.GO},
-    )
-    assert judged(FINE | dict(lookalikes=some[1:])) == (Word.GO, {"fixes": Word.GO})
-
-
-def test_the_mean_is_told_with_its_bound_and_what_go_requires():
-    start = "Mean probability of a confident, correct fix per image on the map: "
-    for mean, low, rest in (
-        (0.85, 0.64, "85 % (90 % lower bound 64 %)."),
-        (0.72, 0.5, "72 % (90 % lower bound 50 %; GO requires 60 %)."),
-    ):
-        assert verdict_of(**(FINE | dict(mean=mean, low=low))).reasons[0].text == start + rest

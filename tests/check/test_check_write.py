@@ -216,29 +216,6 @@ def test_shapes_lie_where_things_are(written, layers):
     assert [row["ends_lost"] for row in rows] == [each.ends_lost for each in result.stretches]
 
 
-def test_the_route_takes_the_worse_end(written, layers):
-    result, _ = written
-    rows = layers["route"][1]
-    ends = result.along.probability
-    found = [row["probability"] for row in rows]
-    np.testing.assert_allclose(found, np.minimum(ends[:-1], ends[1:]), atol=6e-4)
-    risks = {"confident", "likely", "doubtful", "unlikely", "unknown"}
-    assert {row["risk"] for row in rows} <= risks
-    legs = layers["legs"][1]
-    assert [leg["bearing_deg"] for leg in legs] == pytest.approx([24.6, 159.0, 22.5], abs=0.1)
-
-
-def test_the_date_line_is_crossed_without_a_jump():
-    points = [
-        point
-        for each in features(made_check.tiny(LocalFrame(-17.0, 179.9999)))
-        if each["properties"]["layer"] == "cells"
-        for point in each["geometry"]["coordinates"][0]
-    ]
-    lon = np.array(points)[:, 0]
-    assert 0 < np.ptp(lon) < 0.02
-
-
 # The folder
 
 
@@ -259,19 +236,6 @@ def test_files_of_others_are_never_touched(written, folder, opened, name):
     with pytest.raises(OutputError, match="no check wrote"):
         write_check(result, opened, folder)
     assert tree(folder) == before
-
-
-def test_names_alone_do_not_make_a_check(opened, frame, tmp_path):
-    folder = tmp_path / "check"
-    folder.mkdir()
-    require_free(folder)
-    (folder / "index.html").write_text("mine")
-    (folder / "check.json").write_text('{"format": "another"}')
-    with pytest.raises(OutputError, match="no check wrote"):
-        write_check(small_route(frame), opened, folder)
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(OutputError, match="is a file"):
-        require_free(tmp_path / "file")
 
 
 @pytest.mark.parametrize("at", [0, 2, 4])
@@ -343,3 +307,27 @@ def test_names_do_no_harm(opened, frame, tmp_path, undrawn):
     page = write_check(result, opened, tmp_path / "check").read_text(encoding="utf-8")
     assert "alert(" in page and "<script>alert" not in page and "<img src=x" not in page
     assert strict((tmp_path / "check" / "check.json").read_text(encoding="utf-8"))
+
+
+def test_the_date_line_is_crossed_without_a_jump():
+    points = [
+        point
+        for each in features(made_check.tiny(LocalFrame(-17.0, 179.9999)))
+        if each["properties"]["layer"] == "cells"
+        for point in each["geometry"]["coordinates"][0]
+    ]
+    lon = np.array(points)[:, 0]
+    assert 0 < np.ptp(lon) < 0.02
+
+
+def test_names_alone_do_not_make_a_check(opened, frame, tmp_path):
+    folder = tmp_path / "check"
+    folder.mkdir()
+    require_free(folder)
+    (folder / "index.html").write_text("mine")
+    (folder / "check.json").write_text('{"format": "another"}')
+    with pytest.raises(OutputError, match="no check wrote"):
+        write_check(small_route(frame), opened, folder)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="is a file"):
+        require_free(tmp_path / "file")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.flight.fixes import write_results
-from orthonav.core.flight.gnss import BIASES, FAULTS, fault_of
+from orthonav.core.flight.gnss import BIASES, FAULTS
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.metrics import compare
@@ -77,12 +77,6 @@ def test_what_was_learnt_is_that_of_the_last_view_that_knows_it():
 def test_without_gnss_there_are_no_figures():
     results = [result(i) for i in range(3)]
     assert measure_gnss(compare(truth(3), results, FRAME), results) is None
-
-
-def test_codes_of_faults_are_read_safely():
-    assert fault_of({}) == fault_of({"gnss_fault": 0.0}) == fault_of({"gnss_fault": 99.0}) == ""
-    assert fault_of({"gnss_fault": float("nan")}) == ""
-    assert fault_of({"gnss_fault": STEP}) == "gnss_step"
 
 
 @pytest.mark.long

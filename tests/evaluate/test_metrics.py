@@ -100,13 +100,6 @@ def test_criteria_keep_views_at_or_above_a_threshold() -> None:
     assert share == 0.0 and math.isnan(accuracy)
 
 
-def test_a_criterion_that_no_view_has_is_not_defined() -> None:
-    comparison = compare(truth_of(TRUTH_EN_M), [fix("a", (0.0, 0.0), confidence=1.0)])
-    row = next(r for r in measure(comparison).criteria if r.name == "lowe_ratio")
-    assert math.isnan(row.share_accepted) and math.isnan(row.accuracy)
-    assert criterion_curve(comparison, "lowe_ratio", 15.0).thresholds.size == 0
-
-
 def test_a_curve_keeps_equal_values_together() -> None:
     curve = criterion_curve(three_fixes(), "confidence", 15.0)
     assert curve.thresholds.tolist() == [0.95, 0.6]
@@ -137,17 +130,6 @@ def test_no_overlap_is_an_error_that_shows_both_names() -> None:
         compare(truth_of(TRUTH_EN_M), [ViewResult("z", 0, NoFix("blank", ""), 1.0)])
     with pytest.raises(FlightError, match="0 results"):
         compare({}, [])
-
-
-def test_two_results_for_a_frame_are_refused() -> None:
-    with pytest.raises(FlightError, match="more than one result, such as 'a'"):
-        compare(truth_of(TRUTH_EN_M), [no_fix("a"), no_fix("a")])
-
-
-def test_a_fix_without_a_finite_position_is_no_fix() -> None:
-    broken = Fix(math.nan, 0.0, np.eye(2), 1.0, 15.0, 0.0, 100.0)
-    metrics = measure(compare(truth_of(TRUTH_EN_M), [ViewResult("a", 0, broken, 1.0)]))
-    assert metrics.n_fixes == 0 and metrics.reasons == {"not_finite": 1, "no_result": 3}
 
 
 def test_pooled_flights_count_every_view() -> None:

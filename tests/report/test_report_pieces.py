@@ -39,7 +39,7 @@ def names(folder: Path) -> list[str]:
 
 def drawn_map() -> Drawing:
     box = (0.0, 900.0, 0.0, 600.0)
-    background = Background(np.full((60, 90), 200, np.uint8), *(box[0], box[2], box[1], box[3]))
+    background = Background(np.full((60, 90), 200, np.uint8), (0.0, 0.0, 900.0, 600.0))
 
     def draw(axes) -> None:
         draw_map(axes, box, background)

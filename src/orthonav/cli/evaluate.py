@@ -283,4 +283,4 @@ def map_background(opened: "MapFile") -> "Background":
     from orthonav.core.mapfile.layer import preview
     from orthonav.ground.report.drawing import Background
 
-    return Background(preview(opened), *opened.manifest.sheets[0].grid.extent_en_m)
+    return Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)

@@ -9,10 +9,11 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -310,33 +311,28 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
     """
     if not comparisons:
         raise ValueError("no results: expected at least one flight")
-    starts: list[int] = []
-    views = 0
-    for part in comparisons:
-        starts += [views + start for start in part.starts]
-        views += len(part.frames)
-
-    def joined(name: str) -> FloatArray:
-        return np.concatenate([getattr(part, name) for part in comparisons])
-
-    return Comparison(
-        lat_deg=comparisons[0].lat_deg,
-        lon_deg=comparisons[0].lon_deg,
-        frames=tuple(name for part in comparisons for name in part.frames),
-        time_ns=tuple(time for part in comparisons for time in part.time_ns),
-        truth_en_m=joined("truth_en_m"),
-        fix_en_m=joined("fix_en_m"),
-        errors_m=joined("errors_m"),
-        cov_en_m2=joined("cov_en_m2"),
-        own_radius_m=joined("own_radius_m"),
-        confident=joined("confident").astype(np.bool_),
-        criteria={n: np.concatenate([p.criteria[n] for p in comparisons]) for n in CRITERIA},
-        reasons=tuple(reason for part in comparisons for reason in part.reasons),
-        latency_ms=joined("latency_ms"),
-        n_without_truth=sum(part.n_without_truth for part in comparisons),
-        n_without_result=sum(part.n_without_result for part in comparisons),
-        starts=tuple(starts),
+    lengths = [len(part.frames) for part in comparisons]
+    firsts = np.cumsum([0, *lengths[:-1]]).tolist()
+    joined: dict[str, Any] = {
+        field.name: _joined([getattr(part, field.name) for part in comparisons])
+        for field in fields(Comparison)
+    }
+    joined |= {"lat_deg": comparisons[0].lat_deg, "lon_deg": comparisons[0].lon_deg}
+    joined["starts"] = tuple(
+        first + start
+        for first, part in zip(firsts, comparisons, strict=True)
+        for start in part.starts
     )
+    return Comparison(**joined)
+
+
+def _joined(values: list[Any]) -> Any:
+    """Values of one field of several comparisons as one: joined, or counts added."""
+    if isinstance(values[0], np.ndarray):
+        return np.concatenate(values)
+    if isinstance(values[0], Mapping):
+        return {name: np.concatenate([each[name] for each in values]) for name in values[0]}
+    return sum(values, start=type(values[0])())
 
 
 def measure(

@@ -73,7 +73,6 @@ def write_report(
     out_dir: Path,
     flights: Sequence[FlightReport],
     made_from: MadeFrom | None = None,
-    title: str = "",
     whole: Metrics | None = None,
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
@@ -83,14 +82,7 @@ def write_report(
     as `total`, `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot
     be written.
     """
-    page, figures = page_of(flights, whole or total(flights), made_from or MadeFrom(), title)
-    return write_page(out_dir, page, figures)
-
-
-def page_of(
-    flights: Sequence[FlightReport], whole: Metrics, made_from: MadeFrom, title: str = ""
-) -> tuple[str, list[Figure]]:
-    """The page as HTML, and its figures; those of several flights carry the flights' names."""
+    whole = whole or total(flights)
     several = len(flights) > 1
     drawn = [_drawn(flight) for flight in flights]
     if several:
@@ -100,7 +92,7 @@ def page_of(
     drawn = [each.named(*named) for each, *named in zip(drawn, names, files, strict=False)]
     subject = f"{len(flights)} flights" if several else flights[0].name
     values: dict[str, Any] = {
-        "title": title or f"Evaluation of {subject}",
+        "title": f"Evaluation of {subject}",
         "kind": "Evaluation of flights",
         "verdict": verdict(whole),
         "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
@@ -115,14 +107,15 @@ def page_of(
         "total_section": None,
         "made_from": [
             ("orthonav" if name == "version" else name.removesuffix("_name"), text)
-            for name, text in vars(made_from).items()
+            for name, text in vars(made_from or MadeFrom()).items()
         ],
     }
     if several:
         figures = {"name": "all flights", "figures": drawn[-1].general}
         values["total_section"] = {**figures, **_trust(whole)}
     page = render("orthonav.ground.evaluate", "report.html", values)
-    return page, [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    shown = [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    return write_page(out_dir, page, shown)
 
 
 def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:

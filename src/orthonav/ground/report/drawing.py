@@ -139,23 +139,19 @@ def _own_style() -> Iterator[None]:
         yield
 
 
-_BACKGROUND_LEVELS = 16  # few grey levels keep the PNG small
-_BACKGROUND_MAX_PX = 825  # along its longer side; finer ones are made coarser
+_BACKGROUND_LEVELS = 15  # few grey levels keep the PNG small
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
     """A grey image behind a map, north up.
 
-    `grey`: (rows, columns), uint8.
-    `west_m`, `south_m`, `east_m`, `north_m`: outer edges in the plane of the map.
+    `grey`: (rows, columns), uint8, at most about a thousand pixels across.
+    `box`: its west, south, east and north edges in metres, in the plane of the map.
     """
 
     grey: NDArray[np.uint8]
-    west_m: float
-    south_m: float
-    east_m: float
-    north_m: float
+    box: tuple[float, float, float, float]
 
 
 def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None = None) -> None:
@@ -163,8 +159,12 @@ def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None
 
     `box` is the visible part: west, east, south, north in metres.
     """
-    if background is not None:
-        draw_background(axes, background, box)
+    if background is not None:  # pale, in few grey levels
+        levels = np.round(background.grey / 255 * _BACKGROUND_LEVELS) / _BACKGROUND_LEVELS
+        looks: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1, "interpolation": "none"}
+        west, south, east, north = background.box
+        axes.imshow(0.45 + 0.55 * levels, extent=(west, east, south, north), **looks)
+        axes.grid(visible=False)
     axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
     axes.set(xlabel="east (m)", ylabel="north (m)")
     draw_scale_bar(axes, box)
@@ -178,34 +178,6 @@ def map_size_in(
     width_m, height_m = box[1] - box[0], box[3] - box[2]
     scale = longest_in / max(width_m, height_m)
     return max(scale * width_m, least_in[0]) + 1.0, max(scale * height_m, least_in[1]) + 1.0
-
-
-def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]) -> None:
-    """Draw the visible part of the background, pale and in few grey levels."""
-    rows, columns = background.grey.shape
-    west, south = background.west_m, background.south_m
-    east_step = (background.east_m - west) / columns
-    north_step = (background.north_m - south) / rows
-    left, right = (int(np.clip((x - west) / east_step, 0, columns)) for x in box[:2])
-    below, above = (int(np.clip((y - south) / north_step, 0, rows)) for y in box[2:])
-    right, above = min(right + 1, columns), min(above + 1, rows)
-    seen = background.grey[rows - above : rows - below, left:right]
-    if seen.size == 0:
-        return
-    step = max(1, math.ceil(max(seen.shape) / _BACKGROUND_MAX_PX))
-    seen = seen[: seen.shape[0] // step * step, : seen.shape[1] // step * step]
-    coarse = seen.reshape(seen.shape[0] // step, step, -1, step).mean(axis=(1, 3))
-    levels = np.round(coarse / 255 * (_BACKGROUND_LEVELS - 1)) / (_BACKGROUND_LEVELS - 1)
-    extent = (
-        west + left * east_step,
-        west + (left + coarse.shape[1] * step) * east_step,
-        south + (above - coarse.shape[0] * step) * north_step,
-        south + above * north_step,
-    )
-    axes.imshow(
-        0.45 + 0.55 * levels, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="none"
-    )
-    axes.grid(visible=False)
 
 
 def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:

@@ -45,7 +45,7 @@ _MARGIN = 0.04
 _EMPTY = 226
 """Grey level without imagery, as light as a light page."""
 _QUALITIES = (72, 60, 45, 30, 15)
-_BACKGROUND_PX = 900
+_BACKGROUND_PX = 825
 _STEPS = 20
 _NUMBERED = 0.01
 """Recoverable stretches shorter than this fraction of the route get no number in the profile."""
@@ -277,4 +277,4 @@ def map_image(opened: MapFile, box: Box) -> Background:
     size = max(1, round(width_m / gsd_m)), max(1, round(height_m / gsd_m))
     grey, valid = sheet.crop((west, south, east, north), size)
     grey[~valid] = _EMPTY
-    return Background(grey, west, south, east, north)
+    return Background(grey, (west, south, east, north))

@@ -214,7 +214,7 @@ def _page_data(result: CheckResult, image: Background) -> str:
     ]
     drawn = {
         "box": visible_box(result),
-        "image": (image.west_m, image.south_m, image.east_m, image.north_m),
+        "image": image.box,
         "values": list(CELL_VALUES),
         "colours": _colours(),
         "confident": CONFIDENT,
