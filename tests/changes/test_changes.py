@@ -13,7 +13,7 @@ from orthonav.ground.changes.record import ChangedGround, ChangeGrid, read_chang
 from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
 
 FRAME = LocalFrame(48.0, 2.0)
-GRID = ChangeGrid(FRAME, -200.0, 150.0, 10.0, 30, 40)
+GRID = ChangeGrid(-200.0, 150.0, 10.0, 30, 40, FRAME)
 RIGHT = np.s_[:, 30:]
 """Columns that changed in the views below."""
 

@@ -289,7 +289,7 @@ def unwritten(untried, monkeypatch):
 
 def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
     """In the west it is part of the cells, and the report of another map is doubted."""
-    grid = ChangeGrid(frame, -400.0, 100.0, 100.0, 2, 2)
+    grid = ChangeGrid(-400.0, 100.0, 100.0, 2, 2, frame)
     ones = np.ones((2, 2))
     path = tmp_path / "changes.geojson"
     command = ("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.changes.record import CellGrid
 from orthonav.ground.check.places import (
     FEWEST_TRIALS,
     MAX_TRIALS,
     MIN_TRIALS,
-    CellGrid,
     MapCoverage,
     checked_m2,
     trial_places,

@@ -84,7 +84,7 @@ def test_unchanged_views_are_found_with_less_telemetry(exact, changed):
 
 
 def test_views_of_ground_that_changed_are_not_found(plan, registration):
-    grid = ChangeGrid(registration.sheet.frame, -450.0, 300.0, 100.0, 6, 9)
+    grid = ChangeGrid(-450.0, 300.0, 100.0, 6, 9, registration.sheet.frame)
     shape = grid.rows, grid.cols
     gone = np.zeros(shape, np.bool_)
     gone[:, :5] = True

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.changes.record import CellGrid
 
 Array = NDArray[np.float64]
 
@@ -80,6 +81,11 @@ class Cells:
     trials: NDArray[np.int32]
     persistence: Array
     changed: Array
+
+    @property
+    def grid(self) -> CellGrid:
+        """The cells without their values."""
+        return CellGrid(self.west_m, self.north_m, self.side_m, *self.probability.shape)
 
 
 CELL_VALUES = {

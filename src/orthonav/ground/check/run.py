@@ -16,6 +16,7 @@ from orthonav.core.files import Progress, no_progress
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import MAP_STD_M
+from orthonav.ground.changes.record import CellGrid
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     blind_stretches,
@@ -35,7 +36,6 @@ from orthonav.ground.check.outcome import (
     Envelope,
 )
 from orthonav.ground.check.places import (
-    CellGrid,
     MapCoverage,
     cell_side_m,
     checked_m2,
@@ -362,10 +362,8 @@ class _Check:
         route, widths = self.request.route, set(self.bands_m)
         if route is None or len(widths) != 1:
             return found
-        rows, cols = cells.probability.shape
-        grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, rows, cols)
         line = route.points_en_m(self.sheet.frame)
-        away_m = distance_to_polyline_m(grid.centres_en_m, line)
+        away_m = distance_to_polyline_m(cells.grid.centres_en_m, line)
         probability = cells.probability.ravel()
         bands = []
         for part in (*BANDS, 1.0):

@@ -44,37 +44,6 @@ SHARED = ("chart.js", "format.js", "plane.js")
 """Scripts of `orthonav.ground.report` that the page uses."""
 
 
-@dataclass(frozen=True)
-class StaticFile:
-    """A file of the page and its media type."""
-
-    data: bytes
-    media_type: str
-
-
-def load_assets() -> dict[str, StaticFile]:
-    """All files of the page by the path of their request, `/` for the page itself.
-
-    Only these can be requested: no path is derived from what a browser sends. Raises
-    `MissingExtraError` where Leaflet is not installed.
-    """
-    own = list(files("orthonav.ground.view").joinpath("static").iterdir())
-    own += [files("orthonav.ground.report").joinpath("static", name) for name in SHARED]
-    found = {
-        f"/static/{entry.name}": _static_file(entry.read_bytes(), entry.name)
-        for entry in own
-        if entry.is_file() and PurePath(entry.name).suffix in _TYPES
-    }
-    found["/"] = found.pop("/static/index.html")
-    for name, path in zip(LEAFLET, leaflet_files(*LEAFLET), strict=True):
-        found[f"/leaflet/{name}"] = _static_file(path.read_bytes(), name)
-    return found
-
-
-def _static_file(data: bytes, name: str) -> StaticFile:
-    return StaticFile(data, _TYPES[PurePath(name).suffix])
-
-
 log = logging.getLogger(__name__)
 TIMEOUT_S = 60.0
 """An idle connection is closed after this time."""
@@ -101,10 +70,29 @@ class Response:
     cache: str = _NOT_CACHED
 
 
+def load_assets() -> dict[str, Response]:
+    """All files of the page by the path of their request, `/` for the page itself.
+
+    Only these can be requested: no path is derived from what a browser sends. Raises
+    `MissingExtraError` where Leaflet is not installed.
+    """
+    own: list[Any] = list(files("orthonav.ground.view").joinpath("static").iterdir())
+    own += [files("orthonav.ground.report").joinpath("static", name) for name in SHARED]
+    paths = {f"/static/{entry.name}": entry for entry in own}
+    for name, path in zip(LEAFLET, leaflet_files(*LEAFLET), strict=True):
+        paths[f"/leaflet/{name}"] = path
+    paths["/"] = paths.pop("/static/index.html")
+    return {
+        at: Response(HTTPStatus.OK, path.read_bytes(), _TYPES[PurePath(path.name).suffix])
+        for at, path in paths.items()
+        if PurePath(path.name).suffix in _TYPES
+    }
+
+
 class Pages:
     """Routes of the server. Safe to share between threads."""
 
-    def __init__(self, run: Run, assets: dict[str, StaticFile]) -> None:
+    def __init__(self, run: Run, assets: dict[str, Response]) -> None:
         self._run, self._assets = run, assets
 
         def png(data: bytes) -> Response:
@@ -133,9 +121,8 @@ class Pages:
             asked = urlsplit(target)
         except ValueError:
             return _error(HTTPStatus.BAD_REQUEST, "not an address")
-        asset = self._assets.get(asked.path)
-        if asset is not None:
-            return Response(HTTPStatus.OK, asset.data, asset.media_type)
+        if asked.path in self._assets:
+            return self._assets[asked.path]
         for pattern, made in self._routes.items():
             match = re.fullmatch(pattern, asked.path)
             if match is not None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.changes.record import lonlat
 from orthonav.ground.check.outcome import CELL_VALUES, Along, Cells, CheckResult, summarize
 from orthonav.ground.report.numbers import BY_UNIT, to_plain
 
@@ -23,8 +24,6 @@ EDGE_PX = 3.0
 _LATLON_DIGITS = 7
 _STEP_M = 1000.0
 """Legs get a vertex at least this often: they are straight in the plane, not in degrees."""
-_CORNERS = np.array([(0, 0), (0, 1), (1, 1), (1, 0), (0, 0)])
-"""Ring of a cell as (column, row), counter-clockwise."""
 
 Array = NDArray[np.float64]
 Plain = dict[str, Any]
@@ -148,13 +147,12 @@ def _lookalikes(result: CheckResult) -> list[Plain]:
 
 
 def _cells_to_plain(frame: LocalFrame, cells: Cells) -> Plain:
-    rows, cols = cells.probability.shape
-    edges = cells.west_m + np.array([0, cols, cols, 0]) * cells.side_m
-    corners = np.stack([edges, cells.north_m - np.array([0, 0, rows, rows]) * cells.side_m], axis=1)
+    grid = cells.grid
+    west, north = grid.west_m, grid.north_m
+    east, south = west + grid.cols * grid.side_m, north - grid.rows * grid.side_m
+    corners = np.array([(west, north), (east, north), (east, south), (west, south)])
     return {
-        "rows": rows,
-        "cols": cols,
-        **to_plain({name: getattr(cells, name) for name in ("side_m", "west_m", "north_m")}, 4),
+        **to_plain(grid, 4),
         "corners_latlon_deg": _latlon_deg(frame, corners),
         **to_plain({name: getattr(cells, name) for name in CELL_VALUES}, BY_UNIT),
     }
@@ -219,8 +217,7 @@ def _cell_features(result: CheckResult) -> Iterator[Plain]:
     cells = result.cells
     known = np.isfinite(cells.probability) | (cells.trials > 0) | np.isfinite(cells.persistence)
     for row, col in np.argwhere(known).tolist():
-        at = (_CORNERS + np.array([col, row])) * (cells.side_m, -cells.side_m)
-        ring = at + np.array([cells.west_m, cells.north_m])
+        ring = cells.grid.ring_en_m(row, col)
         values = to_plain({name: getattr(cells, name)[row, col] for name in CELL_VALUES}, BY_UNIT)
         yield _feature(result.frame, "cells", "Polygon", ring, {"row": row, "col": col, **values})
 
@@ -270,9 +267,7 @@ def _feature(
     """A feature from points (N, 2); without points its geometry is null."""
     if not len(points_en_m):
         return _as_feature(layer, None, properties)
-    lat, lon = frame.latlon_from_en(points_en_m)
-    lon = frame.lon_deg + (lon - frame.lon_deg + 180) % 360 - 180  # no jump at the date line
-    points = to_plain(np.stack([lon, lat], axis=-1), _LATLON_DIGITS)
+    points = lonlat(frame, points_en_m)
     coordinates = {"Point": points[0], "Polygon": [points]}.get(kind, points)
     return _as_feature(layer, {"type": kind, "coordinates": coordinates}, properties)
 
