@@ -22,7 +22,7 @@ from orthonav.cli import COMMANDS, common, main
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
-from orthonav.ground.report import Drawing
+from orthonav.ground.report.drawing import Drawing
 
 WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "2"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]

@@ -101,7 +101,7 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     from orthonav.core.mapfile import open_map
     from orthonav.core.records import Prior
     from orthonav.core.track.tracker import Tracker
-    from orthonav.ground.evaluate.truth import check_truth
+    from orthonav.ground.evaluate.metrics import check_truth
     from orthonav.ground.recordings.calibrate_mount import (
         MIN_VIEWS,
         RecordedSingleViews,

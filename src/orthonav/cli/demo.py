@@ -115,9 +115,9 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.core.localize import Localizer
     from orthonav.core.mapfile import open_map
     from orthonav.ground.build import BuildRequest, build_map
-    from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.evaluate.metrics import compare, measure
     from orthonav.ground.evaluate.report import MadeFrom, write_report
+    from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
     from orthonav.onboard.run import SingleViews, localize_flight

@@ -172,8 +172,8 @@ def reason_of(error: BaseException) -> tuple[str, bool]:
             return found.group(2), True
         return ("empty answer", True) if status == 200 else (f"HTTP {status}", is_temporary(status))
     if found := re.search(r"(?:HTTP response code: |CURL error: )(\d{3}|.{,200})", text):
-        status = found.group(1)
-        return (f"HTTP {status}" if status.isdecimal() else status), True
+        problem = str(found.group(1))
+        return (f"HTTP {problem}" if problem.isdecimal() else problem), True
     if found := re.search(r"Incorrect size (.*?) of downloaded block, expected (.*?),", text):
         return f"image of {found.group(1)} px instead of {found.group(2)}", False
     if found := re.search(r"server returned exception: (.{,300}?)( GDAL|$)", text):

@@ -1,11 +1,11 @@
-"""The imagery of a map for the page: tiles, crops, and rectified views.
+"""What pages show of a map and of a view: tiles, crops, and rectified views.
 
-Positions on the page are pixels of the sheet's finest level: fractional column and row from the
+Positions on a page are pixels of the sheet's finest level: fractional column and row from the
 north-west corner of its raster (pixel-is-area).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -25,8 +25,7 @@ from orthonav.core.localize.view import check_telemetry
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import TerrainLayer
-from orthonav.core.records import Telemetry, View
-from orthonav.ground.view.images import Grey
+from orthonav.core.records import Fix, Telemetry, View, ViewResult
 
 MIN_PX, MAX_PX = 256, 1024
 """Limits of the pixels across a window: what a screen shows."""
@@ -34,7 +33,10 @@ MARGIN = 1.02
 """Width of a window relative to the footprint."""
 MAX_READ_PX = 4096
 """Limit of a window of the map, about 16 MB."""
+Grey = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Box = tuple[float, float, float, float]
+"""West, south, east, north in metres, in the plane of a sheet."""
 _QUICK = [int(cv2.IMWRITE_PNG_COMPRESSION), 1]
 
 
@@ -50,6 +52,27 @@ class GroundWindow:
     size_px: int
     offset_en_m: tuple[float, float]
 
+    def box_at(self, position_en_m: NDArray[np.float64]) -> Box:
+        """Its edges where the camera is above a position (2,)."""
+        east, north = (float(value) for value in position_en_m + self.offset_en_m)
+        half_m = self.side_m / 2
+        return east - half_m, north - half_m, east + half_m, north + half_m
+
+
+def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
+    """`telemetry` with the heading, height and tilt that the fix states."""
+    fix = result.outcome
+    if not isinstance(fix, Fix):
+        return telemetry
+    pitch_deg, roll_deg = fix.tilt_deg(telemetry)
+    return replace(
+        telemetry,
+        yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else telemetry.yaw_deg,
+        agl_m=fix.agl_m if math.isfinite(fix.agl_m) else telemetry.agl_m,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
+    )
+
 
 def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindow:
     """The square that holds the footprint of a view. Raises `FlightError` where it is unknown.
@@ -62,8 +85,7 @@ def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindo
         raise FlightError(refused.detail)
     attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     axis = axis_on_ground_en_m(*attitude)
-    half_m = math.hypot(*camera.extent) / 2
-    reach_m = MAX_REACH * half_m * telemetry.agl_m
+    reach_m = MAX_REACH * math.hypot(*camera.extent) / 2 * telemetry.agl_m
     try:
         corners = footprint_en_m(camera, *attitude)
         reach_m = min(reach_m, float(np.abs(corners - np.array(axis)).max()))
@@ -80,7 +102,7 @@ def image_px(
     telemetry: Telemetry, camera: Camera, window: GroundWindow, place: tuple[float, float]
 ) -> tuple[float, float]:
     """The image point of a place in the window of a view, shares from the left and the top; the
-    inverse of `view_png`. Raises `FlightError` where the view does not show it."""
+    inverse of `rectified`. Raises `FlightError` where the view does not show it."""
     east = window.offset_en_m[0] + (place[0] - 0.5) * window.side_m
     north = window.offset_en_m[1] + (0.5 - place[1]) * window.side_m
     down = enu_from_camera(telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg)
@@ -90,18 +112,17 @@ def image_px(
     return x, y
 
 
-def view_png(grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow) -> bytes:
-    """A view rectified to nadir in its window, transparent outside."""
+def rectified(
+    grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow
+) -> tuple[Grey, Mask]:
+    """Grey and valid (size_px, size_px) of a view rectified to nadir in its window."""
     height, width = grey.shape
     if abs(height * camera.width_px - width * camera.height_px) > max(height, width) * 4:
         raise FlightError("the image does not have the proportions of the calibration")
     gsd_m = window.side_m / window.size_px
-    made = rectify(
-        downsampled(View(grey, camera.resized(width, height), telemetry), gsd_m),
-        gsd_m=gsd_m,
-        size_px=window.size_px,
-    )
-    return png(made.grey, made.valid)
+    view = downsampled(View(grey, camera.resized(width, height), telemetry), gsd_m)
+    made = rectify(view, gsd_m=gsd_m, size_px=window.size_px)
+    return made.grey, made.valid
 
 
 def png(grey: Grey, valid: Mask) -> bytes:
@@ -109,20 +130,22 @@ def png(grey: Grey, valid: Mask) -> bytes:
     picture = grey
     if not valid.all():
         picture = np.dstack([grey, grey, grey, valid.astype(np.uint8) * 255])
-    done, data = cv2.imencode(".png", picture, _QUICK)
-    if not done:
-        raise FlightError("the image cannot be encoded")
-    return data.tobytes()
+    return bytes(cv2.imencode(".png", picture, _QUICK)[1].tobytes())
 
 
-def small_jpeg(grey: Grey, side_px: int = 640) -> bytes:
-    """An image as recorded, no larger than `side_px`."""
-    share = min(1.0, side_px / max(grey.shape))
-    size = max(1, round(share * grey.shape[1])), max(1, round(share * grey.shape[0]))
-    done, data = cv2.imencode(".jpg", cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
-    if not done:
-        raise FlightError("the image cannot be encoded")
-    return data.tobytes()
+def jpeg(grey: Grey, quality: int = 95) -> bytes:
+    """Grey levels as JPEG."""
+    return bytes(cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1].tobytes())
+
+
+def shrunk(grey: Grey, max_px: int, max_area_px: float = math.inf) -> Grey:
+    """An image no larger than `max_px` on its longer side and `max_area_px`."""
+    rows, cols = grey.shape
+    share = min(1.0, max_px / max(rows, cols), math.sqrt(max_area_px / (rows * cols)))
+    if share == 1:
+        return grey
+    size = (max(1, round(share * cols)), max(1, round(share * rows)))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 class SheetImagery:
@@ -174,48 +197,39 @@ class SheetImagery:
         """
         if self._layer is None or self.sheet.grey is None:
             raise IndexError("the map has no layer")
-        jpeg = self._layer.jpeg(level, row, col)
-        if jpeg is not None:
-            return jpeg, "image/jpeg"
+        stored = self._layer.jpeg(level, row, col)
+        if stored is not None:
+            return stored, "image/jpeg"
         side = self.sheet.grey.chunk_px
         rows, cols = self._layer.shape(level)
         size = min(side, rows - row * side), min(side, cols - col * side)
         grey, valid = self._layer.read(level, row * side, col * side, *size)
         return (png(grey, valid), "image/png") if valid.any() else None
 
-    def crop_png(self, middle_en_m: tuple[float, float], window: GroundWindow) -> bytes:
-        """The map in a window around a position, transparent where there is no imagery."""
-        grey, valid = self.crop(middle_en_m, window.side_m, window.size_px)
-        return png(grey, valid)
-
-    def crop(
-        self, middle_en_m: tuple[float, float], side_m: float, size_px: int
-    ) -> tuple[Grey, Mask]:
-        """Grey and valid (size_px, size_px) of a square `side_m` wide, north up."""
-        step_m = side_m / size_px
-        level = self._level(step_m)
+    def crop(self, box: Box, size_px: tuple[int, int]) -> tuple[Grey, Mask]:
+        """Grey and valid (rows, cols) of a box, north up; `size_px`: columns and rows."""
+        west, north = box[0] - self.grid.west_m, self.grid.north_m - box[3]  # from the corner
+        width_m, height_m = box[2] - box[0], box[3] - box[1]
+        level = self._level(min(width_m / size_px[0], height_m / size_px[1]))
         col_m, row_m = self._steps_m(level)
-        west = middle_en_m[0] - side_m / 2 - self.grid.west_m
-        south = self.grid.north_m - middle_en_m[1] - side_m / 2  # of the top edge, southwards
-        first_col, first_row = math.floor(west / col_m) - 1, math.floor(south / row_m) - 1
-        cols, rows = math.ceil(side_m / col_m) + 4, math.ceil(side_m / row_m) + 4
+        first_col, first_row = math.floor(west / col_m) - 1, math.floor(north / row_m) - 1
+        cols, rows = math.ceil(width_m / col_m) + 4, math.ceil(height_m / row_m) + 4
         if max(cols, rows) > MAX_READ_PX:
-            nothing = np.zeros((size_px, size_px), np.uint8)
+            nothing = np.zeros(size_px[::-1], np.uint8)
             return nothing, nothing > 0
         grey, valid = self._read(level, first_row, first_col, rows, cols)
-        scale_x, scale_y = step_m / col_m, step_m / row_m
+        scale_x, scale_y = width_m / size_px[0] / col_m, height_m / size_px[1] / row_m
         # OpenCV counts from the centres of pixels, we from the corner of the first one.
         from_window = np.array(
             [
                 [scale_x, 0, west / col_m - first_col + scale_x / 2 - 0.5],
-                [0, scale_y, south / row_m - first_row + scale_y / 2 - 0.5],
+                [0, scale_y, north / row_m - first_row + scale_y / 2 - 0.5],
             ]
         )
-        size = (size_px, size_px)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        drawn = cv2.warpAffine(grey, from_window, size, flags=flags)
+        drawn = cv2.warpAffine(grey, from_window, size_px, flags=flags)
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpAffine(valid.astype(np.uint8), from_window, size, flags=flags)
+        seen = cv2.warpAffine(valid.astype(np.uint8), from_window, size_px, flags=flags)
         return np.asarray(drawn, dtype=np.uint8), np.asarray(seen > 0, dtype=np.bool_)
 
     def _level(self, step_m: float) -> int:

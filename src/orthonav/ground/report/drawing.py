@@ -5,6 +5,7 @@ those of Okabe and Ito (https://jfly.uni-koeln.de/color/), safe for colour-blind
 """
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -33,6 +34,12 @@ OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
 """Arguments of an annotation whose position is an offset in points."""
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
 """Box (`bbox`) that keeps text readable on any background."""
+LEGEND_ABOVE: dict[str, Any] = {
+    "loc": "lower center",
+    "bbox_to_anchor": (0.5, 1.0),
+    "frameon": False,
+}
+"""Arguments of a legend above the axes."""
 _STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": GREY,
@@ -130,3 +137,78 @@ def _own_style() -> Iterator[None]:
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
         yield
+
+
+_BACKGROUND_LEVELS = 15  # few grey levels keep the PNG small
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """A grey image behind a map, north up.
+
+    `grey`: (rows, columns), uint8, at most about a thousand pixels across.
+    `box`: its west, south, east and north edges in metres, in the plane of the map.
+    """
+
+    grey: NDArray[np.uint8]
+    box: tuple[float, float, float, float]
+
+
+def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None = None) -> None:
+    """Draw the base of a map: axes in metres, background image, scale bar and north arrow.
+
+    `box` is the visible part: west, east, south, north in metres.
+    """
+    if background is not None:  # pale, in few grey levels
+        levels = np.round(background.grey / 255 * _BACKGROUND_LEVELS) / _BACKGROUND_LEVELS
+        looks: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1, "interpolation": "none"}
+        west, south, east, north = background.box
+        axes.imshow(0.45 + 0.55 * levels, extent=(west, east, south, north), **looks)
+        axes.grid(visible=False)
+    axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+    axes.set(xlabel="east (m)", ylabel="north (m)")
+    draw_scale_bar(axes, box)
+    draw_north(axes)
+
+
+def map_size_in(
+    box: tuple[float, ...], longest_in: float, least_in: tuple[float, float] = (3.0, 3.0)
+) -> tuple[float, float]:
+    """Width and height in inches of a drawing of `box`, an inch for the axes included."""
+    width_m, height_m = box[1] - box[0], box[3] - box[2]
+    scale = longest_in / max(width_m, height_m)
+    return max(scale * width_m, least_in[0]) + 1.0, max(scale * height_m, least_in[1]) + 1.0
+
+
+def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
+    """Draw a scale bar of a round length at the bottom left."""
+    width_m, height_m = box[1] - box[0], box[3] - box[2]
+    length_m = _round_length(0.25 * min(width_m, height_m))
+    x, y = box[0] + 0.04 * width_m, box[2] + 0.04 * height_m
+    for width, colour in ((6, "white"), (3, INK)):
+        axes.plot([x, x + length_m], [y, y], color=colour, linewidth=width, zorder=8)
+    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+    axes.annotate(
+        text, (x + length_m / 2, y), (0, 6), **OFFSET, ha="center", zorder=8, bbox=BACKING
+    )
+
+
+def draw_north(axes: "Axes") -> None:
+    """Draw a north arrow at the top right."""
+    axes.annotate(
+        "N",
+        xy=(0.965, 0.975),
+        xytext=(0.965, 0.89),
+        xycoords="axes fraction",
+        ha="center",
+        weight="bold",
+        zorder=8,
+        arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.6, "shrinkA": 1},
+        bbox=BACKING,
+    )
+
+
+def _round_length(length_m: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above `length_m`."""
+    power = 10.0 ** math.floor(math.log10(length_m))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= length_m * (1 + 1e-9))
