@@ -20,7 +20,7 @@ from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import View
 from orthonav.core.register.search import bank
-from orthonav.core.tiles.canny import Canny
+from orthonav.core.tiles.represent import Canny
 
 Array = NDArray[np.float32]
 Place = NDArray[np.float64] | None
@@ -76,7 +76,7 @@ def poses(heading_known: bool, yaw_std_deg: float | None) -> list[tuple[float, f
         scale_step=SCALE_STEP,
         sigmas=SIGMAS,
     )
-    return [(math.degrees(turn), math.exp(log_scale)) for turn, log_scale in made.poses]
+    return [(math.degrees(turn), math.exp(log_scale)) for turn, log_scale in made]
 
 
 def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterator[RectifiedView]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 
 from benchmarks.placing import FlownView, views_in
 from orthonav.core.errors import OutputError
@@ -24,7 +25,6 @@ from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 DATA = Path(os.environ.get("ORTHONAV_DATA", BESIDE))

@@ -28,6 +28,7 @@ from benchmarks.faults import Ground, calm_cells
 from benchmarks.record import Section, Table, run, say, side_by_side
 from benchmarks.scenes import Pair, chosen, leave_one_out_pairs, localizer_of, ortho
 from orthonav.core.records import NoFix, Telemetry, View
+from orthonav.core.register.refine import Refiner
 from orthonav.core.register.sharpness import sharpness
 
 NAME = "undisturbed"
@@ -82,10 +83,10 @@ def _is_shown(flight: FaultFlight, at_s: float, rng: np.random.Generator) -> boo
     if isinstance(prepared, NoFix):
         return False
     pose = registration.pose_of(prepared, np.array([*place, np.radians(yaw), 0.0]))
-    levels, registrar = prepared.levels, registration.registrar
-    placed = registrar.refiner(prepared.templates, levels, levels.final).place(pose, 2)
+    levels = prepared.levels
     template = prepared.templates.at(levels.final, levels.recipe(levels.final))
-    return bool(sharpness(template, registrar.reference, placed.pose).ratio >= SHOWN_RATIO)
+    placed = Refiner(template, registration.reference).place(pose, 2)
+    return bool(sharpness(template, registration.reference, placed.pose).ratio >= SHOWN_RATIO)
 
 
 def add(parser: argparse.ArgumentParser) -> None:

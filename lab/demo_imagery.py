@@ -3,7 +3,7 @@
 Two dates of one generated area of 2 x 2 km at 1 m per pixel, seed 1, as GeoTIFF compressed with
 JPEG. On one machine with the same NumPy, OpenCV and GDAL the files are the same to the bit. Other
 processors round single pixels of the generated landscape differently. The golden views are views
-of this imagery: renew them too (`python -m tests.golden.renew`).
+of this imagery: renew them too (`make golden`).
 """
 
 import sys
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import rasterio
 
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
+from lab.landscape import DEFAULT_DATES, generate_area
 
 FOLDER = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "demo_data"
 SEED = 1

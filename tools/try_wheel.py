@@ -37,7 +37,6 @@ BUILD = f"build --ortho {ORTHO} --tile-px 128 --overlap 0.75 --calibration-views
 ATLAS = f"--ortho {ORTHO} --tile-px 128 --coarse-gsd-m 2 --coarse-tile-px 64"
 COMMANDS: dict[str, Sequence[str]] = {
     "geo": (
-        "landscape --out land --size-m 600 600 --gsd-m 1",
         f"{BUILD} --out {MAP}",
         "simulate --ortho land/2021-10.tif --random 5 --agl-m 150 --out flight",
     ),
@@ -59,7 +58,7 @@ COMMANDS: dict[str, Sequence[str]] = {
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
 SCRIPTS = {
     "ros2": "import cyclonedds.domain, rosbags.typesys",
-    "web": "from orthonav.ground.view.assets import load_assets; assert '/' in load_assets()",
+    "web": "from orthonav.ground.view.server import load_assets; assert '/' in load_assets()",
     "neural": "import onnxruntime; assert onnxruntime.get_available_providers()",
 }
 """Where a command would serve until it is stopped, or would need a map of gigabytes."""
@@ -93,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         work = folder / "work"
         work.mkdir()
+        shutil.copytree(ROOT / "src" / "orthonav" / "demo_data", work / "land")
         try_extra("geo", wheel, folder, work)
         try_core(wheel, folder, work)
         for extra in tried:  # in the order of the table

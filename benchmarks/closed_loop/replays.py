@@ -32,11 +32,16 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
-from orthonav.onboard.aiding import ABSOLUTE, FIX_3D, Aiding
 from orthonav.onboard.messages.estimate import Clock, estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
-from orthonav.onboard.telemetry import TelemetryBuffer, wxyz_of_angles
+from orthonav.onboard.telemetry import (
+    ABSOLUTE,
+    FIX_3D,
+    Aiding,
+    TelemetryBuffer,
+    wxyz_of_angles,
+)
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 """The camera of the recorded flights; it looks straight down the body, image top to the nose."""

@@ -1,7 +1,7 @@
 """The paper's Table 1, trajectories A to D, settings of the experiments, and methods as rows.
 
 The table itself, and the ground resolution taken where the paper states none, are those of the
-presets (`orthonav.ground.planning.routes.presets`).
+presets (`orthonav.ground.planning.route`).
 """
 
 import math
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
-from orthonav.ground.planning.routes import presets
+from orthonav.ground.planning import route
 
 TILE_PX = 256
 SWEPT_ON = "B"
@@ -56,7 +56,7 @@ class Trajectory:
         return self.length_m + slack_m, self.band_m + slack_m
 
 
-TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
+TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in route.TABLE_1.items()}
 IMPLIED_GSD_M = {"B": 0.75, "C": 1.5, "D": 0.75}
 """Ground resolution that the paper's numbers of views imply: 12 km in 500 tile steps of 32 px, and
 2 km in 84; C, from twice the height, in proportion. A: 0.19 m, but landscapes end at 0.2 m."""

@@ -34,8 +34,8 @@ from experiments.paper.results import BASELINES as BASELINES_KEY
 from experiments.paper.scenes import Scene
 from orthonav.core.files import write_text
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.match import TileMatcher
 from orthonav.core.localize.rectify import downsampled
+from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import Fix, View
 from orthonav.core.tiles.position import RULES

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from benchmarks.scenes import SCENES
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 
 from experiments.paper.methods import (
@@ -32,7 +33,6 @@ from orthonav.core.records import Telemetry
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 from orthonav.ground.simulate.render import ViewEffects, render_view
 
 Array = NDArray[np.float64]

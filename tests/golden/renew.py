@@ -18,7 +18,7 @@ def main() -> None:
     """Locate the views and store the results."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
-        found = golden_views.located(Path(folder))
+        found = {name: golden_views.located(name, Path(folder)) for name in golden_views.FLIGHTS}
     if golden_views.FILE.exists():
         stored = json.loads(golden_views.FILE.read_text(encoding="utf-8"))
         print(golden_views.report(stored, found) or "no differences")
@@ -26,7 +26,8 @@ def main() -> None:
     for name, rows in found.items():
         lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
         flights.append(f" {json.dumps(name)}: [\n{lines}\n ]")
-    text = "{\n" + ",\n".join(flights) + "\n}\n"
+    kind = json.dumps(golden_views.instructions())
+    text = f'{{\n"instructions": {kind},\n"flights": {{\n' + ",\n".join(flights) + "\n}\n}\n"
     golden_views.FILE.write_text(text, encoding="utf-8")
 
 

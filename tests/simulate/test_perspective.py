@@ -5,6 +5,9 @@ import math
 import cv2
 import numpy as np
 import pytest
+from lab.landscape import generate_area, generate_heights
+from lab.landscape.epoch import DEFAULT_DATES
+from lab.landscape.scene import Landscape
 from test_flight import FISH, LENS, PLAIN, SEEN
 
 from orthonav.core.errors import FlightError
@@ -12,9 +15,6 @@ from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
-from orthonav.ground.simulate.landscape import generate_area, generate_heights
-from orthonav.ground.simulate.landscape.epoch import DEFAULT_DATES
-from orthonav.ground.simulate.landscape.scene import Landscape
 from orthonav.ground.simulate.perspective import Raster, met, rays_enu, seen_view
 from orthonav.ground.simulate.render import render_view
 

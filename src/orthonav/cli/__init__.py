@@ -90,7 +90,6 @@ GROUPS = {
     },
     "try it without data": {
         "demo": ("build a map, simulate a flight over other imagery, localize it and report", ""),
-        "landscape": ("generate orthophotos of a landscape at several dates", "--out landscape"),
         "simulate": (
             "simulate a flight over an orthophoto of another year",
             "--ortho other-year.tif --route route.kml --agl-m 120 --out flight",

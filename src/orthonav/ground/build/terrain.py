@@ -15,7 +15,7 @@ from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, MAX_POSTING_M, TerrainInfo
 from orthonav.core.mapfile.terrain import encode_terrain, terrain_part_names
-from orthonav.ground.build.layout import rounded_gsd_m
+from orthonav.ground.build.sheet import rounded_gsd_m
 from orthonav.ground.imagery.terrain import Dem
 from orthonav.ground.planning.area import Area
 
