@@ -220,9 +220,9 @@ def measure(options: argparse.Namespace) -> Section:
     notes = (
         f"{AGL_M:g} m above generated ground of another date than the map's, {SPEED_MPS:g} m/s "
         f"with turns and turbulence, {VIEWS_HZ:g} Hz; s, views, sent: during the fault; worst: "
-        f"from its begin to the end of the flight; false: messages of the flight more than {FAR_M:g} m "
-        f"and {FAR_STD:g} standard deviations off; recovered: from the end of the fault to a "
-        f"correct message within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s)",
+        "from its begin to the end of the flight; false: messages of the flight more than "
+        f"{FAR_M:g} m and {FAR_STD:g} standard deviations off; recovered: from the end of the "
+        f"fault to a correct message within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s)",
     )
     tables = [Table("Faults", HEADER, rows, notes)] if rows else []
     if calm:

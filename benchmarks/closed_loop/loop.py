@@ -474,8 +474,8 @@ def measure(options: argparse.Namespace) -> Section:
     notes = (
         f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; position, velocity, "
         "tilt: errors of the autopilot; correlation, slope: of errors of fixes with height "
-        "times the tangent of the autopilot's error of tilt, ahead and right; false: sent, and more "
-        f"than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
+        "times the tangent of the autopilot's error of tilt, ahead and right; false: sent, and "
+        f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
     title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"
     return Section("Flights in the loop", [Table(title, HEADER, rows, notes)])
