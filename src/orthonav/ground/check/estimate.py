@@ -16,7 +16,7 @@ from orthonav.ground.check.recalibrate import PLAIN, expit, logit
 from orthonav.ground.check.trials import Trial
 
 Array = NDArray[np.float64]
-# Chosen on generated landscapes by the calibration error of `python -m benchmarks.prediction`.
+# Chosen on generated landscapes by the calibration error of `benchmarks.prediction` at d63ac91.
 PRIOR_TRIALS = 3.0
 BANDWIDTH_VIEWS = 0.4
 """Standard deviation of the distance weights, in sides of a view."""
