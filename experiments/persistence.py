@@ -18,13 +18,7 @@ from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
 from orthonav.core.register.channels import FINE, channels_of
-from orthonav.ground.check.ageing import (
-    MODEL,
-    PATCH_PX,
-    PersistenceModel,
-    features,
-    terms,
-)
+from orthonav.ground.check.ageing import MODEL, PATCH_PX, PersistenceModel, features, terms
 
 Array = NDArray[Any]
 SEEDS = (901, 902, 903, 904)
@@ -32,7 +26,7 @@ GSD_M = (0.25, 0.5, 1.0, 2.0, 4.0)
 SIDE_PX = 1024
 LEVELS = 2
 RIDGE = 3e-3
-OUT = Path(__file__).parents[1] / "src" / "orthonav" / "check" / MODEL
+OUT = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "check" / MODEL
 
 
 def main() -> None:
