@@ -174,8 +174,8 @@ def measure(options: argparse.Namespace) -> Section:
         say(" | ".join(rows[-1]))
     commit = git("-C", str(options.other), "describe", "--always", "--dirty")
     notes = (
-        f"other: commit {commit}; CPU ms: processor time of `orthonav localize` a view, less that of
-        " f"a blank one, least of {options.rounds} rounds in turn; ms, p99: on the clock, by the "
+        f"other: commit {commit}; CPU ms: processor time of `orthonav localize` a view, less that "
+        f"of a blank one, least of {options.rounds} rounds in turn; ms, p99: on the clock, by the "
         "fixes; peak: of the process; height known to 10 %",
         f"correct: within 35 m or 10 px; accepted: of these, confidence of {CONFIDENT:g} or more",
     )
