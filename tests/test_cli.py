@@ -237,7 +237,9 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
 
 @pytest.mark.long
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out, monkeypatch):
-    monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other configurations are not tried
+    monkeypatch.setattr(
+        "orthonav.ground.recordings.setups.FEW", 0.0
+    )  # other configurations are not tried
     mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
     shorten(shutil.copytree(flight_path, few), 10)
     gnss = ["--gnss-positions", few / "truth.csv", "--gnss-std-m", "2"]

@@ -31,7 +31,7 @@ from orthonav.core.mapfile.signature import (
     sign_map,
     signature_path,
 )
-from orthonav.onboard.serials import require_newest, serials_path
+from orthonav.onboard.state import require_newest, serials_path
 
 NAMES = ("private", "public")
 

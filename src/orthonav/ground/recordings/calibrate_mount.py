@@ -1,8 +1,4 @@
-"""The mount of views that make no track, such as photographs taken far apart.
-
-Each confident view shows its own pitch and roll (`orthonav.core.localize.camera`). The mount is
-their robust mean over the reported values.
-"""
+"""Constant errors of reported heading, height and tilt, estimated from the track of a flight."""
 
 import math
 from collections.abc import Sequence
@@ -23,9 +19,23 @@ from orthonav.core.records import (
     View,
     ViewResult,
 )
-from orthonav.onboard.calibrate import MAD_TO_STD, MIN_VIEWS, STD_FLOOR, MountCalibration
 from orthonav.onboard.run import SingleViews
 
+MIN_VIEWS = 5
+MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
+"""A tilt that differs by more than both from that at the end shows that the camera moved."""
+MAD_TO_STD = 1.4826
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
+STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+"""Lower bounds of the standard deviations of the estimated biases."""
+_LASTING = ("pitch_deg", "roll_deg")
+_EVIDENCE = {
+    "heading_deg": "heading_bias_deg",
+    "log_scale": "log_scale_bias",
+    "pitch_deg": "pitch_bias_deg",
+    "roll_deg": "roll_bias_deg",
+}
+Array = NDArray[np.float64]
 OUTLIER_SIGMAS = 3.0
 """Views that are off by more of their standard deviations, scatter included, do not count."""
 ROUNDS = 10
@@ -35,7 +45,88 @@ LEAST_SHARE = 0.1
 rest is the reported value."""
 _AXES = ("heading_deg", "log_scale", "pitch_deg", "roll_deg")
 _UNKNOWN_HEADING = Bias(0.0, DEFAULT_YAW_STD_DEG, DEFAULT_YAW_STD_DEG)
-Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MountCalibration:
+    """A mount calibration.
+
+    `mount`: estimated biases.
+    `first`, `last`: frames of the first and the last view used.
+    `moved`: whether the camera moved in its mount before `first`.
+    """
+
+    mount: Mount
+    first: str
+    last: str
+    moved: bool
+
+
+def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
+    """Mount at the end of a tracked flight, estimated from its confident views.
+
+    Views before a movement of the camera in its mount are excluded. Biases are medians; their
+    standard deviations account for the correlation of successive views. Raises `FlightError` where
+    fewer than `MIN_VIEWS` views are confident.
+    """
+    confident = confident_views(results)
+    if len(confident) < MIN_VIEWS:
+        raise FlightError(
+            f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
+            f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
+        )
+    values = {name: _column(confident, key) for name, key in _EVIDENCE.items()}
+    spreads = {
+        name: _column(confident, key.replace("bias", "bias_std")) for name, key in _EVIDENCE.items()
+    }
+    begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
+    begin = min(begin, len(confident) - MIN_VIEWS)
+    used = slice(begin, None)
+    biases = {
+        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name], name in _LASTING)
+        for name in _EVIDENCE
+    }
+    mount = Mount(**biases, views=len(confident) - begin)
+    return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
+
+
+def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
+    """Confident views of a track that state their biases."""
+    return [each for each in results if _is_confident(each)]
+
+
+def _is_confident(result: ViewResult) -> bool:
+    fix = result.outcome
+    return isinstance(fix, Fix) and fix.confidence >= CONFIDENT and "pitch_bias_deg" in fix.evidence
+
+
+def _column(confident: Sequence[ViewResult], key: str) -> Array:
+    return np.array([each.outcome.evidence[key] for each in confident])
+
+
+def _still_from(values: Array, spreads: Array) -> int:
+    """Index of the first view from which on a value stays close to that at the end."""
+    end = float(np.median(values[-MIN_VIEWS:]))
+    far = np.abs(values - end) > np.maximum(MOVED_SIGMAS * spreads, MOVED_DEG)
+    return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
+
+
+def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
+    """Median, its standard deviation, and the scatter around it.
+
+    The standard deviation of a `lasting` bias is that of the track. Otherwise it is that of the
+    mean of the views, their number reduced by the autocorrelation at lag one.
+    """
+    middle = float(np.median(values))
+    off = values - middle
+    scatter = MAD_TO_STD * float(np.median(np.abs(off)))
+    if lasting:
+        return Bias(middle, max(floor, float(np.median(spreads))), scatter)
+    energy = float(off @ off)
+    alike = float(off[1:] @ off[:-1]) / energy if energy > 0 else 0.0
+    alike = min(max(alike, 0.0), 0.99)
+    mean_std = scatter * math.sqrt((1 + alike) / (1 - alike) / len(values))
+    return Bias(middle, max(floor, mean_std), scatter)
 
 
 @dataclass(frozen=True)
