@@ -290,43 +290,6 @@ def test_windows_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("missing", range(5))
-def test_an_array_that_is_missing_is_refused(missing):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    spectra, poses = np.zeros((3, 3, 45, 16), np.float32), np.zeros((1, 4))
-    best, numbers = np.zeros((3, 40, 16), np.float32), np.zeros((3, 40, 16), np.int32)
-    given = [spectra, made.values, poses, best, numbers]
-    given[missing] = None
-    spectra, values, poses, best, numbers = given
-    with pytest.raises(TypeError):
-        KERNEL.search(spectra, values, made.weights, poses, 0, best, numbers, None)
-    with pytest.raises(TypeError):
-        KERNEL.near(None, made.values, made.weights, np.zeros((1, 4)), 2, np.zeros((1, 3)))
-
-
-@needs_kernel
-@pytest.mark.parametrize("missing", range(3))
-def test_moves_of_an_array_that_is_missing_are_refused(missing):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    given = [np.zeros((20, 30, 4), np.float32), made.values, np.zeros((3, 7, 9), np.float32)]
-    given[missing] = None
-    window, values, out = given
-    with pytest.raises(TypeError):
-        KERNEL.moved(window, values, made.weights, (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, out)
-
-
-@needs_kernel
-@pytest.mark.parametrize("missing", range(5))
-def test_sums_of_an_array_that_is_missing_are_refused(missing):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    window, out = np.zeros((20, 30, 4), np.float32), np.zeros(2 * 16 + 36 * refine.BLOCK_SUMS)
-    given = [window, made.values, made.slopes, made.numbers, out]
-    given[missing] = None
-    with pytest.raises(TypeError):
-        KERNEL.spread(*given[:4], (0,) * 4, (0,) * 9, given[4])
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("reach_px", [2, 7])
@@ -365,15 +328,25 @@ def test_blocks_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("missing", range(3))
-def test_blocks_of_an_array_that_is_missing_are_refused(missing):
-    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).values
-    rows, cols = view.shape[:2]
-    given = [
-        view,
-        np.ones((rows + 4, cols + 4, 4), np.float32),
-        np.zeros((36, 5, 5, 4), np.float32),
-    ]
-    given[missing] = None
-    with pytest.raises(TypeError):
-        KERNEL.blocks(given[0], given[1], 2, given[2])
+@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks"])
+def test_an_array_that_is_missing_is_refused(name):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    values, weights, (rows, cols) = made.values, made.weights, made.mask.shape
+
+    def zeros(*shape, of=np.float32):
+        return np.zeros(shape, of)
+
+    window, best, numbers = zeros(20, 30, 4), zeros(3, 40, 16), zeros(3, 40, 16, of=np.int32)
+    spectra, poses, sums = zeros(3, 3, 45, 16), np.zeros((1, 4)), np.zeros(2 * 16 + 36 * 7)
+    moved = (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, zeros(3, 7, 9)
+    given = {
+        "search": (spectra, values, weights, poses, 0, best, numbers, None),
+        "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
+        "moved": (window, values, weights, *moved),
+        "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
+        "blocks": (values, zeros(rows + 4, cols + 4, 4), 2, zeros(36, 5, 5, 4)),
+    }[name]
+    for at, each in enumerate(given):
+        if isinstance(each, np.ndarray):
+            with pytest.raises(TypeError):
+                getattr(KERNEL, name)(*given[:at], None, *given[at + 1 :])
