@@ -147,3 +147,11 @@ def test_plain_round_trip(bias, weights):
 def test_what_is_no_confidence_is_refused(plain):
     with pytest.raises(VariantError, match="confidence"):
         LogisticConfidence.from_plain(plain)
+
+
+def test_separable_and_constant_evidence_give_finite_weights():
+    features = np.stack([np.linspace(0, 1, 100), np.full(100, 0.3)], axis=1)
+    found = fit_logistic(features, features[:, 0] > 0.5, np.ones(100))
+    assert all(map(math.isfinite, (found.bias, *found.weights)))
+    said = probabilities(found, features)
+    assert said[0] < 0.1 and said[-1] > 0.9

@@ -233,3 +233,9 @@ def test_one_sided_views_give_a_finite_answer(all_right):
     usual = RegisteredConfidence.usual(CHANCE)
     moved = [fitted(each) - usual(each) for each in views]
     assert min(moved) > 0 if all_right else max(moved) < 0
+
+
+@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
+def test_a_missing_number_is_refused(path):
+    with pytest.raises(VariantError, match="confidence"):
+        RegisteredConfidence.from_plain(without(PLAIN, *path))

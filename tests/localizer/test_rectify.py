@@ -1,6 +1,7 @@
 """Rectified views equal the ground as drawn by a renderer that shares no code with them."""
 
 import importlib
+import math
 
 import cv2
 import numpy as np
@@ -201,3 +202,9 @@ def test_a_lens_at_some_pixels_is_as_good_as_at_all(monkeypatch, lens, attitude)
     both = quick.valid & exact.valid
     off = np.abs(quick.grey.astype(int) - exact.grey)[both]
     assert both.any() and off.max() <= 3 and off.mean() < 0.2
+
+
+def test_a_picture_beyond_the_horizon_is_not_valid():
+    view = tilted_and_prepared(rendered(Ground(), PLAIN, (0, 44, 0)), PLAIN, (0, 44, 0), gsd_m=8.0)
+    east, north = window_en_m(view.offset_en_m, gsd_m=8.0)
+    assert not view.valid[np.broadcast_to(north, east.shape) < -AGL_M / math.tan(0.767)].any()

@@ -380,42 +380,6 @@ def test_threads_may_share_a_localizer(localizer, map_path):
     assert all(same(one, other) for one, other in zip(alone, shared, strict=True))
 
 
-REFUSED = {
-    "no heading": ({"yaw_deg": math.nan}, "missing_telemetry"),
-    "no pitch": ({"pitch_deg": math.nan}, "missing_telemetry"),
-    "no height": ({"agl_m": math.nan}, "missing_telemetry"),
-    "below ground": ({"agl_m": -3.0}, "bad_height"),
-    "tilted": ({"roll_deg": 70.0}, "extreme_tilt"),
-    "far up": ({"agl_m": 1e6}, "too_coarse"),
-    "on the ground": ({"agl_m": 5.0}, "too_small"),
-    "tiny height": ({"agl_m": 1e-300}, "too_small"),
-}
-
-
-@pytest.mark.parametrize("changes, reason", REFUSED.values(), ids=REFUSED.keys())
-def test_telemetry_that_makes_no_fix(localizer, plain, changes, reason):
-    outcome = localizer.locate(View(plain[0], CAMERA, replace(plain[1], **changes)))
-    assert isinstance(outcome, NoFix) and outcome.reason == reason
-    assert outcome.detail and "\n" not in outcome.detail
-
-
-@pytest.mark.parametrize(
-    "grey, reason",
-    [
-        (np.full((240, 320), 128, np.uint8), "blank"),
-        (np.zeros((240, 320), np.uint8), "too_dark"),
-        (np.full((240, 320), 255, np.uint8), "too_bright"),
-        (np.full((16, 16), 99, np.uint8), "too_small"),
-        (np.zeros((1, 1), np.uint8), "too_small"),
-    ],
-)
-def test_pictures_that_make_no_fix(localizer, grey, reason):
-    height, width = grey.shape
-    camera = Camera(width, height, 250.0, 250.0, width / 2, height / 2)
-    outcome = localizer.locate(View(grey, camera, telemetry()))
-    assert isinstance(outcome, NoFix) and outcome.reason == reason
-
-
 def test_a_map_without_the_layer_is_flown_by_its_tiles(known, tmp_path, plain):
     path = tmp_path / "tiles.onav"
     with pytest.MonkeyPatch.context() as patch:
@@ -449,3 +413,44 @@ def test_a_damaged_layer_gives_no_fix(map_path, tmp_path, plain, caplog):
     assert isinstance(outcome, NoFix) and outcome.reason == "map_damaged"
     assert "damaged" in outcome.detail and latency_ms > 0
     assert [record.exc_info for record in caplog.records] == [None]  # a line, no traceback
+
+
+def test_a_fix_lies_near_its_prior(localizer, plain):
+    grey, reported, place, free = plain
+    wrong = place + np.array([-180.0, 120.0])
+    fix = localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, wrong, 20.0))
+    if isinstance(fix, Fix):
+        assert np.abs(place_of(localizer, fix) - wrong).max() < 3 * 20.0 + 25.0
+        assert fix.confidence < 0.5 < free.confidence
+
+
+@pytest.mark.parametrize(
+    "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.5, 3.0, math.nan)]
+)
+def test_a_nan_prior_is_outside_the_map(localizer, plain, prior):
+    outcome = localizer.locate(View(plain[0], CAMERA, plain[1]), prior=prior)
+    assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
+
+
+ODD = {
+    "heading std": {"yaw_std_deg": math.nan},
+    "huge heading std": {"yaw_std_deg": 1e9},
+    "negative heading std": {"yaw_std_deg": -5.0},
+    "height std": {"agl_std_m": math.inf},
+    "huge height std": {"agl_std_m": 1e9},
+    "negative height std": {"agl_std_m": -20.0},
+    "many turns": {"yaw_deg": 33.0 + 3600},
+}
+
+
+@pytest.mark.parametrize("changes", ODD.values(), ids=ODD.keys())
+def test_invalid_deviations_are_tolerated(localizer, plain, changes):
+    grey, reported, place, _ = plain
+    fix = localizer.locate(View(grey, CAMERA, replace(reported, **changes)))
+    assert error_m(localizer, fix, place) < 0.5 and 0 <= fix.heading_deg < 360
+
+
+def test_a_strip_of_a_view(localizer):
+    camera = Camera(320, 60, 250.0, 250.0, 160.0, 30.0)
+    fix = located(localizer, (30.0, 30.0), (20.0, 0.0, 0.0), camera)
+    assert error_m(localizer, fix, (30.0, 30.0)) < 0.3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from blots import AGL_M, GROUND, Ground, known_map, rendered
 
-from orthonav.core.errors import MapFileError
+from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -458,3 +458,21 @@ def test_exact_dead_reckoning_of_a_confirmed_track_is_confirmed_around_it(
     whole, around = (tracker._search_area(expected, whole_map=each) for each in (True, False))
     assert whole == (None, True)
     assert around.circle is not None and around.confirms is confirms
+
+
+@pytest.mark.long
+def test_a_start_that_was_reported_wrongly_is_left(localizer):
+    tracker, seen = Tracker(localizer), list(views(19))
+    lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, 30.0))  # 150 m from the true place
+    grey, telemetry, place = seen[0]
+    seen[0] = grey, replace(telemetry, prior=Prior(float(lat), float(lon), 15.0)), place
+    rows = followed(tracker, localizer, seen)
+    assert rows[0][0] > 100
+    assert all(row[0] < 10 for row in rows if row[2] == "tracking" or row[1] > 0.8)
+    assert rows[-1][2] == "tracking"
+
+
+def test_a_wrong_camera_is_refused(localizer):
+    grey, telemetry, _ = next(iter(views(1)))
+    with pytest.raises(CameraError, match="320 x 240"):
+        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640), telemetry))

@@ -108,3 +108,12 @@ def test_a_window_made_alone_reads_little(piecewise):
     assert piecewise.pyramid.read_px == [(30 + 2 * margin) * (40 + 2 * margin)]
     piecewise.window(0, -1000, -1000, 3000, 3000)
     assert piecewise.pyramid.read_px[1] == SHAPE[0] * SHAPE[1]
+
+
+@pytest.mark.parametrize(
+    "place", [(-300, 20), (500, 20), (20, -300), (20, 500), (SHAPE[0], 0), (0, SHAPE[1])]
+)
+def test_windows_outside_are_empty(whole, piecewise, place):
+    for reference in (whole, piecewise):
+        made = reference.window(0, *place, 40, 50)
+        assert made.shape == (40, 50, 4) and made.dtype == np.float32 and not made.any()

@@ -16,6 +16,7 @@ from scenes import (
     turned_rad,
 )
 
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.refine import STEPS, Refiner
 from orthonav.core.register.template import ViewTemplates
@@ -231,3 +232,12 @@ def test_a_coarser_level_gives_the_covariance_in_the_same_unit(reference):
     covariances = [many_placed(reference, level, 15, 40, **view)[1] for level in (0, 1)]
     deviations = [np.sqrt(np.median(each[:, 0, 0])) for each in covariances]
     assert 1.2 < deviations[1] / deviations[0] < 5
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (7, 12), (16, 16)])
+def test_tiny_views_are_no_crash(reference, shape):
+    pose = Pose(200.0, 180.0, 0.3, 0.0)
+    view = templates_of(GROUND, pose, shape)
+    for recipe in (FINE, COARSE):
+        placed = Refiner(view.at(0, recipe), reference).place(pose, with_covariance=True)
+        assert math.isfinite(placed.score) and np.isfinite(placed.covariance).all()

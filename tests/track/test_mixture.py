@@ -488,3 +488,33 @@ def test_a_place_that_was_never_confirmed_is_no_dead_reckoning(followed, state):
     mixture.hypotheses = [found, replace(track, share=0.2)]
     mixture.elsewhere = 0.0
     assert mixture.estimate(RADIUS_M).state is state
+
+
+def test_the_bias_of_a_reported_velocity_is_estimated():
+    """Dead reckoning through 30 s without a view: the reported wind is wrong by 1.8 m/s."""
+    flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None
+    reported = SPEED + np.array([1.5, -1.0])
+    for second in range(90):
+        moved = flight.moved()
+        seen = second < 60
+        mixture.predict(1.0, ReportedVelocity(reported, before, 1.5), moved if seen else None)
+        before = reported
+        if seen:
+            mixture.update(flight.reported(), [flight.sighting(4.0)])
+    estimate = mixture.estimate(RADIUS_M)
+    error = estimate.mean[:2] - flight.place
+    assert np.hypot(*error) < 20 < 30 * 1.8
+    assert error @ np.linalg.solve(estimate.covariance[:2, :2], error) < 14
+
+
+def test_a_measured_position_starts_a_new_hypothesis():
+    """Views of places that no aircraft flies between, each with its GNSS."""
+    mixture = Mixture(MODEL, EXTENT)
+    for place in ([-700.0, 300.0], [650.0, 500.0], [100.0, -800.0]):
+        mixture.predict(1.0)
+        mixture.measure_position(np.array(place), 3.0)
+        found = mixture.estimate(RADIUS_M)
+        assert np.hypot(*(found.mean[:2] - place)) < 5 and found.confidence > 0.5
+        assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(
+            1
+        )
