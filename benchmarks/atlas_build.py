@@ -18,7 +18,7 @@ from benchmarks.inputs import LANDSCAPE_SEED, PAST, Workplace
 from benchmarks.record import Section, Table, number
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 
 SIDE_M, SHEET_KM = 6000, 1.9
 QUICK_SIDE_M, QUICK_SHEET_KM = 4000, 1.25

@@ -35,11 +35,9 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import MapFile, open_map, write_map
 from orthonav.core.mapfile.layer import GreyLayer
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.coverage import box_deg
-from orthonav.ground.atlas.cut import cut_map
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.cut import box_deg, cut_map
 from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.layer import CHUNK_PX, compressed_block
 from orthonav.ground.planning.area import Area, Extent

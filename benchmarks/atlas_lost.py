@@ -30,13 +30,11 @@ from benchmarks.record import Section, Table, number, provenance, save
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.records import CONFIDENT, Fix, Telemetry, View
-from orthonav.ground.atlas.build import build_atlas
+from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cluster import SerialRunner
 from orthonav.ground.atlas.locate import AtlasLocator
-from orthonav.ground.atlas.sheet_registration import SheetRegistrar
-from orthonav.ground.atlas.sheet_tasks import AtlasRequest
-from orthonav.ground.atlas.tile_search import TileSearch
+from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
 PAST, PRESENT = DEFAULT_DATES[2], DEFAULT_DATES[0]

@@ -24,14 +24,16 @@ from benchmarks.atlas_fields import Fields, drawn_ids
 from benchmarks.child import memory_mb
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, Table, number, provenance
-from orthonav.ground.atlas.index_manifest import Part, ShardInfo
-from orthonav.ground.atlas.index_shards import ShardedIndex, write_shard
-from orthonav.ground.atlas.quantizers import (
+from orthonav.ground.atlas.vectors import (
     MAX_TRAINING_VECTORS,
     QUANTIZERS_NAME,
+    Part,
+    ShardedIndex,
+    ShardInfo,
     VectorRecipe,
     faiss,
     train,
+    write_shard,
 )
 
 QUERIES = 500

@@ -20,13 +20,12 @@ from benchmarks.record import Section, Table, number
 from benchmarks.tracking import TURNS_EN_M
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame, distances_m
-from orthonav.ground.atlas.build import build_atlas
+from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.cluster import SerialRunner
-from orthonav.ground.atlas.sheet_tasks import AtlasRequest
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.route import Route
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 SHEET_KM, GSD_M = 1.5, 8.0
@@ -145,10 +144,9 @@ def search(folder: Path, flight: Path) -> dict[str, Any]:
     from benchmarks.child import memory_mb
     from benchmarks.flights import read_views
     from orthonav.ground.atlas.catalog import Atlas
-    from orthonav.ground.atlas.find import PlaceFinder
-    from orthonav.ground.atlas.index_manifest import read_manifest
-    from orthonav.ground.atlas.sheet_registration import SheetRegistrar
-    from orthonav.ground.atlas.tile_search import TileSearch
+    from orthonav.ground.atlas.index import read_manifest
+    from orthonav.ground.atlas.locate import PlaceFinder
+    from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
 
     cv2.setNumThreads(1)
     start = time.process_time()

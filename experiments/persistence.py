@@ -18,7 +18,7 @@ from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
 from orthonav.core.register.channels import FINE, channels_of
-from orthonav.ground.check.persistence import (
+from orthonav.ground.check.ageing import (
     MODEL,
     PATCH_PX,
     PersistenceModel,

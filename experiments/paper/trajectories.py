@@ -1,13 +1,13 @@
 """The paper's Table 1: trajectories A to D, their search bands and overlaps; and how it is cut.
 
 The table itself, and the ground resolution taken where the paper states none, are those of the
-presets (`orthonav.ground.planning.routes.presets`).
+presets (`orthonav.ground.planning.route`).
 """
 
 import math
 from dataclasses import astuple, dataclass, replace
 
-from orthonav.ground.planning.routes import presets
+from orthonav.ground.planning import route
 
 TILE_PX = 256
 VIEW_ROOM = 1.5
@@ -52,7 +52,7 @@ class Trajectory:
         return self.length_m + slack_m, self.band_m + slack_m
 
 
-TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
+TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in route.TABLE_1.items()}
 IMPLIED_GSD_M = {"B": 0.75, "C": 1.5, "D": 0.75}
 """Ground resolution that the paper's numbers of views imply: 12 km in 500 tile steps of 32 px, and
 2 km in 84; C, from twice the height, in proportion. A: 0.19 m, but landscapes end at 0.2 m."""

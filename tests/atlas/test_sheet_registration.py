@@ -14,16 +14,17 @@ pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[
 from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import PRIOR_SIGMAS, Prior, View
-from orthonav.ground.atlas import matches
-from orthonav.ground.atlas.find import PlaceFinder, rectified
-from orthonav.ground.atlas.matches import SEARCHED, ViewMatches
-from orthonav.ground.atlas.sheet_registration import (
+from orthonav.ground.atlas import search as matches
+from orthonav.ground.atlas.locate import PlaceFinder, rectified
+from orthonav.ground.atlas.search import (
+    SEARCHED,
     PyramidPart,
     SearchRegion,
     SheetMatch,
     SheetRegistrar,
+    TileSearch,
+    ViewMatches,
 )
-from orthonav.ground.atlas.tile_search import TileSearch
 
 SIDE_M = 300.0
 

@@ -6,7 +6,7 @@ from arm64 import instructions
 from benchmarks.child import memory_mb
 
 from benchmarks import growth, growth_sheets
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 
 
 @pytest.mark.parametrize("side", [1, 2, 4])

@@ -19,7 +19,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.confidence import Chances, RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.calibrate_registration import RegistrationCalibration
+from orthonav.ground.build.calibrate import RegistrationCalibration
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 

@@ -13,7 +13,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
-from orthonav.onboard.setups import (
+from orthonav.ground.recordings.setups import (
     SAMPLE,
     LowConfidenceViews,
     Setup,

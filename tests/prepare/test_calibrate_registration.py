@@ -18,11 +18,11 @@ from orthonav.core.localize.confidence import (
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import SheetInfo, open_map
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build import calibrate_registration as module
-from orthonav.ground.build.calibrate import Crop
-from orthonav.ground.build.calibrate_registration import (
+from orthonav.ground.build import calibrate as module
+from orthonav.ground.build.calibrate import (
     FLOOR_LIMITS_PX,
     FLOOR_PX,
+    Crop,
     RegistrationCalibration,
     calibrate_registration,
 )

@@ -5,7 +5,7 @@ import pytest
 
 from helpers import textured
 from orthonav.core.register.channels import channels_of
-from orthonav.ground.build.change import changed
+from orthonav.ground.build.calibrate import changed
 
 SIZE = 128
 GREY, OTHER = textured((SIZE, SIZE), 1), textured((SIZE, SIZE), 2)

@@ -6,8 +6,8 @@
    rectifies the rest with its own heading up (`rectify`). Everything wrong with a view becomes a
    `NoFix` with a reason; nothing is raised but `CameraError`, for a camera of another size.
 2. `search.Search` runs steps that find candidates, the cheapest first: a correlation with the map
-   by FFT, or the most similar tiles (`tiles`). What is tried, what that costs and
-   when it ends are numbers in `policy`.
+   by FFT, or the tiles whose embeddings are most similar (`tiles`). What is tried, what it costs
+   and when it ends are numbers in `policy`.
 3. `place.Placer` refines candidates from coarse to fine and compares the best `Place` with its
    strongest rival; the search ends as soon as it stands out. On a map with a terrain the best are
    orthorectified on it first (`ground`).

@@ -6,7 +6,7 @@ scores of chance those of the map; weights of tiles are learnt when the map is b
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,16 +26,10 @@ FEATURES = (
 )
 ALONE = 2
 """The last so many say whether the view fits nowhere near as well, the others whether it fits."""
-OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
-"""Features of the first maps."""
-BEFORE_PHASE = OLD_FEATURES | {"blocks_t", "log_detail_ratio", "log_local_ratio"}
-"""Features of later ones, built before phase correlation was judged."""
 CHANCES = ("total", "look", "fine")
 CUT_SHORT = 0.89
 """Largest confidence of a view whose search ended early (`--budget-ms`) before a place stood out:
 its rivals were not all looked for. Below `orthonav.core.records.CONFIDENT`."""
-BIAS_BEFORE_PHASE = -6.29
-"""The usual first bias of maps of `BEFORE_PHASE`."""
 USUAL_BIASES = -6.68, -8.0
 USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
 """What separates right from wrong, fitted to 1,734 views (docs/decisions/confidence.md). The
@@ -116,12 +110,6 @@ class RegisteredConfidence:
         """With the usual weights, and a map's own scores of chance."""
         return cls(USUAL_BIASES, USUAL_WEIGHTS, chances)
 
-    def _lowered(self, shift: float) -> "RegisteredConfidence":
-        """With a first bias that is lower by a negative `shift`; raises `ValueError` for NaN."""
-        if math.isnan(shift):
-            raise ValueError("a bias is not a number")
-        return replace(self, biases=(self.biases[0] + min(shift, 0.0), self.biases[1]))
-
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""
         return {
@@ -132,24 +120,12 @@ class RegisteredConfidence:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "RegisteredConfidence":
-        """Inverse of `to_plain`; raises `VariantError` if it does not fit.
-
-        Maps built before all of `FEATURES` existed have the usual weights, with their own scores
-        of chance, and what views of another date had lowered the bias by. With small tiles their
-        `total` was measured on views of one level: it is at least that of `look` and one more
-        level.
-        """
+        """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
         try:
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
-            stored = plain["weights"]
-            if set(stored) == OLD_FEATURES:
-                least = chances.look + USUAL_CHANCES.total - USUAL_CHANCES.look
-                return cls.usual(replace(chances, total=max(chances.total, least)))
-            if set(stored) == BEFORE_PHASE:
-                return cls.usual(chances)._lowered(float(plain["biases"][0]) - BIAS_BEFORE_PHASE)
             first, second = plain["biases"]
             biases = float(first), float(second)
-            weights = tuple(float(stored[name]) for name in FEATURES)
+            weights = tuple(float(plain["weights"][name]) for name in FEATURES)
         except (KeyError, TypeError, ValueError) as error:
             raise VariantError(
                 f"confidence of registration must have two biases, weights of {FEATURES} and "

@@ -23,11 +23,9 @@ from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import Peak
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import Representation, embed_poses
-from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.core.tiles.embed import ViewEmbedder, embedder_of
 from orthonav.core.tiles.exact import ExactIndex, rows_within
-from orthonav.core.tiles.peak import TileNeighbours, parabola_peak
-from orthonav.core.tiles.position import PositionRule, offset_en_m
-from orthonav.core.tiles.stored import embedder_of
+from orthonav.core.tiles.position import PositionRule, TileNeighbours, offset_en_m, parabola_peak
 from orthonav.core.tiles.whitened import WhitenedEmbedder
 from orthonav.core.variants import variant_from_recipe
 
