@@ -13,8 +13,6 @@ from orthonav.core.localize.confidence import (
     CHANCES,
     FEATURES,
     STAND_IN,
-    USUAL_BIASES,
-    USUAL_DETAIL,
     Chances,
     RegisteredConfidence,
     features_of,
