@@ -33,7 +33,7 @@ from benchmarks.verdicts import percent
 from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.ground.changes.ground import changed_ground

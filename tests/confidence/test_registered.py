@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from orthonav.ground.build.fit import fit_registered
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.registered import (
+from orthonav.core.localize.confidence import (
     BEFORE_PHASE,
     BIAS_BEFORE_PHASE,
     CHANCES,
@@ -21,7 +22,6 @@ from orthonav.core.localize.registered import (
     Chances,
     RegisteredConfidence,
     features_of,
-    fit_registered,
 )
 from orthonav.core.records import CONFIDENT
 

@@ -10,7 +10,7 @@ from flown import SMALL, Flown
 from orthonav.cli import main
 from orthonav.cli.flying import _stated
 from orthonav.core.errors import FlightError, OrthonavError
-from orthonav.core.flight.latency import CameraLatency, read_latency, write_latency
+from orthonav.core.flight.mount import CameraLatency, read_latency, write_latency
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.telemetry import VehicleState
 

@@ -17,7 +17,7 @@ from rasterio.transform import Affine
 
 from helpers import textured
 from orthonav.core.errors import AreaError, ImageryError, OutputError, VariantError
-from orthonav.core.localize.registered import USUAL_CONFIDENCE
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.core.tiles.gray import Gray
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.block_cache import BlockCache

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.register.evidence import evidence
+from orthonav.core.register.channels import channels_of
 from orthonav.ground.build.change import changed
 
 SIZE = 128
@@ -18,7 +18,7 @@ def drawn(seed, grey=GREY, other=OTHER):
 def alike(one, other):
     """Correlation of the evidence of edges of two pictures."""
     valid = np.ones(one.shape, bool)
-    parts = [evidence(each, valid)[..., :2] for each in (one, other)]
+    parts = [channels_of(each, valid)[..., :2] for each in (one, other)]
     return float((parts[0] * parts[1]).sum() / np.sqrt(np.prod([(p**2).sum() for p in parts])))
 
 

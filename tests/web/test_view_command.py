@@ -10,8 +10,7 @@ import pytest
 from small_run import NO_FIX, WRONG, result
 
 from orthonav.cli import view as view_module
-from orthonav.core.flight.fixes import write_results
-from orthonav.core.flight.identity import Identity
+from orthonav.core.flight.fixes import Identity, write_results
 from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.view.opening import ViewRequest, open_run
 

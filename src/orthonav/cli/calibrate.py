@@ -153,7 +153,7 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
 
 def _run_latency(options: argparse.Namespace) -> None:
     """Estimate the latency of the camera and write it."""
-    from orthonav.core.flight.latency import write_latency
+    from orthonav.core.flight.mount import write_latency
     from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
 
     flight = open_source(options.flight, options)

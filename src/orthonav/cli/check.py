@@ -204,7 +204,7 @@ def run(options: argparse.Namespace) -> int:
 def _accepted(text: str) -> float:
     """The least confidence of `--accept`; raises `VariantError`."""
     from orthonav.core.errors import VariantError
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
 
     accept = Acceptance.parse(text)
     if accept.criterion != "confidence":

@@ -111,8 +111,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
     from orthonav.core.flight import open_flight, read_truth
-    from orthonav.core.flight.fixes import write_results
-    from orthonav.core.flight.identity import Identity, flight_digest
+    from orthonav.core.flight.fixes import Identity, flight_digest, write_results
     from orthonav.core.localize import Localizer
     from orthonav.core.mapfile import open_map
     from orthonav.ground.build import BuildRequest, build_map

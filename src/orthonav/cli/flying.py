@@ -21,16 +21,15 @@ from orthonav.cli.source import FAR_M, distance_from_map, far_text
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
+from orthonav.core.flight.fixes import Identity
 from orthonav.core.flight.gnss import FILE, GnssSample, read_gnss
-from orthonav.core.flight.identity import Identity
-from orthonav.core.flight.latency import MOST_MS, CameraLatency, read_latency
-from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.flight.mount import MOST_MS, CameraLatency, Mount, read_latency, read_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker

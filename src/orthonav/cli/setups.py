@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.flight.mount import Mount
     from orthonav.core.localize import Localizer
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.records import Telemetry, ViewResult
     from orthonav.ground.recordings import Recording, SourceView
     from orthonav.ground.recordings.setups import Tried

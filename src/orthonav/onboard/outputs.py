@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol, TextIO
 
 from orthonav.core.errors import VariantError
-from orthonav.core.flight.fixes import UNKNOWN, result_to_json
-from orthonav.core.flight.identity import Identity
+from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
 from orthonav.core.records import CONFIDENT, ViewResult
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import (

@@ -19,7 +19,7 @@ from orthonav.core.errors import (
 from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import Flight, RecordedView
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.core.track import Model

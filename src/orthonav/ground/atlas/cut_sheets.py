@@ -20,8 +20,12 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import AtlasError, MapFileError, MissingFileError, VariantError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.logistic import LogisticConfidence
-from orthonav.core.localize.registered import CHANCES, Chances, RegisteredConfidence
+from orthonav.core.localize.confidence import (
+    CHANCES,
+    Chances,
+    LogisticConfidence,
+    RegisteredConfidence,
+)
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile, open_map

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.checks import MIN_VIEW_PX, check_footprint, check_view
-from orthonav.core.localize.prepared import pose_prior
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.core.localize.view import MIN_VIEW_PX, check_footprint, check_view, pose_prior
 from orthonav.core.records import CONFIDENT, NoFix, View
 from orthonav.ground.atlas.agreement import (
     MAX_REACH_M,

@@ -17,7 +17,7 @@ import numpy as np
 from orthonav.core.errors import AreaError, AtlasError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.registered import USUAL_CONFIDENCE
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track import Model, State
 from orthonav.core.track.mixture import MOST_SIGHTED

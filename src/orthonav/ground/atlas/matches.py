@@ -3,16 +3,15 @@
 Searching a region takes ten times as long as judging the place near its middle. So all candidates
 are judged, those with hope are finished, and of these the strongest are searched until one is
 proven. The others count as rivals by what is known of them, as the candidates of one search do
-within a sheet (`orthonav.core.register.registrar`).
+within a sheet (`orthonav.core.localize.place`).
 """
 
 import math
 from collections.abc import Mapping, Sequence
 
-from orthonav.core.localize.logistic import logit
-from orthonav.core.localize.plan import DEFAULT_PLAN
-from orthonav.core.localize.registered import USUAL_CONFIDENCE
-from orthonav.core.register.registrar import HOPE, MIN_HOPEFUL
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE, logit
+from orthonav.core.localize.place import HOPE, MIN_HOPEFUL
+from orthonav.core.localize.policy import DEFAULT_PLAN
 from orthonav.ground.atlas.agreement import nearest_m
 from orthonav.ground.atlas.sheet_registration import (
     JudgedRegion,
@@ -24,7 +23,7 @@ from orthonav.ground.atlas.sheet_registration import (
 SEARCHED = 4
 """At most so many candidates are searched: the right one and the best rivals are among them
 (docs/decisions/atlas.md)."""
-PROVEN = logit(1 - DEFAULT_PLAN.trial_doubt, 0.0)
+PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""
 RIVAL_SHARE = 0.25

@@ -16,11 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.logistic import FEATURES, LogisticConfidence, fit_few, fit_logistic
-from orthonav.core.tiles.contract import ViewEmbedder
 from orthonav.core.files import Progress
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.match import TileMatcher
+from orthonav.core.localize.confidence import (
+    TILE_FEATURES,
+    LogisticConfidence,
+)
+from orthonav.core.localize.tiles import TileMatcher
+from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.ground.build.fit import fit_few, fit_logistic
 
 CROPS = 192
 """Views searched; seconds per map."""
@@ -171,7 +175,7 @@ def calibrate(
             changed = changed_picture(rng, picture, other)
             queries = _queries(rng, changed, grid, representation, embedder, heading_step_deg)
             match = matcher.match(queries)
-            features.append([match.evidence[name] for name in FEATURES])
+            features.append([match.evidence[name] for name in TILE_FEATURES])
             truth = [
                 grid.west_m + crop.col_px * grid.gsd_m,
                 grid.north_m - crop.row_px * grid.gsd_m,
@@ -180,7 +184,7 @@ def calibrate(
             mirrored.append(mirror)
         progress("calibrate", (done + 1) / len(crops))
     return _fitted(
-        np.array(features).reshape(-1, len(FEATURES)),
+        np.array(features).reshape(-1, len(TILE_FEATURES)),
         np.array(errors).reshape(-1, 2),
         np.array(mirrored, dtype=bool),
         grid,

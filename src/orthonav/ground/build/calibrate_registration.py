@@ -14,20 +14,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.registered import (
-    USUAL_CHANCES,
-    Chances,
-    RegisteredConfidence,
-    fit_registered,
-)
 from orthonav.core.files import Progress
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.registration import RegistrationLocalizer
-from orthonav.ground.build.calibrate import Crop
-from orthonav.ground.build.change import changed
+from orthonav.core.localize.confidence import (
+    USUAL_CHANCES,
+    Chances,
+    RegisteredConfidence,
+)
+from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
+from orthonav.ground.build.calibrate import Crop
+from orthonav.ground.build.change import changed
+from orthonav.ground.build.fit import fit_registered
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
@@ -115,12 +115,12 @@ def _placed(
 ) -> _Outcome | None:
     """Outcome of locating one view of the picture of a crop; None if there is no fix."""
     view = _view(rng, picture, localizer.grid)
-    seen = localizer.register(view, _prior(rng, localizer, crop))
-    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
+    search = localizer.search(view, _prior(rng, localizer, crop))
+    best = search if isinstance(search, NoFix) else search.run()
+    if isinstance(best, NoFix):
         return None
-    best = seen.found
-    error = np.array([best.placed.pose.x_px - crop.col_px, best.placed.pose.y_px - crop.row_px])
-    return _Outcome(best.evidence(), error, mirror)
+    error = np.array([best.pose.x_px - crop.col_px, best.pose.y_px - crop.row_px])
+    return _Outcome(best.scores, error, mirror)
 
 
 def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:

@@ -16,7 +16,7 @@ from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.records import Telemetry, View
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.reference import GreyPyramid
+from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.check.persistence import MARGIN_PX, default_model, features
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.imagery.mosaic import Mosaic

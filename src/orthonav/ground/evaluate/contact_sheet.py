@@ -16,10 +16,10 @@ from orthonav.core.errors import FlightError, OrthonavError
 from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.checks import check_telemetry
 from orthonav.core.localize.rectify import downsampled, rectify
+from orthonav.core.localize.view import check_telemetry
 from orthonav.core.records import Fix, Telemetry, View, ViewResult
-from orthonav.core.register.reference import GreyPyramid
+from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.evaluate.calibration import is_covariance
 from orthonav.ground.evaluate.metrics import Comparison
 from orthonav.ground.report.canvas import BACKING, INK, RIGHT, SOFT, WRONG, Drawing, draw_figure

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.latency import CameraLatency
+from orthonav.core.flight.mount import CameraLatency
 from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.recordings.flightlog import LoggedFlight

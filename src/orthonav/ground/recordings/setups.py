@@ -18,7 +18,7 @@ from orthonav.core.flight.recording import RecordedView
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.headings import seem_radians
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.prepared import MAX_AGL_STD
+from orthonav.core.localize.view import MAX_AGL_STD
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 
 V = TypeVar("V", bound=RecordedView)

@@ -8,7 +8,7 @@ from pathlib import Path
 from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import with_paths
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+from orthonav.core.flight.fixes import Identity, flight_digest, read_identity
 from orthonav.core.flight.mount import read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.signature import map_digest

@@ -1,11 +1,11 @@
-"""Confidence of a registered view: a probability from its scores, its rivals and its ground.
+"""How likely a fix is right: a probability from scores, and acceptance by a threshold.
 
-Weights are those of real imagery of two dates (`python -m benchmarks.trust`), scores of chance
-those of the map.
+Weights of registration are those of real imagery of two dates (`python -m benchmarks.trust`),
+scores of chance those of the map; weights of tiles are learnt when the map is built.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.logistic import probability
+from orthonav.core.records import Fix, NoFix
 
 FEATURES = (
     "log_strength",
@@ -40,12 +40,6 @@ USUAL_BIASES = -6.68, -8.0
 USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
 """What separates right from wrong, fitted to 1,734 views (docs/decisions/confidence.md). The
 benchmark of trust shows how weights fitted in this way judge scenes left out."""
-RIDGE = 3e-2
-"""Weight of the usual bias where views of another date of the map's area are fitted."""
-MAX_SHIFT = 5.0
-"""Largest change of the bias by them."""
-LEAST = 1e-9
-"""Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
 LEAST_DEVIATIONS = 1.0
@@ -187,26 +181,144 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
     )
 
 
-def fit_registered(
-    evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
-) -> RegisteredConfidence:
-    """The usual confidence with its first bias fitted to views (N) that came out right or not (N,)
-    and drawn to the usual one."""
-    from scipy.optimize import minimize_scalar  # not needed to fly
-
-    usual = RegisteredConfidence.usual(chances)
-    features = [features_of(each, chances) for each in evidence]
-
-    def shifted(shift: float) -> RegisteredConfidence:
-        return replace(usual, biases=(usual.biases[0] + shift, usual.biases[1]))
-
-    def loss(shift: float) -> float:
-        model = shifted(shift)
-        said = np.clip([model.of(each) for each in features], LEAST, 1 - LEAST)
-        return float(RIDGE * shift**2 - np.log(np.where(right, said, 1 - said)).mean())
-
-    return shifted(float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x))
-
-
 USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)
 """For a map without views to learn from."""
+
+
+TILE_FEATURES = ("score", "margin")
+USUAL_SHIFT = 0.42
+"""Standard deviation of the bias from map to map, under the weights of `USUAL_TILES`."""
+LIMIT = 60.0
+"""Largest logit: beyond, the probability is 0 or 1 to all digits of a float."""
+
+
+@dataclass(frozen=True)
+class LogisticConfidence:
+    """P(right) = 1 / (1 + exp(-(bias + weights . evidence))).
+
+    `weights` belong to the evidence named in `TILE_FEATURES`: the best score, and its lead over the
+    best score elsewhere. Weights are never negative: more evidence never means less confidence.
+    """
+
+    bias: float
+    weights: tuple[float, ...]
+
+    def __call__(self, evidence: Mapping[str, float]) -> float:
+        """Probability in 0..1 that the fix is right."""
+        total = self.bias + sum(
+            weight * evidence[name]
+            for name, weight in zip(TILE_FEATURES, self.weights, strict=True)
+        )
+        return probability(total)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for a manifest."""
+        return {"bias": self.bias, "weights": dict(zip(TILE_FEATURES, self.weights, strict=True))}
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "LogisticConfidence":
+        """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
+        try:
+            numbers = [
+                float(plain["bias"]),
+                *(float(plain["weights"][name]) for name in TILE_FEATURES),
+            ]
+        except (KeyError, TypeError, ValueError) as error:
+            raise VariantError(
+                f"confidence must have bias and weights of {TILE_FEATURES}"
+            ) from error
+        if not all(math.isfinite(number) for number in numbers) or min(numbers[1:]) < 0:
+            raise VariantError(f"confidence has a weight that is negative or not finite: {plain}")
+        return cls(numbers[0], tuple(numbers[1:]))
+
+
+USUAL_TILES = LogisticConfidence(-3.42 - USUAL_SHIFT, (5.87, 12.08))
+"""Of tiles of whitened gradients: fitted to the trials of 22 maps of nine scenes, and lower by one
+standard deviation (docs/decisions/confidence.md)."""
+
+
+def probability(logit: float) -> float:
+    """The logistic function, cut off where it is 0 or 1 to all digits that matter."""
+    return 1 / (1 + math.exp(-min(max(logit, -LIMIT), LIMIT)))
+
+
+def logit(likely: float, least: float) -> float:
+    """Logarithm of the odds of a probability that is taken as `least` to 1 - `least`."""
+    inside = min(max(likely, least), 1 - least)
+    return math.log(inside / (1 - inside))
+
+
+CRITERIA = {
+    "confidence": (0.01, 1.0),
+    "peak_ratio": (1.0, 1000.0),
+    "lowe_ratio": (1.0, 1000.0),
+}
+"""Thresholds that make sense, by criterion. The best of two scores is no less than the other."""
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Fixes whose `criterion` is below `threshold` are withheld.
+
+    `confidence`: the calibrated probability; `peak_ratio`: best over its strongest rival;
+    `lowe_ratio`: best over second best tile, the criterion of Di Piazza et al. 2024 (threshold
+    1.13), which only tile search has.
+    """
+
+    criterion: str
+    threshold: float
+
+    @classmethod
+    def parse(cls, text: str) -> "Acceptance":
+        """From `name:threshold`, the value of `--accept`; raises `VariantError`."""
+        name, _, value = text.partition(":")
+        try:
+            threshold = float(value)
+        except ValueError:
+            threshold = math.nan
+        if name not in CRITERIA or not math.isfinite(threshold):
+            raise VariantError(
+                f"--accept must be one of {', '.join(CRITERIA)} with a threshold, such as "
+                f"confidence:0.9 or lowe_ratio:1.13, got '{text}'"
+            )
+        least, most = CRITERIA[name]
+        if not least <= threshold <= most:
+            raise VariantError(
+                f"--accept {name}: the threshold must be {least:g} to {most:g}, got {value}"
+            )
+        return cls(name, threshold)
+
+    def __call__(self, outcome: Fix | NoFix) -> Fix | NoFix:
+        """The outcome, or `NoFix` where the number is below the threshold or unknown."""
+        if isinstance(outcome, NoFix) or self.accepts(outcome):
+            return outcome
+        value = self._value(outcome)
+        value_text = "unknown" if math.isnan(value) else f"{value:.3g}"
+        detail = f"{self.criterion} is {value_text}, at least {self.threshold:g} is required"
+        return NoFix("low_confidence", detail, outcome.evidence)
+
+    def accepts(self, outcome: Fix | NoFix) -> bool:
+        """Whether there is a fix whose number is known and not below the threshold."""
+        return isinstance(outcome, Fix) and self._value(outcome) >= self.threshold
+
+    def _value(self, fix: Fix) -> float:
+        if self.criterion == "confidence":
+            return fix.confidence
+        return fix.evidence.get(self.criterion, math.nan)
+
+
+def within(
+    mean: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    radius_m: float,
+    middle: NDArray[np.float64] | None = None,
+) -> float:
+    """Probability that a state lies within a radius of `middle` (2,), its own mean where None.
+
+    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
+    """
+    variance = float(covariance[0, 0] + covariance[1, 1]) / 2
+    away = 0.0 if middle is None else math.dist(mean[:2], middle)
+    if away > radius_m + 3 * math.sqrt(variance):
+        return 0.0
+    return 1 - math.exp(-(radius_m**2) / (2 * variance + away**2 + 1e-9))

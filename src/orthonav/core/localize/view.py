@@ -1,14 +1,34 @@
-"""Views that cannot be placed are refused before any search, each by a `NoFix` with its reason."""
+"""A view made ready for registration: checked, and rectified with its own heading up.
+
+Views that cannot be placed are refused before any search, each by a `NoFix` with its reason.
+"""
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.rectify import RectifiedView, off_nadir_deg
-from orthonav.core.records import NoFix, Telemetry, View
+from orthonav.core.localize.rectify import (
+    RectifiedView,
+    downsampled,
+    is_oblique,
+    near_part,
+    off_nadir_deg,
+    rectify_footprint,
+)
+from orthonav.core.records import (
+    DEFAULT_AGL_STD,
+    DEFAULT_YAW_STD_DEG,
+    MIN_YAW_STD_DEG,
+    NoFix,
+    Telemetry,
+    View,
+)
+from orthonav.core.register.pose import PosePrior
+from orthonav.core.register.template import Levels, ViewTemplates
 
 MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
@@ -128,3 +148,105 @@ def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
 def _is_uniform(view: RectifiedView) -> bool:
     _, std = cv2.meanStdDev(view.grey, mask=view.valid.view(np.uint8))
     return float(std[0, 0]) < MIN_STD / 2
+
+
+MIN_AGL_STD = 0.03
+"""Least standard deviation of the log scale that is searched, whatever the telemetry reports."""
+MAX_AGL_STD = 0.15
+"""Largest one: three of them are scales of 0.64 to 1.57, about as far as scores of chance were
+measured to be alike (docs/decisions/registration.md)."""
+NEAR_SHARE = 0.6
+"""The part of a view far off nadir is judged as one so many times smaller, thus mostly one level
+finer: it is no square, and on its coarse levels too little is left of it
+(docs/decisions/terrain.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedView:
+    """A view made ready for registration.
+
+    `view`: as the camera saw it. `gsd_m`: ground resolution of level 0 of the map. `levels`: levels
+    of the map at which it is searched, judged and finished. `templates`: it rectified at the final
+    level. `side_px`: root of the area seen, in pixels of level 0. `camera_px` (2,): the camera as
+    seen from the middle of the view, heading up, x to the right and y down, in pixels of level 0.
+    `prior`: expected heading and scale.
+    """
+
+    view: View
+    gsd_m: float
+    levels: Levels
+    templates: ViewTemplates
+    side_px: float
+    camera_px: NDArray[np.float64]
+    prior: PosePrior
+    _pictures: dict[int, View]
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What was reported with the view."""
+        return self.view.telemetry
+
+    def picture_at(self, level: int) -> View:
+        """The view averaged towards the ground resolution of a level, made once."""
+        if level not in self._pictures:
+            self._pictures[level] = downsampled(self.view, self.gsd_m * 2**level)
+        return self._pictures[level]
+
+    def rectified_at(self, level: int) -> RectifiedView:
+        """The view rectified at the ground resolution of a level."""
+        return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)
+
+
+def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> PreparedView | NoFix:
+    """The view rectified at the level where it is finished; `NoFix` where it shows too little.
+
+    `gsd_m` is the ground resolution of level 0 of the map, `map_levels` the number of its levels.
+    """
+    camera, telemetry = view.camera, view.telemetry
+    nominal_m = footprint_side_m(telemetry, camera)
+    if is_oblique(view):
+        near = near_part(view, gsd_m)
+        if near is None:
+            return NoFix("too_small", "the view shows no ground that is near enough")
+        nominal_m = NEAR_SHARE * math.sqrt(near.area_m2)
+    levels = Levels.of(nominal_m / gsd_m, map_levels)
+    unit_px = 2**levels.final
+    picture = downsampled(view, gsd_m * unit_px)
+    rectified = _rectified(picture, gsd_m, levels, levels.final)
+    refused = check_footprint(rectified, unit_px, MIN_VIEW_PX)
+    if refused is not None:
+        return refused
+    offset = rectified.offset_en_m / gsd_m
+    return PreparedView(
+        view,
+        gsd_m,
+        levels,
+        ViewTemplates(rectified.grey, rectified.valid, levels.final),
+        math.sqrt(float(rectified.valid.sum())) * unit_px,
+        np.array([-offset[0], offset[1]]),
+        pose_prior(telemetry, heading_known, camera.focal_std),
+        {levels.final: picture},
+    )
+
+
+def _rectified(picture: View, gsd_m: float, levels: Levels, level: int) -> RectifiedView:
+    """A picture rectified at a level, its sides whole pixels of the coarse one."""
+    multiple = 2 ** max(0, levels.coarse - level)
+    return rectify_footprint(picture, gsd_m=gsd_m * 2**level, multiple_px=multiple)
+
+
+def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> PosePrior:
+    """Expected heading and scale of a view, by its telemetry and its camera's `focal_std`."""
+    yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
+    agl_std_m = telemetry.agl_std_m
+    agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
+    scale_std = math.hypot(_or_default(agl_std, DEFAULT_AGL_STD), focal_std)
+    return PosePrior(
+        math.radians(telemetry.yaw_deg) if heading_known else None,
+        math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
+        min(max(scale_std, MIN_AGL_STD), MAX_AGL_STD),
+    )
+
+
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None or not math.isfinite(value) else value

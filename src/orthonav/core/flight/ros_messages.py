@@ -1,5 +1,6 @@
-"""Images and cameras of ROS messages (sensor_msgs)."""
+"""Images, cameras, attitudes and heights of ROS messages; axes: REP 103 and REP 105."""
 
+import math
 from typing import Any
 
 import cv2
@@ -8,8 +9,67 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import decode_image
+from orthonav.core.geo.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+)
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import camera_from_numbers
+
+LEAST_TILT_STD_DEG, MOST_TILT_STD_DEG = 1.5, 10.0
+"""An orientation of an IMU counts as stated between them; MAVROS states 57 deg by default."""
+
+
+def stamp_ns(message: Any, recorded_ns: int) -> int:
+    """Time stamp of a message, or the time of its recording where it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    stamped = 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    return stamped or recorded_ns
+
+
+def attitude_of_message(message: Any) -> tuple[float, float, float, float] | None:
+    """The orientation w, x, y, z in a `sensor_msgs/Imu`, `nav_msgs/Odometry` or
+    `geometry_msgs/PoseStamped`: from forward-left-up to east-north-up (REP 103).
+
+    None for an `Imu` that says it has none.
+    """
+    if hasattr(message, "orientation_covariance"):
+        if message.orientation_covariance[0] == -1:
+            return None
+        turn = message.orientation
+    elif hasattr(message.pose, "pose"):
+        turn = message.pose.pose.orientation
+    else:
+        turn = message.pose.orientation
+    return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
+
+
+def tilt_std_of_message(message: Any) -> float:
+    """Standard deviation of pitch and roll (deg) by the covariance of a `sensor_msgs/Imu`.
+
+    That of an autopilot where it is not stated, or is a placeholder. A smaller one than
+    `LEAST_TILT_STD_DEG` leaves out the errors of the mount and of accelerations.
+    """
+    covariance = getattr(message, "orientation_covariance", (0.0,) * 9)
+    variance = max(float(covariance[0]), float(covariance[4]))
+    std_deg = math.degrees(math.sqrt(variance)) if variance > 0 else math.inf
+    if not std_deg <= MOST_TILT_STD_DEG:
+        return AUTOPILOT_TILT_STD_DEG
+    return max(std_deg, LEAST_TILT_STD_DEG)
+
+
+def height_of_message(message: Any) -> float | None:
+    """Metres above ground of a `sensor_msgs/Range`, `mavros_msgs/Altitude` or a plain number.
+
+    None for a range outside the limits of its sensor.
+    """
+    if hasattr(message, "range"):
+        sound = message.min_range <= message.range <= message.max_range
+        return float(message.range) if sound else None
+    if hasattr(message, "bottom_clearance"):
+        clearance = message.bottom_clearance
+        return float(clearance if math.isfinite(clearance) else message.relative)
+    return float(message.data)
+
 
 Grey = NDArray[np.uint8]
 # encoding: bytes per channel, channels, conversion to grey.

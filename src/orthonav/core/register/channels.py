@@ -1,4 +1,4 @@
-"""What registration compares: two kinds of evidence of the same ground, made of grey levels.
+"""What registration compares: two kinds of channels of the same ground, made of grey levels.
 
 *Oriented gradients*: the edge direction doubled, so that an edge keeps its place when its contrast
 flips between seasons, weighted by a magnitude that saturates against its surroundings, so that a
@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 CHANNELS = 4
-"""Channels of evidence: cosine and sine of the doubled edge direction, grey, valid."""
+"""cosine and sine of the doubled edge direction, grey, valid."""
 GROUPS = (slice(0, 2), slice(2, 3))
-"""Channels of the two kinds of evidence."""
+"""Those of the two kinds."""
 
 
 @dataclass(frozen=True)
-class EvidenceRecipe:
-    """Parameters of the evidence, in pixels of the level it is made at.
+class ChannelRecipe:
+    """Parameters of the channels, in pixels of the level it is made at.
 
     `gradient_sigma_px`: Gaussian before the gradient; `contrast_px`: side of the window in which a
     gradient is weighed against its surroundings; `mean_px` and `deviation_px`: windows of local
@@ -40,13 +40,13 @@ class EvidenceRecipe:
 
     @property
     def margin_px(self) -> int:
-        """How far a pixel's grey level can reach into the evidence."""
+        """How far a pixel's grey level can reach into the channels."""
         return max(self.contrast_px // 2 + 4, self.mean_px // 2 + self.deviation_px // 2 + 1)
 
 
-FINE = EvidenceRecipe()
-COARSE = EvidenceRecipe(gradient_sigma_px=0.7, contrast_px=17, mean_px=7, deviation_px=17)
-"""For views of some 30 pixels across: the same evidence from smaller windows."""
+FINE = ChannelRecipe()
+COARSE = ChannelRecipe(gradient_sigma_px=0.7, contrast_px=17, mean_px=7, deviation_px=17)
+"""For views of some 30 pixels across: the same channels from smaller windows."""
 _GRADIENT_FLOOR = np.float32(0.5)
 _DEVIATION_FLOOR = np.float32(2.0)
 """Grey levels (per pixel) below which gradient and contrast count as noise of an 8-bit picture."""
@@ -54,20 +54,20 @@ _CLIP = 3.0
 """Limit of the normalized grey, in local standard deviations."""
 
 
-def evidence(
-    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: EvidenceRecipe = FINE
+def channels_of(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe = FINE
 ) -> Array:
-    """Evidence (H, W, 4) float32 of grey (H, W) uint8, zero where not valid.
+    """Channels (H, W, 4) float32 of grey (H, W) uint8, zero where not valid.
 
-    The last channel is 1 where the evidence counts: valid, and not on the border of `valid`.
+    The last channel is 1 where the channels count: valid, and not on the border of `valid`.
     """
-    return np.asarray(cv2.merge(evidence_planes(grey, valid, recipe)), np.float32)
+    return np.asarray(cv2.merge(channel_planes(grey, valid, recipe)), np.float32)
 
 
-def evidence_planes(
-    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: EvidenceRecipe
+def channel_planes(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe
 ) -> list[Array]:
-    """The channels of `evidence`, each (H, W)."""
+    """Those of `channels_of`, each (H, W)."""
     whole = bool(valid.all())
     picture = np.asarray(grey, dtype=np.float32)
     share = np.ones(grey.shape, np.float32) if whole else valid.astype(np.float32)
@@ -107,7 +107,7 @@ def _box(values: Array, side_px: int) -> Array:
 
 
 def _gradients(
-    picture: Array, counts: Array, local: _LocalMean, recipe: EvidenceRecipe
+    picture: Array, counts: Array, local: _LocalMean, recipe: ChannelRecipe
 ) -> tuple[Array, Array]:
     """Doubled direction times saturated magnitude: cosine and sine (H, W)."""
     smooth = cv2.GaussianBlur(picture, (0, 0), recipe.gradient_sigma_px)
@@ -127,7 +127,7 @@ def _gradients(
     return np.asarray(square * weight), np.asarray(product * weight)
 
 
-def _grey(picture: Array, share: Array, local: _LocalMean, recipe: EvidenceRecipe) -> Array:
+def _grey(picture: Array, share: Array, local: _LocalMean, recipe: ChannelRecipe) -> Array:
     """Grey levels (H, W) without local mean, divided by the local deviation."""
     rest = (picture - local(picture * share, recipe.mean_px)) * share
     # Running sums of a box filter may fall a little below zero.
