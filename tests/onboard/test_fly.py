@@ -386,15 +386,6 @@ def test_samples_after_the_last_view_count_in_its_displacement(begin):
     assert flight.locator.seen[-1].vel_en_mps == (0.0, pytest.approx(moved_m / 2.9))
 
 
-def test_after_a_gap_of_the_telemetry_no_velocity_is_known(begin):
-    flight = begin()
-    for pause_s in (0.1, 0.1, 3.0, 0.1):
-        flight.time.go(pause_s)
-        flight.hear(flight.autopilot.local(flight.time.now_ns + AHEAD_NS, (20.0, 0.0, 0.0)))
-        flight.views(1)
-    assert [each.vel_en_mps for each in flight.locator.seen[-2:]] == [(0.0, 20.0), None]
-
-
 BAD = {
     "bad_image": NoFix("bad_image", "cut short"),
     "too_dark": np.zeros((240, 320), np.uint8),
@@ -443,13 +434,6 @@ def test_without_telemetry_there_is_no_fix(flight):
     assert reason_of(flight.view()) == "fix"
 
 
-def test_gaps_in_telemetry_are_reported(flight):
-    for number in range(60):
-        flight.talks = number % 12 > 8
-        flight.view()
-    assert "telemetry_gaps" in flight.reasons()
-
-
 def test_a_link_that_failed_is_opened_again(flight):
     flight.port.broken = OSError("unplugged")
     flight.views(60)
@@ -495,17 +479,6 @@ def test_a_large_mismatch_of_heading_or_height_degrades(flight):
     )
     flight.views(11)
     assert flight.reasons() == {"height_mismatch"}
-
-
-def test_a_position_of_low_confidence_or_a_lost_track_is_not_sent(flight):
-    flight.locator.outcome = lambda *_: fix(confidence=0.5)
-    flight.views(110)
-    assert "low_confidence" in flight.reasons()
-    flight.locator.state_name = "lost"
-    flight.port.gone.clear()
-    flight.views(3)
-    assert "lost" in flight.reasons() and flight.port.sent("GPS_INPUT") == []
-    assert flight.written()[-2]["withheld"] in ("not_tracking", "low_confidence")
 
 
 def test_a_removed_map_file_degrades(begin, tmp_path):
@@ -613,14 +586,6 @@ def test_the_first_located_view_gets_the_start_position(begin):
     flight.view(BAD["too_dark"])
     flight.views(3)
     assert [each.prior for each in flight.locator.seen] == [prior, None, None]
-
-
-def test_recorded_telemetry_needs_no_autopilot(begin):
-    flight = begin(recorded=True)
-    telemetry = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
-    grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
-    flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
-    assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [telemetry]
 
 
 def test_time_that_goes_back_begins_the_track_again(begin, caplog):
@@ -1158,29 +1123,6 @@ def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_st
     assert done.code == 0 and all("WARNING: " in line for line in lines)
     done = run(*command, "--jsonl", "-", "--gnss", "watch")
     assert (done.code, done.out) == (1, "") and "gnss.csv" in done.err.splitlines()[-1]
-
-
-def test_the_console_of_a_flight_beside_an_autopilot(flown, autopilot, monkeypatch, run, tmp_path):
-    path, folder, _, _ = flown
-    lines = tmp_path / "lines.jsonl"
-    autopilot.mute = True
-    talks = threading.Timer(1.5, lambda: setattr(autopilot, "mute", False))
-    held = pace_by(lines, lambda: autopilot.mute)
-    monkeypatch.setattr(cameras, "own_pace", held)
-    talks.start()
-    url = f"udpin:{autopilot.port}"
-    done = run(
-        *("fly", path, folder, "--autopilot", url, "--send", "gps-input", "--jsonl", lines),
-        *("--deadline-ms", "60000", "--telemetry-wait-ms", "10000"),
-    )
-    assert done.code == 0
-    texts = [line[12:] for line in done.err.splitlines()]
-    assert f"sends: GPS_INPUT, JSON lines to {lines}; positions of confidence 0.9 or more" in texts
-    waited, heard = f"waiting for heartbeat on {url}", f"autopilot 1/1 PX4 heard on {url}"
-    tracked = next(text for text in texts if "-> tracking" in text)
-    assert texts.index(waited) < texts.index(heard) < texts.index(tracked)
-    sent = sum(bool(line["sent"]) for line in views_in(lines)[0])
-    assert sent and texts[-1].startswith(f"end: {COUNT} views, {sent} sent, ")
 
 
 @pytest.mark.parametrize("how", ["nobody reads", "full", "closed"])
