@@ -21,9 +21,8 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import Relief
 from orthonav.core.records import CONFIDENT, Fix
-from orthonav.ground.recordings.pixel import locate_pixel
+from orthonav.ground.recordings.pixel import ELLIPSE_95, locate_pixel
 from orthonav.ground.simulate.perspective import Raster, met, rays_enu
-from orthonav.onboard.messages.estimate import ELLIPSE_95
 
 TILT_STD_DEG = 1.0
 AT = ((0.5, 0.5), (0.15, 0.8), (0.85, 0.8), (0.3, 0.4), (0.7, 0.4))

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.ground.recordings.pixel import ellipse_95
 from orthonav.onboard.messages.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
-    ellipse_95,
     estimate_from_result,
 )
 from orthonav.onboard.messages.mavlink import gps_time

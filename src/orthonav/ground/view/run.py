@@ -14,7 +14,7 @@ from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.mount import Mount
 from orthonav.core.records import Fix, Telemetry, ViewResult
 from orthonav.ground.evaluate.contact_sheet import as_fixed
-from orthonav.ground.recordings.pixel import locate_pixel
+from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 from orthonav.ground.view.columns import columns_of
 from orthonav.ground.view.feed import Batch, Feed
 from orthonav.ground.view.images import Shot, ViewImages
@@ -27,7 +27,6 @@ from orthonav.ground.view.sheet import (
     view_png,
     window_of,
 )
-from orthonav.onboard.messages.estimate import ellipse_95
 
 AT = ("fix", "truth")
 
