@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.planning.area import Area
 from orthonav.core.geo.grid import TileGrid
 from orthonav.ground.imagery.mosaic import GreyPixels, SheetRaster
+from orthonav.ground.planning.area import Area
 
 
 @dataclass(frozen=True)

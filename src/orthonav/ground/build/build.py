@@ -15,14 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.tiles import embed, represent
-from orthonav.core.localize.logistic import USUAL
-from orthonav.research.caevl_recipe import CaevlRecipe
-from orthonav.core.tiles.contract import ViewEmbedder
-from orthonav.core.tiles.network import TripletRecipe
-from orthonav.core.tiles.whitened import WhitenedRecipe, learn
 from orthonav.core.files import Progress
-from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.core.localize.logistic import USUAL
 from orthonav.core.localize.match import TileMatcher
 from orthonav.core.localize.plan import SearchPlan
 from orthonav.core.localize.propose import TileProposer
@@ -30,6 +24,11 @@ from orthonav.core.localize.registration import RegistrationLocalizer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.writer import write_map
+from orthonav.core.tiles import embed, represent
+from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.core.tiles.network import TripletRecipe
+from orthonav.core.tiles.whitened import WhitenedRecipe, learn
+from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.caevl import learn_caevl
 from orthonav.ground.build.calibrate import (
     RADIUS_STRIDES,
@@ -46,7 +45,8 @@ from orthonav.ground.build.methods import stored_representation
 from orthonav.ground.build.pictures import SheetPictures, read_pictures
 from orthonav.ground.build.request import BuildInputs, BuildRequest, BuildResult
 from orthonav.ground.build.sheet import SheetReader
-from orthonav.core.variants import variant_recipe
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.research.caevl_recipe import CaevlRecipe
 
 __all__ = ["BuildRequest", "BuildResult", "build_map"]
 

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.research.caevl_recipe import CaevlRecipe
-from orthonav.core.tiles.network import NetworkEmbedder
 from orthonav.core.extras import needed
 from orthonav.core.files import Progress
+from orthonav.core.tiles.network import NetworkEmbedder
 from orthonav.ground.build.encoders import (
     EncoderRecipe,
     Learning,
@@ -19,6 +18,7 @@ from orthonav.ground.build.encoders import (
     _require_as_in_flight,
 )
 from orthonav.ground.build.pictures import SheetPictures
+from orthonav.research.caevl_recipe import CaevlRecipe
 
 
 def learn_caevl(

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.logistic import FEATURES, LogisticConfidence, fit_few, fit_logistic
-from orthonav.core.tiles.contract import ViewEmbedder
 from orthonav.core.files import Progress
 from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.logistic import FEATURES, LogisticConfidence, fit_few, fit_logistic
 from orthonav.core.localize.match import TileMatcher
+from orthonav.core.tiles.contract import ViewEmbedder
 
 CROPS = 192
 """Views searched; seconds per map."""

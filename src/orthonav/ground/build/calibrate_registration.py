@@ -14,20 +14,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.files import Progress
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.registered import (
     USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
     fit_registered,
 )
-from orthonav.core.files import Progress
-from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.registration import RegistrationLocalizer
-from orthonav.ground.build.calibrate import Crop
-from orthonav.ground.build.change import changed
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
+from orthonav.ground.build.calibrate import Crop
+from orthonav.ground.build.change import changed
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
-from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import Progress
-from orthonav.research.tiles import SheetTiles
-from orthonav.research.words import learn_words
+from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe
 from orthonav.ground.build.change import changed
 from orthonav.ground.build.pictures import SheetPictures
+from orthonav.research.tiles import SheetTiles
+from orthonav.research.words import learn_words
 
 log = logging.getLogger(__name__)
 

@@ -5,11 +5,11 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.errors import AreaError
+from orthonav.core.geo.grid import TileGrid
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.core.errors import AreaError
 from orthonav.ground.planning.area import Area
-from orthonav.core.geo.grid import TileGrid
 
 log = logging.getLogger(__name__)
 

@@ -4,15 +4,15 @@ import logging
 from importlib.util import find_spec
 from typing import Any
 
+from orthonav.core.errors import MissingExtraError, VariantError
+from orthonav.core.extras import needed, pip_line
 from orthonav.core.tiles import embed, represent
+from orthonav.core.tiles.gray import Gray
 from orthonav.core.tiles.network import AutoEncoderRecipe, TripletRecipe
 from orthonav.core.tiles.whitened import WhitenedRecipe
 from orthonav.core.tiles.words import WordsRecipe
-from orthonav.core.errors import MissingExtraError, VariantError
-from orthonav.core.extras import needed, pip_line
-from orthonav.ground.build.encoders import EncoderRecipe
-from orthonav.core.tiles.gray import Gray
 from orthonav.core.variants import make_variant, variant_recipe
+from orthonav.ground.build.encoders import EncoderRecipe
 
 log = logging.getLogger(__name__)
 

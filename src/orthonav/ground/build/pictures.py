@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.files import Progress, no_progress
-from orthonav.ground.planning.area import Area
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.research.tiles import SheetTiles
-from orthonav.ground.build.blocks import Block, BlockPixels, blocks_of, read_block
 from orthonav.core.tiles.gray import Gray
+from orthonav.ground.build.blocks import Block, BlockPixels, blocks_of, read_block
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.planning.area import Area
+from orthonav.research.tiles import SheetTiles
 
 BLOCK_PX = 1024
 

@@ -8,24 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.tiles import represent
-from orthonav.core.tiles.whitened import WhitenedRecipe
 from orthonav.core.errors import AreaError, OutputError, VariantError
 from orthonav.core.files import with_paths
-from orthonav.ground.planning.area import Area, Extent, require_one_area
-from orthonav.ground.planning.estimate import estimate_map
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.planning.route import Route
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.imagery.terrain import open_dem
 from orthonav.core.mapfile.manifest import Manifest
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.whitened import WhitenedRecipe
+from orthonav.core.variants import make_variant
 from orthonav.ground.build.calibrate import CROPS
 from orthonav.ground.build.encoders import EncoderRecipe
 from orthonav.ground.build.layout import grid_of
 from orthonav.ground.build.methods import check_device, check_positives, method_recipe, usual_edges
 from orthonav.ground.build.terrain import TerrainParts, terrain_of_dem
-from orthonav.core.variants import make_variant
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.planning.area import Area, Extent, require_one_area
+from orthonav.ground.planning.estimate import estimate_map
+from orthonav.ground.planning.route import Route
 
 MAX_WORKERS = 64
 """Sanity limit on threads."""

@@ -20,23 +20,23 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.tiles import represent
 from orthonav.core.cores import usable_cores
-from orthonav.core.tiles.cells import CellLayout, cell_means
-from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.errors import AreaError
 from orthonav.core.files import Progress
-from orthonav.ground.planning.area import Area
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
-from orthonav.ground.imagery.quiet import quiet
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.cells import CellLayout, cell_means
+from orthonav.core.tiles.whitened import CellSheet
+from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.block_cache import BlockCache, digest
 from orthonav.ground.build.blocks import Block, Preview, blocks_of, margins, read_block
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
 from orthonav.ground.build.parallel import in_order
 from orthonav.ground.build.pictures import SheetPictures, sheet_maps
-from orthonav.core.variants import variant_recipe
+from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
+from orthonav.ground.imagery.quiet import quiet
+from orthonav.ground.planning.area import Area
 
 log = logging.getLogger(__name__)
 
