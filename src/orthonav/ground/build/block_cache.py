@@ -52,7 +52,7 @@ class BlockCache:
         """
         self._folder = folder
         self._request = request
-        self._names: dict["Block", str] = {}
+        self._names: dict[Block, str] = {}
         parent = next(each for each in [folder, *folder.absolute().parents] if each.exists())
         room = shutil.disk_usage(parent).free + sum(path.stat().st_size for path in self._files())
         if room < needed_bytes:

@@ -60,7 +60,6 @@ from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.estimate import estimate_map
 from orthonav.ground.planning.route import Route
-from orthonav.research.caevl_recipe import CaevlRecipe
 
 MAX_WORKERS = 64
 """Sanity limit on threads."""

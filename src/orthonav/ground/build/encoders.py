@@ -115,7 +115,6 @@ MOST_REPLACED, MOST_MIXED = 0.35, 0.4
 network learned a third as much in its first 300 batches."""
 
 
-
 @dataclass(frozen=True)
 class Learning:
     """How to learn: seed of all draws, and of networks what `BuildRequest` says of each."""
