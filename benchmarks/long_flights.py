@@ -40,9 +40,9 @@ from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
 from orthonav.ground.planning.route import Route
-from orthonav.ground.simulate.clouds import Clouds
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
+from orthonav.ground.simulate.render import Clouds
 from orthonav.onboard.run import localize_flight
 
 CAMERA = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)

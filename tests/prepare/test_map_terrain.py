@@ -147,7 +147,7 @@ def flown(area, frame, dem, tmp_path_factory):
         terrain=open_dem(dem, "msl"), seed=1,
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
+        patch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)
         simulate_flight(request)
     return out
 
@@ -269,7 +269,7 @@ def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
 
 
 def test_random_views_report_heights_above_sea_only(run, area, flown, dem, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
+    monkeypatch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)
     done = run(
         "simulate", "--ortho", area.present, "--random", 3, "--agl-m", 250, "--dem", dem,
         "--dem-datum", "msl", "--camera", flown / "flight.json", "--out", tmp_path / "flight",

@@ -15,11 +15,10 @@ from orthonav.core.records import View
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route, distance_to_polyline_m
-from orthonav.ground.simulate.clouds import Clouds
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.imagery import reflected
+from orthonav.ground.simulate.ground import reflected
 from orthonav.ground.simulate.motion import Wind
-from orthonav.ground.simulate.render import ViewEffects
+from orthonav.ground.simulate.render import Clouds, ViewEffects
 
 PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)

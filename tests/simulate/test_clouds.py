@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.geo.camera import Camera
-from orthonav.ground.simulate.clouds import EDGE, GRID, HEIGHT, MOST_VIEWS, Clouds
+from orthonav.ground.simulate.render import EDGE, GRID, HEIGHT, MOST_VIEWS, Clouds
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
 AGL_M = 1000.0

@@ -13,8 +13,8 @@ from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate import flight as flight_module
-from orthonav.ground.simulate.attitude import HORIZON_TIME_S, camera_attitude, horizon_errors
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.motion import HORIZON_TIME_S, camera_attitude, horizon_errors
 
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 LEVEL = (0.0, 0.0, 0.0)

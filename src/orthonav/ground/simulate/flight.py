@@ -25,27 +25,28 @@ from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA as DEFAULT_CAMERA
-from orthonav.ground.simulate.attitude import camera_attitude, horizon_errors
-from orthonav.ground.simulate.clouds import Clouds
-from orthonav.ground.simulate.imagery import Coverage, GroundImagery
-from orthonav.ground.simulate.motion import (
-    FlownPath,
-    Wind,
-    drifting,
-    rounded,
-    steady_path,
-    windy_path,
-)
-from orthonav.ground.simulate.perspective import Raster
-from orthonav.ground.simulate.receiver import Good, samples_of, solutions
-from orthonav.ground.simulate.render import ViewEffects, degraded, render_view
-from orthonav.ground.simulate.terrain import (
+from orthonav.ground.simulate.ground import (
+    Coverage,
+    GroundImagery,
     ground_below_m,
     near_ground_en_m,
     reported_heights,
     seen_over,
     surface_of,
 )
+from orthonav.ground.simulate.motion import (
+    FlownPath,
+    Wind,
+    camera_attitude,
+    drifting,
+    horizon_errors,
+    rounded,
+    steady_path,
+    windy_path,
+)
+from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.receiver import Good, samples_of, solutions
+from orthonav.ground.simulate.render import Clouds, ViewEffects, degraded, render_view
 
 MAX_VIEWS = 1_000_000
 """Sanity limit."""
