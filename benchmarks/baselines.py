@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.rectify import RectifiedView, downsampled
 from orthonav.core.records import Fix, View
-from orthonav.core.tiles.canny import Canny
+from orthonav.core.tiles.represent import Canny
 from orthonav.ground.imagery.mosaic import Mosaic
 
 JPEG_QUALITY = 90

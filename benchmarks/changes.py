@@ -33,12 +33,11 @@ from benchmarks.verdicts import percent
 from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import SheetInfo
-from orthonav.ground.changes.ground import changed_ground
+from orthonav.ground.changes.ground import cell_side_m, changed_ground, views_beside_map
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid
-from orthonav.ground.changes.views import cell_side_m, views_beside_map
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import SingleViews, localize_flight

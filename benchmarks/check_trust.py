@@ -33,7 +33,6 @@ from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
-from orthonav.ground.check.places import CellGrid
 from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
@@ -181,7 +180,7 @@ def _measured(pair: Pair, width_px: int, prior: bool, options: argparse.Namespac
         recalibration=PLAIN,
     )
     cells = check_map(asked)[0].cells
-    grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, *cells.probability.shape)
+    grid = cells.grid
     shares, right, wrong, off_m, expected_m = [], [], 0, [], []
     truth = read_truth(folder / "truth.csv")
     for result in localize_flight(SingleViews(localizer), open_flight(folder)):

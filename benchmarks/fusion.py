@@ -4,7 +4,7 @@
 over a generated area with errors of attitude, heading and height, follows every flight with
 `Tracker` from no prior, and gives the positions that would be sent to Kalman filters of constant
 velocity, once with the covariance of the fix and once with the one that is sent
-(`orthonav.onboard.messages.correlation`). It prints the mean normalized error squared (NEES) of the
+(`orthonav.onboard.messages.estimate`). It prints the mean normalized error squared (NEES) of the
 filters' positions over its expected value: 1 is right, more is too confident. Recorded flights of
 the optional real imagery follow where they are at hand. Area, map and flights stay in the work
 folder.
@@ -38,9 +38,8 @@ from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
-from orthonav.onboard.messages import correlation
-from orthonav.onboard.messages.correlation import FilterCovariance
-from orthonav.onboard.messages.estimate import estimate_from_result
+from orthonav.onboard.messages import estimate as estimates
+from orthonav.onboard.messages.estimate import FilterCovariance, estimate_from_result
 from orthonav.onboard.run import localize_flight
 
 AREA_M, GSD_M, REACH_M = 3000, 1.0, 1100.0
@@ -52,7 +51,7 @@ SCATTER = Errors(
     yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.3, attitude_std_deg=2.0, velocity_drift=0.02
 )
 SEED, FLIGHT_SEED, CALIBRATION = 77, 1000, 3
-"""The first flights of each rate chose `orthonav.onboard.messages.correlation.AVERAGING_S`."""
+"""The first flights of each rate chose `orthonav.onboard.messages.estimate.AVERAGING_S`."""
 SETTLING_S = 30.0
 """A filter is judged from so long after its first position on."""
 RECORDED = (
@@ -327,8 +326,8 @@ def main(arguments: Sequence[str]) -> int:
         f"{SETTLING_S:g} s after its first position on; smallest and largest flight in brackets",
         "recorded flights: the error of the reference is part of the error",
     )
-    for averaging_s in options.averaging_s or [correlation.AVERAGING_S]:
-        correlation.AVERAGING_S = averaging_s
+    for averaging_s in options.averaging_s or [estimates.AVERAGING_S]:
+        estimates.AVERAGING_S = averaging_s
         rows = _generated(options, options.work) + _recorded(options.work)
         title = f"Filters that take positions as independent, averaging {averaging_s:g} s"
         section = Section(title)

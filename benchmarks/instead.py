@@ -212,7 +212,7 @@ def _encoder(task: Task) -> tuple[Placer, int]:
 
     from orthonav.core.localize.rectify import downsampled, rectify
     from orthonav.core.mapfile import open_map
-    from orthonav.core.tiles.canny import Canny
+    from orthonav.core.tiles.represent import Canny
     from orthonav.research.autoencoder import AutoEncoder
 
     torch.set_num_threads(1)

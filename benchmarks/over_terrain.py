@@ -33,7 +33,7 @@ from orthonav.cli.heights import map_heights
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.build import BuildRequest, build_map

@@ -19,7 +19,7 @@ from orthonav.cli.heights import map_heights
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.ground import Relief
 from orthonav.core.records import CONFIDENT, Fix
 from orthonav.ground.recordings.pixel import locate_pixel
 from orthonav.ground.simulate.perspective import Raster, met, rays_enu

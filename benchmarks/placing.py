@@ -138,7 +138,7 @@ def _method(task: Task) -> Placer:
 
 def _orthonav(task: Task) -> Placer:
     from orthonav.core.localize import Localizer
-    from orthonav.core.localize.plan import DEFAULT_PLAN
+    from orthonav.core.localize.policy import DEFAULT_PLAN
     from orthonav.core.mapfile import open_map
     from orthonav.core.track.tracker import Tracker
 

@@ -78,7 +78,7 @@ def poses(heading_known: bool, yaw_std_deg: float | None) -> list[tuple[float, f
         scale_step=SCALE_STEP,
         sigmas=SIGMAS,
     )
-    return [(math.degrees(turn), math.exp(log_scale)) for turn, log_scale in made.poses]
+    return [(math.degrees(turn), math.exp(log_scale)) for turn, log_scale in made]
 
 
 def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterator[RectifiedView]:

@@ -364,7 +364,7 @@ def _bins_table(found: Sequence[Outcome]) -> Table:
 
 def _picture(found: Sequence[Outcome], path: Path) -> None:
     """Predicted against measured, a point per cell."""
-    from orthonav.ground.report import draw_axes
+    from orthonav.ground.report.drawing import draw_axes
 
     def draw(axes: Any) -> None:
         for group in GROUPS:

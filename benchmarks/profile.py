@@ -16,9 +16,12 @@ from benchmarks.flights import Flight
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace
 from benchmarks.machine import reading_gb_per_s, seconds
 from benchmarks.record import Section, Table, number
-from orthonav.core.localize import Localizer, candidates, plan, registration
+from orthonav.core.localize import Localizer
+from orthonav.core.localize import localizer as fixes
+from orthonav.core.localize import place as places
+from orthonav.core.localize import search as steps
 from orthonav.core.mapfile import open_map
-from orthonav.core.register import refine, registrar
+from orthonav.core.register import refine
 from orthonav.core.register.search import search
 
 FORWARD, BACKWARD = 3, 1
@@ -88,7 +91,7 @@ def _accounts(
 @contextmanager
 def _watched(account: _Account) -> Iterator[_Account]:
     """Clocks around the stages of registration."""
-    locate, refiner = registration.RegistrationLocalizer, refine.Refiner
+    locate, refiner = fixes.RegistrationLocalizer, refine.Refiner
 
     def searched(template: Any, window: Any, poses: Any, *rest: Any) -> Any:
         account.searches.append((template.level, tuple(window.size), len(poses)))
@@ -96,21 +99,22 @@ def _watched(account: _Account) -> Iterator[_Account]:
 
     clocked = [
         (locate, "prepared", lambda *a, **k: "rectify"),
-        (candidates.ViewCandidates, "found", _kind),
-        (registrar.Registrar, "judged", lambda *a, **k: VERIFY),
-        (registrar.Registrar, "finished", lambda *a, **k: VERIFY),
+        (steps.FftStep, "run", _kind),
+        (steps.TileStep, "run", _kind),
+        (places.Placer, "judge", lambda *a, **k: VERIFY),
+        (places.Placer, "finished", lambda *a, **k: VERIFY),
         (refiner, "place", lambda self, *a, **k: f"refine, level {self.template.level}"),
     ]
     with ExitStack() as stack:
         for owner, name, stage in clocked:
             timed = account.around(stage, getattr(owner, name))
             stack.enter_context(patch.object(owner, name, timed))
-        stack.enter_context(patch.object(candidates, "search", searched))
+        stack.enter_context(patch.object(steps, "search", searched))
         yield account
 
 
-def _kind(_: Any, run: plan.Search) -> str:
-    return "search, " + ("tiles" if run.from_tiles else f"level {run.level}")
+def _kind(step: steps.Step) -> str:
+    return "search, " + ("tiles" if step.from_tiles else f"level {step.level}")
 
 
 def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:

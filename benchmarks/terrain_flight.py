@@ -23,7 +23,7 @@ from orthonav.cli.heights import map_heights
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import CONFIDENT, Fix

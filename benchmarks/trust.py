@@ -30,16 +30,16 @@ from benchmarks.trust_pictures import write_worst
 from benchmarks.trust_views import pairs, views_of
 from benchmarks.verdicts import percent
 from orthonav.core.files import write_text
-from orthonav.core.localize.registered import (
+from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,
-    LEAST,
     USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
     features_of,
 )
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.build.fit import LEAST
 from orthonav.ground.evaluate.calibration import calibrate
 
 RIDGE = 1e-5

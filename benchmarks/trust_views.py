@@ -23,7 +23,7 @@ from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.flight.folder import read_image
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
@@ -203,26 +203,27 @@ def _placed(
 ) -> dict[str, Any] | None:
     """Evidence, error and verdict of a view; None where it was refused."""
     prior = None if case.prior_px is None else view.telemetry.prior
-    seen = localizer.register(view, prior, case.heading_known)
-    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
+    search = localizer.search(view, prior, case.heading_known)
+    found = search if isinstance(search, NoFix) else search.run()
+    if isinstance(search, NoFix) or isinstance(found, NoFix):
         return None
-    found, gsd_m = seen.found, localizer.grid.gsd_m
+    gsd_m = localizer.grid.gsd_m
     assert localizer.confidence is not None
-    fix, frame = localizer.fix(seen, found, view.telemetry), localizer.sheet.frame
+    fix, frame = localizer.fix(search, found, view.telemetry), localizer.sheet.frame
     off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
     error_m = float(np.hypot(*off_m))
     far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
     far_m = max(far_m, RADIUS_SHARE * fix.agl_m)
     right = case.kind in ("found", "beside") and error_m <= far_m
     return {
-        "evidence": found.evidence(),
+        "evidence": found.scores,
         "chances": asdict(localizer.confidence.chances),
         "error_px": error_m / gsd_m,
         "nees": float(off_m @ np.linalg.solve(fix.cov_en_m2, off_m)),
         "right": right,
-        "pose": astuple(found.placed.pose),
-        "side_px": seen.prepared.side_px,
-        "confidence": localizer.confidence(found.evidence()),
+        "pose": astuple(found.fit.pose),
+        "side_px": search.view.side_px,
+        "confidence": localizer.confidence(found.scores),
     }
 
 

@@ -40,6 +40,7 @@ from benchmarks.trust_views import Pair, pairs
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import NoFix, Telemetry, View
+from orthonav.core.register.refine import Refiner
 from orthonav.core.register.sharpness import sharpness
 
 GSD_M = 0.9, 2.1
@@ -112,10 +113,9 @@ def _is_shown(flight: FaultFlight, at_s: float, rng: np.random.Generator) -> boo
         return False
     pose = registration.pose_of(prepared, np.array([*place, np.radians(yaw), 0.0]))
     levels = prepared.levels
-    registrar = registration.registrar
-    placed = registrar.refiner(prepared.templates, levels, levels.final).place(pose, 2)
     template = prepared.templates.at(levels.final, levels.recipe(levels.final))
-    found = sharpness(template, registrar.reference, placed.pose)
+    placed = Refiner(template, registration.reference).place(pose, 2)
+    found = sharpness(template, registration.reference, placed.pose)
     return bool(found.ratio >= SHOWN_RATIO)
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import FINE, evidence
-from orthonav.ground.check.persistence import (
+from orthonav.core.register.channels import FINE, channels_of
+from orthonav.ground.check.ageing import (
     MODEL,
     PATCH_PX,
     PersistenceModel,
@@ -78,7 +78,7 @@ def _samples(seed: int) -> tuple[Array, Array]:
                 pictures = [_halved(each) for each in pictures]
             kinds = [features(each, gsd_m * 2**level, PATCH_PX) for each in pictures]
             gradients = [
-                evidence(each, np.ones(each.shape, np.bool_), FINE)[..., :2] for each in pictures
+                channels_of(each, np.ones(each.shape, np.bool_), FINE)[..., :2] for each in pictures
             ]
             for one, other in permutations(range(len(pictures)), 2):
                 patches.append(kinds[one][1:-1, 1:-1].reshape(-1, kinds[one].shape[-1]))

@@ -26,8 +26,12 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
-from orthonav.onboard.messages.correlation import FilterCovariance
-from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, estimate_from_result
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    FilterCovariance,
+    NavigationEstimate,
+    estimate_from_result,
+)
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import locate_view
 

@@ -22,10 +22,10 @@ from benchmarks.record import Section, Table, number
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.aiding import ABSOLUTE, FIX_3D, Aiding
 from orthonav.onboard.messages.estimate import Clock, estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
+from orthonav.onboard.telemetry import ABSOLUTE, FIX_3D, Aiding
 
 RECORDED = DATA / "closed_loop"
 METHODS = ("single", "single, no prior", "track")

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.match import TileMatcher
 from orthonav.core.localize.rectify import downsampled
+from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.mapfile import MapFile
 from orthonav.core.records import View
 from orthonav.core.tiles.position import RULES

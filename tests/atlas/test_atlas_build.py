@@ -44,7 +44,7 @@ RECIPE = AtlasRecipe(**{"gsd_m": 1.0, **SMALL, "coarse": COARSE})
 def fewer_crops(monkeypatch):
     """Calibration from few crops: it takes longest."""
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def built(ortho, tmp_path_factory):
     place = tmp_path_factory.mktemp("built") / "atlas"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
-        patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+        patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
         return place, made(place, ortho)
 
 

@@ -8,8 +8,7 @@ from benchmarks.fusion import RECEIVERS, Fixes, fixes_of, fuse
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
-from orthonav.onboard.messages.correlation import for_filter
-from orthonav.onboard.messages.estimate import NavigationEstimate
+from orthonav.onboard.messages.estimate import NavigationEstimate, for_filter
 
 FRAME = LocalFrame(48.0, 2.0)
 INERTIAL = [each for each in RECEIVERS if each.inertial]

@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.logistic import (
-    FEATURES,
-    USUAL,
+from orthonav.core.localize.confidence import (
+    TILE_FEATURES,
+    USUAL_TILES,
     LogisticConfidence,
-    fit_few,
-    fit_logistic,
 )
-from orthonav.core.localize.ratios import MAX_RATIO, lowe_ratio, peak_ratio, rival_score
+from orthonav.core.localize.tiles import MAX_RATIO, lowe_ratio, peak_ratio, rival_score
+from orthonav.ground.build.fit import fit_few, fit_logistic
 
 
 def scores(*values):
@@ -86,7 +85,7 @@ def synthetic(count, seed):
 
 
 def probabilities(model, features):
-    rows = [dict(zip(FEATURES, row, strict=True)) for row in features]
+    rows = [dict(zip(TILE_FEATURES, row, strict=True)) for row in features]
     return np.array([model(row) for row in rows])
 
 
@@ -146,7 +145,7 @@ def test_separable_and_constant_evidence_give_finite_weights():
     assert said[0] < 0.1 and said[-1] > 0.9
 
 
-@pytest.mark.parametrize("usual", [USUAL, None])
+@pytest.mark.parametrize("usual", [USUAL_TILES, None])
 def test_few_trials_move_the_usual_confidence_and_without_any_nothing_is_confident(usual):
     evidence = {"score": 0.6, "margin": 0.2}
     features, weight = np.tile([0.6, 0.2], (20, 1)), np.ones(20)

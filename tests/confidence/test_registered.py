@@ -9,21 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.registered import (
-    BEFORE_PHASE,
-    BIAS_BEFORE_PHASE,
+from orthonav.core.localize.confidence import (
     CHANCES,
     FEATURES,
-    OLD_FEATURES,
     STAND_IN,
-    USUAL_BIASES,
     USUAL_DETAIL,
     Chances,
     RegisteredConfidence,
     features_of,
-    fit_registered,
 )
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.build.fit import fit_registered
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
 MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)
@@ -143,29 +139,6 @@ def test_plain_round_trip(biases, weights, chances):
     model = RegisteredConfidence(biases, weights, Chances(*chances))
     again = RegisteredConfidence.from_plain(json.loads(json.dumps(model.to_plain())))
     assert again == model and again(evidence()) == model(evidence())
-
-
-def test_an_older_map_has_the_usual_weights_and_its_own_chance():
-    plain = {**PLAIN, "weights": dict.fromkeys(sorted(OLD_FEATURES), 2.0)}
-    plain["chances"] = {"total": 45.0, "look": 15.0, "fine": 60.0}
-    usual = RegisteredConfidence.usual(Chances(45.0, 15.0, 60.0))
-    assert RegisteredConfidence.from_plain(plain) == usual
-    plain["chances"]["total"] = 16.0  # of views of one level
-    assert RegisteredConfidence.from_plain(plain).chances == Chances(32.0, 15.0, 60.0)
-    with pytest.raises(VariantError, match="chances"):
-        RegisteredConfidence.from_plain(without(plain, "chances"))
-    plain["weights"] = dict.fromkeys(sorted(BEFORE_PHASE), 2.0)
-    assert RegisteredConfidence.from_plain(plain).chances == Chances(16.0, 15.0, 60.0)
-
-
-@pytest.mark.parametrize(("shift", "expected"), [(-5.0, -5.0), (2.0, 0.0)])
-def test_an_older_map_stays_as_cautious_as_another_date_made_it(shift, expected):
-    plain = {**PLAIN, "weights": dict.fromkeys(sorted(BEFORE_PHASE), 2.0)}
-    plain["biases"] = [BIAS_BEFORE_PHASE + shift, -1.75]
-    found = RegisteredConfidence.from_plain(plain)
-    assert found.biases[0] == pytest.approx(USUAL_BIASES[0] + expected)
-    with pytest.raises(VariantError):
-        RegisteredConfidence.from_plain({**plain, "biases": [math.nan, 0.0]})
 
 
 def test_a_search_that_was_cut_short_is_not_confident():

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize import checks
-from orthonav.core.localize.checks import check_picture, check_rectified, check_telemetry
+from orthonav.core.localize import view as checks
 from orthonav.core.localize.rectify import RectifiedView
+from orthonav.core.localize.view import check_picture, check_rectified, check_telemetry
 from orthonav.core.records import Telemetry
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)

@@ -7,7 +7,7 @@ import pytest
 from blots import CAMERA, GROUND, as_grey
 
 from orthonav.core.geo.ground import bilinear
-from orthonav.core.localize.orthorectify import (
+from orthonav.core.localize.rectify import (
     Orientation,
     hidden,
     node_px,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.core.localize.propose import peak_poses
+from orthonav.core.localize.tiles import peak_poses
 from orthonav.core.register.search import bank
 
 STEP_RAD, SCALE_STEP = math.radians(8.0), 0.13
@@ -22,7 +22,7 @@ def scores_around(poses, turn_rad, log_scale):
 @pytest.mark.parametrize("turn_deg, log_scale", [(0.0, 0.0), (3.1, -0.05), (-2.5, 0.06)])
 def test_a_pose_lies_between_those_that_were_tried(turn_std_rad, turn_deg, log_scale):
     made = bank(turn_std_rad, 0.1, turn_step_rad=STEP_RAD, scale_step=SCALE_STEP, sigmas=3.0)
-    poses = np.array(made.poses)
+    poses = np.array(made)
     scores = scores_around(poses, math.radians(turn_deg), log_scale)
     found, first = peak_poses(
         poses, np.stack([scores, scores_around(poses, 0.0, 0.0)]), np.ones(len(poses), np.float32)

@@ -15,14 +15,16 @@ from blots import (
     Ground,
     as_grey,
     known_map,
+    planned,
     rendered,
 )
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.candidates import ViewCandidates
-from orthonav.core.localize.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
-from orthonav.core.localize.registered import RegisteredConfidence
+from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.place import Placer
+from orthonav.core.localize.policy import ClearMargin
+from orthonav.core.localize.search import FftStep, Search, TileStep
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
@@ -256,14 +258,13 @@ def test_a_prior_near_the_truth_changes_nothing(localizer, plain, std_m):
 def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, monkeypatch):
     """Memory has a bound: by tiles if views are as large, else not at all."""
     grey, reported, place, free = plain
-    plan = localizer.registration.plan
     rows, cols = localizer.registration.pyramid.shape(0)
-    monkeypatch.setattr(localizer.registration, "plan", replace(plan, max_search_px=40_000))
+    monkeypatch.setattr(localizer.registration, "plan", planned(max_search_px=40_000))
     asked = []
-    whole = localizer.registration.registrar.whole_window
+    whole = localizer.registration.windows.whole
     monkeypatch.setattr(
-        localizer.registration.registrar,
-        "whole_window",
+        localizer.registration.windows,
+        "whole",
         lambda *window: asked.append(window[0]) or whole(*window),
     )
     alone = localizer.locate(View(grey, CAMERA, reported))
@@ -272,7 +273,7 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
     fix = localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, place, 5.0))
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     monkeypatch.setattr(localizer.registration, "propose", None)
-    monkeypatch.setattr(localizer.registration, "plan", replace(plan, max_search_px=100))
+    monkeypatch.setattr(localizer.registration, "plan", planned(max_search_px=100))
     nothing = localizer.locate(View(grey, CAMERA, reported))
     assert nothing.reason == "no_match" and "prior" in nothing.detail
 
@@ -281,14 +282,10 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
 def from_tiles_only(localizer, monkeypatch):
     """The localizer's plan allows no search by FFT; the candidates that it judged."""
     registration = localizer.registration
-    plan = replace(registration.plan, max_search_px=100, tile_candidates=(40, 80))
+    plan = planned(max_search_px=100, tile_candidates=(40, 80))
     monkeypatch.setattr(registration, "plan", plan)
-    judged, seen = registration.registrar.judged, []
-    monkeypatch.setattr(
-        registration.registrar,
-        "judged",
-        lambda *taken: seen.extend(taken[2]) or judged(*taken),
-    )
+    judge, seen = Placer.judge, []
+    monkeypatch.setattr(Placer, "judge", lambda *taken: seen.extend(taken[1]) or judge(*taken))
     return seen
 
 
@@ -308,9 +305,7 @@ def test_candidates_from_tiles_lie_within_the_prior(localizer, plain, from_tiles
     grid = localizer.registration.grid
     x, y = (place + offset - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m]
     most_px = 3 * std_m / grid.gsd_m + 2.0 * 2**3
-    assert all(
-        max(abs(each.pose.x_px - x), abs(each.pose.y_px - y)) <= most_px for each in from_tiles_only
-    )
+    assert all(max(abs(each.x_px - x), abs(each.y_px - y)) <= most_px for each in from_tiles_only)
 
 
 @pytest.mark.parametrize("confidence, further", [(0.995, False), (0.95, True), (0.005, True)])
@@ -320,21 +315,20 @@ def test_the_search_ends_with_tiles_only_where_the_place_is_confident(
     grey, reported, place, _ = plain
     registration = localizer.registration
     levels = registration.prepared(View(grey, CAMERA, reported), True).levels
-    searches = [
-        Search(levels.coarse, [(math.radians(33.0), 0.0)], True, 20, 1.0),
-        Search(levels.look, [(math.radians(33.0), 0.0)], False, 8, 1.0),
-    ]
-    plan = replace(registration.plan, clear_at_judged=ClearMargin(0.5, 1.0, 1.0))
-    monkeypatch.setattr(SearchPlan, "searches", lambda *_: iter(searches))
+    directions, asked = [(math.radians(33.0), 0.0)], []
+
+    def steps(search):
+        for made, level, count in ((TileStep, levels.coarse, 20), (FftStep, levels.judged, 8)):
+            asked.append(level)
+            yield made(search, level, directions, count, 1)
+
+    plan = planned(clear_at_judged=ClearMargin(0.5, 1.0, 1.0))
+    monkeypatch.setattr(Search, "steps", steps)
     monkeypatch.setattr(registration, "plan", plan)
     monkeypatch.setattr(RegisteredConfidence, "__call__", lambda *_: confidence)
-    asked, found = [], ViewCandidates.found
-    monkeypatch.setattr(
-        ViewCandidates, "found", lambda self, run: asked.append(run.level) or found(self, run)
-    )
     fix = localizer.locate(View(grey, CAMERA, reported))
     assert error_m(localizer, fix, place) < 0.5
-    assert asked == [levels.coarse, levels.look][: 1 + further]
+    assert asked == [levels.coarse, levels.judged][: 1 + further]
 
 
 def test_a_fix_lies_near_its_prior(localizer, plain):
@@ -450,7 +444,7 @@ def test_the_same_view_gives_the_same_fix(localizer, map_path, plain):
 
 
 def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
-    threaded = Localizer(open_map(map_path), plan=replace(DEFAULT_PLAN, threads=3))
+    threaded = Localizer(open_map(map_path), plan=planned(threads=3))
     view = View(plain[0], CAMERA, plain[1])
     assert same(*(each.locate(view, heading_known=False) for each in (localizer, threaded)))
 
@@ -458,7 +452,7 @@ def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
 def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
     """One that ends before the first search does, so that only this one is made. No margin is
     enough to end the search here, and such a place is not confident."""
-    doubting = replace(DEFAULT_PLAN, clear=NEVER_CLEAR, clear_at_judged=NEVER_CLEAR)
+    doubting = planned(clear=NEVER_CLEAR, clear_at_judged=NEVER_CLEAR)
     view = View(plain[0], CAMERA, plain[1])
     whole, fix = (
         Localizer(open_map(map_path), plan=plan).locate(view)

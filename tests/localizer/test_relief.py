@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
+from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, planned, rendered
 
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.plan import DEFAULT_PLAN
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
@@ -202,14 +201,6 @@ def test_level_ground_is_as_without_a_terrain(opened):
     assert {**fix.evidence} == pytest.approx(evidence, rel=1e-3, abs=1e-3, nan_ok=True)
 
 
-def test_candidates_on_maps_without_a_terrain_are_placed_once(opened, monkeypatch):
-    """Up to 45 deg off nadir."""
-    monkeypatch.delattr("orthonav.core.localize.registration.ViewOverRelief")
-    picture = rendered(GROUND, np.zeros(2), (30.0, 44.0, 0.0))
-    fix = Localizer(opened).locate(View(picture, CAMERA, telemetry((30.0, 44.0, 0.0))))
-    assert "terrain_gain" not in fix.evidence
-
-
 def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
     attitude = (70.0, 60.0, 0.0)
     place = np.array([-60.0, -120.0])
@@ -221,7 +212,7 @@ def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
 
 def looking(opened, relief, **changes):
     """A localizer to which every further search is dear."""
-    plan = replace(DEFAULT_PLAN, **{"cheap_ms": 0.0, "terrain_trial_ms": 0.0} | changes)
+    plan = planned(**{"cheap_ms": 0.0, "terrain_trial_ms": 0.0} | changes)
     localizer = Localizer(opened, plan=plan)
     localizer.registration.relief = Relief(Terrain(relief), localizer.grid)
     return localizer

@@ -161,13 +161,13 @@ def test_the_search_stays_around_a_reported_start_unless_it_is_as_wide_as_the_ma
     localizer, monkeypatch, std_m, whole
 ):
     tracker, priors = Tracker(localizer), []
-    register = localizer.registration.register
+    search = localizer.registration.search
 
     def noted(view, prior=None, *others, **named):
         priors.append(prior)
-        return register(view, prior, *others, **named)
+        return search(view, prior, *others, **named)
 
-    monkeypatch.setattr(localizer.registration, "register", noted)
+    monkeypatch.setattr(localizer.registration, "search", noted)
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array([-150.0, -120.0]))
     prior = Prior(float(lat), float(lon), std_m)
     rows = []
@@ -381,8 +381,8 @@ def test_the_pose_of_a_camera_is_the_inverse(localizer):
     registration = localizer.registration
     telemetry = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
     grey = rendered(GROUND, (20.0, -35.0), (33.0, 4.0, -7.0), AGL_M, WIDE)
-    view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
-    pose = registration.best(view, None).placed.pose
+    search = registration.search(View(grey, WIDE, telemetry))
+    view, pose = search.view, search.run().pose
     place = registration.camera_en_m(view, pose)
     again = registration.pose_of(view, np.array([*place, pose.turn_rad, pose.log_scale]))
     assert again.x_px == pytest.approx(pose.x_px) and again.y_px == pytest.approx(pose.y_px)
@@ -535,7 +535,6 @@ def test_exact_dead_reckoning_of_a_confirmed_track_is_confirmed_around_it(
     covariance = np.eye(STATE) * std_m**2
     expected = Estimate(np.zeros(STATE), covariance, 0.7, state, 0.5, 0.0, False, followed=True)
     tracker = Tracker(localizer)
-    areas = [tracker._search_area(expected) for _ in range(2)]
-    whole, around = areas
-    assert whole == (None, None, True)
-    assert around[0] is not None and around[2] is confirms
+    whole, around = (tracker._search_area(expected, whole_map=each) for each in (True, False))
+    assert whole == (None, True)
+    assert around.circle is not None and around.confirms is confirms

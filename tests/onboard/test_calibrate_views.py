@@ -10,7 +10,7 @@ import pytest
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
-from orthonav.onboard.calibrate_views import (
+from orthonav.ground.recordings.calibrate_mount import (
     RecordedSingleViews,
     calibrate_mount_by_views,
     robust_mean,

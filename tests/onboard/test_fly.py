@@ -20,6 +20,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 import pytest
+from benchmarks.fakes import answers
 from blots import AGL_M, GROUND, known_map, rendered
 from fake_autopilot import (
     MS,
@@ -45,14 +46,13 @@ from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
+from orthonav.onboard.console import Inputs, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.narrator import Inputs, Narrator
-from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger, Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode
 
@@ -147,9 +147,9 @@ class Flight:
         """The autopilot sends telemetry and answers TIMESYNC."""
         now = self.time.now_ns + AHEAD_NS
         asked = self.port.sent("TIMESYNC") if not self.port.broken else []
-        answers = self.autopilot.answers(asked, self.time.now_ns, AHEAD_NS)
+        answered = answers(self.autopilot, asked, self.time.now_ns, AHEAD_NS)
         attitude = self.autopilot.attitude(now, yaw_deg=self.yaw_deg)
-        self.hear(self.autopilot.home(now, self.agl_m), attitude, *answers)
+        self.hear(self.autopilot.home(now, self.agl_m), attitude, *answered)
 
     def view(self, grey=None, age_s=0.05, wait_s=0.1):
         """Process one more view; its result."""

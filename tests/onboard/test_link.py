@@ -12,9 +12,9 @@ from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
 from orthonav.core.errors import MissingExtraError, VariantError
 from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
-from orthonav.onboard.messages.local import Autopilot as Kind
-from orthonav.onboard.messages.local import Origin
 from orthonav.onboard.messages.mavlink import Signing, Target, dialect, signing_timestamp
+from orthonav.onboard.messages.mavlink_local import Autopilot as Kind
+from orthonav.onboard.messages.mavlink_local import Origin
 from orthonav.onboard.ports import Descriptor, Udp, open_serial, transport_opener
 from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode

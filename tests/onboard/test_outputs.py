@@ -17,11 +17,15 @@ from fake_autopilot import UTC_NS, S, Time, fix
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.records import NoFix, ViewResult
-from orthonav.onboard.messages.correlation import messages_averaged
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    EstimateError,
+    NavigationEstimate,
+    messages_averaged,
+)
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.local import Autopilot, Origin, north_east_m
 from orthonav.onboard.messages.mavlink import Packer, Target
+from orthonav.onboard.messages.mavlink_local import Autopilot, Origin, north_east_m
 from orthonav.onboard.messages.nmea import Quality
 from orthonav.onboard.outputs import (
     KINDS,
@@ -255,7 +259,7 @@ def test_nmea_over_udp():
 def test_nmea_over_tcp_to_all_clients_that_read():
     sink = open_sink("tcp-listen:0")
     assert isinstance(sink, TcpSink) and sink._listening.getsockname()[0] == "127.0.0.1"
-    out = NmeaOut(sink, talker="GN", quality=Quality.AUTONOMOUS)
+    out = NmeaOut(sink, quality=Quality.AUTONOMOUS)
     clients = [socket.create_connection(("127.0.0.1", sink.port)) for _ in range(2)]
     out.write(ESTIMATE, UTC_NS, 0.9)
     for client in clients:

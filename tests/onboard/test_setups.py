@@ -10,10 +10,10 @@ from orthonav.cli.setups import setup_text
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.headings import seem_radians
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
-from orthonav.onboard.setups import (
+from orthonav.ground.recordings.setups import (
     SAMPLE,
     LowConfidenceViews,
     Setup,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.cli.flying_gnss import _learnt_before
+from orthonav.cli.flying import _learnt_before
 from orthonav.onboard import state
 from orthonav.onboard.gnss.biases import unknown
 from orthonav.onboard.gnss.learner import Resumed

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from orthonav.core.flight.telemetry_track import RecordedTrack, Samples, attitude_of_angles
 from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.onboard import telemetry
 from orthonav.onboard.telemetry import (
-    BufferLimits,
     ClockSync,
     TelemetryBuffer,
     VehicleState,
@@ -67,7 +67,7 @@ def test_telemetry_equals_that_of_an_imported_log(angles, mount):
 @pytest.mark.parametrize("every_ms, known", [(20, True), (50, True), (100, False)])
 def test_dense_attitudes_are_extrapolated_a_little(every_ms, known):
     """A view need not wait for the next one; it turns on as it turned."""
-    buffer = TelemetryBuffer(BufferLimits(attitude_ahead_s=0.03))
+    buffer = TelemetryBuffer()
     for number in range(5):
         attitude(buffer, number * every_ms * MS, yaw_deg=number * every_ms * 0.1)
     last_ns = 4 * every_ms * MS
@@ -87,8 +87,7 @@ def test_single_attitudes_are_not_extrapolated():
 
 
 def test_gaps_are_not_interpolated():
-    limits = BufferLimits(attitude_gap_s=0.5, attitude_hold_s=0.1, slow_gap_s=2.0, slow_hold_s=1.5)
-    buffer = TelemetryBuffer(limits)
+    buffer = TelemetryBuffer()
     assert buffer.at(0).ned_from_body is None and buffer.covered_ns is None
     attitude(buffer, 1 * S)
     attitude(buffer, 2 * S)
@@ -147,8 +146,9 @@ def circling(time_ns):
     return 20 * math.cos(angle), 20 * math.sin(angle), 0.0
 
 
-def test_the_displacement_follows_turns_for_longer_than_samples_are_kept():
-    buffer = TelemetryBuffer(BufferLimits(keep_s=2.0))
+def test_the_displacement_follows_turns_for_longer_than_samples_are_kept(monkeypatch):
+    monkeypatch.setattr(telemetry, "KEEP_S", 2.0)
+    buffer = TelemetryBuffer()
     buffer.add_local(0, circling(0), 0.0)
     first = buffer.at(0).travelled
     for time_ns in range(40 * MS, 50 * S + 1, 40 * MS):
@@ -174,7 +174,7 @@ def test_the_displacement_is_not_known_across_gaps_and_restarts():
     buffer = TelemetryBuffer()
     buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
     first = buffer.at(0).travelled
-    later = round(BufferLimits().slow_gap_s * S) + 1
+    later = round(telemetry.SLOW_GAP_S * S) + 1
     buffer.add_local(later, (10.0, 0.0, 0.0), 0.0)
     second = buffer.at(later).travelled
     assert second.since(first) is None and second.since(None) is None
@@ -197,12 +197,13 @@ def test_an_invalid_attitude_is_dropped(wxyz):
     assert buffer.covered_ns is None
 
 
-def test_samples_out_of_order_and_old_ones_are_dropped():
-    buffer = TelemetryBuffer(BufferLimits(keep_s=1.0))
+def test_samples_out_of_order_and_old_ones_are_dropped(monkeypatch):
+    monkeypatch.setattr(telemetry, "KEEP_S", 1.0)
+    buffer = TelemetryBuffer()
     for number in range(1000):
         attitude(buffer, number * 10 * MS, yaw_deg=10.0)
     attitude(buffer, 5 * S, yaw_deg=90.0)
-    assert buffer.covered_ns == 9990 * MS + round(BufferLimits().attitude_ahead_s * S)
+    assert buffer.covered_ns == 9990 * MS + round(telemetry.ATTITUDE_AHEAD_S * S)
     assert buffer.at(5 * S).ned_from_body is None
     assert buffer.at(9500 * MS).telemetry(0).yaw_deg == pytest.approx(10.0)
     assert len(buffer._attitude.times) <= 201

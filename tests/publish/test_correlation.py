@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import MAP_STD_M
-from orthonav.onboard.messages.correlation import (
+from orthonav.onboard.messages.estimate import (
     AT_STD_M,
     AVERAGING_S,
     FilterCovariance,
+    NavigationEstimate,
     for_filter,
     messages_averaged,
 )
-from orthonav.onboard.messages.estimate import NavigationEstimate
 
 S = 10**9
 COV = np.array([[25.0, 6.0], [6.0, 16.0]])

@@ -18,7 +18,7 @@ from orthonav.onboard.messages.estimate import (
     ellipse_95,
     estimate_from_result,
 )
-from orthonav.onboard.messages.gpstime import gps_time
+from orthonav.onboard.messages.mavlink import gps_time
 
 COV = np.array([[16.0, 3.0], [3.0, 9.0]])
 PLAIN = NavigationEstimate(48.0, -4.0, COV, 0.95, utc_ns=1_789_000_000_000_000_000)

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from orthonav.core.errors import MissingExtraError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
-from orthonav.onboard.messages.local import Autopilot, Origin, north_east_m
 from orthonav.onboard.messages.mavlink import (
     Packer,
     Signing,
@@ -32,7 +31,10 @@ from orthonav.onboard.messages.mavlink import (
     status_texts,
 )
 from orthonav.onboard.messages.mavlink_local import (
+    Autopilot,
     LocalPose,
+    Origin,
+    north_east_m,
     odometry,
     set_gps_global_origin,
     vision_position_estimate,

@@ -10,13 +10,12 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.register import blocks, refine, search, sharpness, template
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.map_window import MapWindow
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
-from orthonav.core.register.scale_map import ScaleMap
 from orthonav.core.register.search import SearchWindow, bank, best_near
+from orthonav.core.register.window import MapWindow
 
 SHAPE = (256, 320)
 GROUND = Ground()
@@ -267,7 +266,7 @@ SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_a_search_finds_the_same_scores_and_poses(reference, monkeypatch, size, with_scales):
     made, _ = next(views(1, 7, 1))
-    poses = bank(None, 0.1, turn_step_rad=0.6, scale_step=0.13, sigmas=2).poses
+    poses = bank(None, 0.1, turn_step_rad=0.6, scale_step=0.13, sigmas=2)
     np.random.default_rng(3).shuffle(poses)  # smaller ones after larger ones
     values = np.random.default_rng(2).uniform(-0.3, 0.3, (9, 11)).astype(np.float32)
     scales = ScaleMap(values, 40.0, 0.05) if with_scales else None

@@ -2,7 +2,7 @@
 
 import threading
 
-from orthonav.core.register.memory import thread_memory
+from orthonav.core.register.window import thread_memory
 
 
 def test_the_same_memory_comes_back():

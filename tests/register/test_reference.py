@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scenes import Sheet
 
 from helpers import textured
-from orthonav.core.register import reference as module
-from orthonav.core.register.evidence import COARSE, FINE, evidence
-from orthonav.core.register.reference import Reference
+from orthonav.core.register import window as module
+from orthonav.core.register.channels import COARSE, FINE, channels_of
+from orthonav.core.register.window import Reference
 
 SHAPE = (160, 232)
 
@@ -65,7 +65,7 @@ def test_a_level_is_the_evidence_of_its_picture(whole):
     for level in range(whole.levels):
         for recipe in (FINE, COARSE):
             picture = whole.pyramid.read(level, 0, 0, *whole.shape(level))
-            np.testing.assert_array_equal(whole.whole(level, recipe), evidence(*picture, recipe))
+            np.testing.assert_array_equal(whole.whole(level, recipe), channels_of(*picture, recipe))
 
 
 def test_a_level_is_made_once_and_cannot_be_changed(whole):

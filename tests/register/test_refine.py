@@ -20,11 +20,11 @@ from scenes import (
     turned_rad,
 )
 
-from orthonav.core.register.evidence import COARSE, FINE
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
-from orthonav.core.register.refine import STEPS, Placed, Refiner
+from orthonav.core.register.refine import STEPS, Refiner
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import Reference
 
 SHAPE = (384, 448)
 VIEW = (96, 128)
@@ -203,7 +203,7 @@ def test_the_same_again_and_inputs_untouched(reference):
 
 
 def test_windows_made_alone_give_the_same(reference, monkeypatch):
-    monkeypatch.setattr("orthonav.core.register.reference.WHOLE_LEVEL_PX", 0)
+    monkeypatch.setattr("orthonav.core.register.window.WHOLE_LEVEL_PX", 0)
     piecewise = reference_of(GROUND, SHAPE)
     for pose in random_poses(5, SHAPE, 60, seed=6):
         template = templates_of(GROUND, pose).at(0)
@@ -303,13 +303,6 @@ def test_half_of_a_view_that_changed_disagrees(reference):
     view = ViewTemplates(as_grey(values), np.ones(VIEW, bool), 0)
     placed = Refiner(view.at(0), reference).place(pose, with_covariance=True)
     assert apart_px(placed.pose, pose) < 0.3 and 0.6 < placed.agreement < 0.95
-
-
-def test_a_proposed_pose_is_not_judged():
-    pose = Pose(1.0, 2.0, 0.3, 0.0)
-    placed = Placed.unjudged(pose, 2)
-    assert placed.pose == pose and placed.level == 2 and not placed.converged
-    assert math.isnan(placed.score) and placed.covariance is None
 
 
 def many_placed(reference, level, count, seed, **view):

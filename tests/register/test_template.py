@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from scenes import Ground, as_grey, reference_of, seen, templates_of
 
-from orthonav.core.register.evidence import COARSE, FINE, GROUPS, evidence
+from orthonav.core.register.channels import COARSE, FINE, GROUPS, channels_of
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import posed_channels, posed_half_px
 from orthonav.core.register.template import (
     BLOCKS,
+    JUDGED_PX,
+    Levels,
     Template,
     ViewTemplates,
     energy_of,
@@ -111,15 +113,15 @@ def test_what_blocks_add_up_to_is_the_whole(shape):
 def test_planes_turn_with_their_picture(quarters):
     """Clockwise: `rot90` turns a picture counter-clockwise, y being to the south."""
     grey = as_grey(seen(GROUND, PLACE, (60, 80)))
-    plain = evidence(grey, np.ones(grey.shape, bool))
+    plain = channels_of(grey, np.ones(grey.shape, bool))
     picture = np.ascontiguousarray(np.rot90(grey, -quarters))
-    turned = evidence(picture, np.ones(picture.shape, bool))
+    turned = channels_of(picture, np.ones(picture.shape, bool))
     planes = turned_planes(np.ascontiguousarray(np.rot90(plain, -quarters)), quarters * math.pi / 2)
     np.testing.assert_allclose(np.moveaxis(planes, 0, -1), turned, atol=2e-3)
 
 
 def test_planes_turned_back_are_the_same():
-    made = evidence(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
+    made = channels_of(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
     kept = made.copy()
     there = turned_planes(made, 0.7)
     np.testing.assert_allclose(
@@ -211,3 +213,27 @@ def test_masks_do_not_shift_what_is_seen():
     inner = cv2.erode(ragged().astype(np.uint8), np.ones((9, 9))) > 0
     for group in GROUPS:
         assert alike(whole.channels[group][:, inner], cut.channels[group][:, inner]) > 0.97
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3, 7, 12])
+def test_levels_of_any_view(levels):
+    judged = []
+    for view_px in (1e-9, 0.5, 1.0, 20.0, 72.0, 110.0, 300.0, 1000.0, 3e4, 1e9):
+        made = Levels.of(view_px, levels)
+        assert 0 <= made.final <= made.judged <= made.coarse <= levels - 1
+        assert made.coarse - made.judged <= 1 and made.judged - made.final <= 1
+        if 0 < made.judged < levels - 1:
+            assert JUDGED_PX / 1.5 < view_px / 2**made.judged < JUDGED_PX * 1.5
+        judged.append(made.judged)
+        for level in range(levels):
+            assert made.recipe(level) == (COARSE if level > made.judged else FINE)
+    assert judged == sorted(judged) and judged[0] == 0 and judged[-1] == levels - 1
+
+
+def test_the_side_of_a_view_is_the_root_of_what_is_seen():
+    valid = np.zeros((96, 128), bool)
+    valid[:, :48] = True
+    grey = as_grey(seen(GROUND, Pose(100.0, 100.0, 0.0, 0.0), (96, 128)))
+    views = ViewTemplates(np.where(valid, grey, 0), valid, 2)
+    # The border of what is seen does not count: two pixels.
+    assert views.side_px == pytest.approx(4 * math.sqrt(96 * 46), rel=0.01)

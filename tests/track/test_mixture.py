@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize.confidence import within
 from orthonav.core.track import (
     CameraDisplacement,
     Mixture,
@@ -18,7 +19,6 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
-from orthonav.core.track.hypotheses import within
 from orthonav.core.track.model import SEEN, STATE, WHITE_SHARE
 from orthonav.core.track.smooth import History
 

@@ -78,7 +78,7 @@ def _add_camera(group: argparse._ActionsContainer) -> None:
         "--camera-latency-ms",
         metavar="MS|FILE",
         help="live cameras: time from exposure to arrival, or the file of `orthonav calibrate "
-        "--latency`; without it nothing is sent until it has been measured in flight",
+        "--latency`; without it nothing is sent",
     )
     group.add_argument(
         "--mount-deg",
@@ -111,13 +111,6 @@ def _add_recording(group: argparse._ActionsContainer) -> None:
         help="playback speed (default 1: real time)",
     )
     group.add_argument(
-        "--rate-hz",
-        type=float,
-        metavar="HZ",
-        help="views per second taken from a recording (default: every frame of a video, 2 for a "
-        "folder of images)",
-    )
-    group.add_argument(
         "--file-clock",
         choices=("own", "autopilot"),
         default="own",
@@ -138,13 +131,6 @@ def _add_autopilot(group: argparse._ActionsContainer) -> None:
         type=int,
         metavar="N",
         help="system id of the autopilot (default: the first one heard)",
-    )
-    group.add_argument(
-        "--component-id",
-        type=int,
-        default=197,
-        metavar="N",
-        help="component id of orthonav (default 197)",
     )
     group.add_argument(
         "--signing-key",

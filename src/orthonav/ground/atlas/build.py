@@ -37,7 +37,7 @@ from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.block_cache import digest
 from orthonav.ground.build.build import BuildRequest, build_map
-from orthonav.ground.build.layout import grid_of, rounded_gsd_m
+from orthonav.ground.build.sheet import grid_of, rounded_gsd_m
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area

@@ -35,8 +35,12 @@ from orthonav.core.errors import (
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.core.localize.logistic import LogisticConfidence
-from orthonav.core.localize.registered import CHANCES, Chances, RegisteredConfidence
+from orthonav.core.localize.confidence import (
+    CHANCES,
+    Chances,
+    LogisticConfidence,
+    RegisteredConfidence,
+)
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile, open_map
@@ -50,19 +54,21 @@ from orthonav.core.variants import variant_from_recipe
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.warp import SheetSource, Warp, joined_cells, joined_grey, outline
-from orthonav.ground.build.blocks import Block, Preview
-from orthonav.ground.build.build import BuildResult
+from orthonav.ground.build.build import MAX_WORKERS, BuildResult
 from orthonav.ground.build.cellparts import StoredCells
 from orthonav.ground.build.layer import GreyLayerWriter, Parts
-from orthonav.ground.build.layout import MIN_TILE_VALID_SHARE, grid_of, tiles_of
-from orthonav.ground.build.parallel import in_order
-from orthonav.ground.build.request import MAX_WORKERS
 from orthonav.ground.build.sheet import (
+    MIN_TILE_VALID_SHARE,
     PREVIEW_PX,
+    Block,
+    Preview,
     blocks_of_area,
+    grid_of,
+    in_order,
     layer_parts,
     one_opencv_thread,
     put_layer_parts,
+    tiles_of,
 )
 from orthonav.ground.build.terrain import TerrainParts, terrain_parts
 from orthonav.ground.planning.area import Area, Extent

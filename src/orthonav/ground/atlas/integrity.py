@@ -29,7 +29,7 @@ from orthonav.ground.atlas.item import (
     split_name,
 )
 from orthonav.ground.atlas.store import Store, digest_of
-from orthonav.ground.build.methods import usual_edges
+from orthonav.ground.build.encoders import usual_edges
 
 MIN_AGE_S = 24 * 3600.0
 """Younger files may belong to a running build, which writes the files of a sheet before its item:

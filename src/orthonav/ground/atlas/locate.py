@@ -19,10 +19,9 @@ import numpy as np
 from orthonav.core.errors import AreaError, AtlasError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.checks import MIN_VIEW_PX, check_footprint, check_view
-from orthonav.core.localize.prepared import pose_prior
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.core.localize.registered import USUAL_CONFIDENCE
+from orthonav.core.localize.view import MIN_VIEW_PX, check_footprint, check_view, pose_prior
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track import Model, State
 from orthonav.core.track.mixture import MOST_SIGHTED

@@ -20,23 +20,21 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.candidates import ViewCandidates
-from orthonav.core.localize.logistic import logit
-from orthonav.core.localize.plan import DEFAULT_PLAN
-from orthonav.core.localize.prepared import PreparedView, prepare
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE, RegisteredConfidence, logit
+from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.place import HOPE, MIN_HOPEFUL, Place
+from orthonav.core.localize.policy import DEFAULT_PLAN
 from orthonav.core.localize.rectify import RectifiedView
-from orthonav.core.localize.registered import USUAL_CONFIDENCE, RegisteredConfidence
-from orthonav.core.localize.registration import RegistrationLocalizer
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.search import Search
+from orthonav.core.localize.view import PreparedView, prepare
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, View
-from orthonav.core.register.evidence import COARSE, FINE
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import GreyPyramid
-from orthonav.core.register.refine import Placed
-from orthonav.core.register.registrar import HOPE, MIN_HOPEFUL, Registered
-from orthonav.core.register.search import Candidate
+from orthonav.core.register.search import Peak
+from orthonav.core.register.window import GreyPyramid
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_poses
 from orthonav.core.variants import make_variant
@@ -270,12 +268,12 @@ class ViewRegistrar:
         pose_prior = replace(view.prior, turn_rad=region.turn_rad, turn_std_rad=region.turn_std_rad)
         view = replace(view, prior=pose_prior)
         prior = Prior(*region.latlon_deg, region.reach_m / PRIOR_SIGMAS)
-        whole = ViewCandidates(view, prior, sheet.sheet, sheet.registrar, None, sheet.plan, None)
+        whole = Search(sheet, view, prior)
         if not whole.touches_map:
             return None
         half_diagonal_px = math.hypot(*view.templates.valid.shape) / 2 * 2**view.levels.final
         margin_px = max(
-            FINE.margin_px * 2**view.levels.look, COARSE.margin_px * 2**view.levels.coarse
+            FINE.margin_px * 2**view.levels.judged, COARSE.margin_px * 2**view.levels.coarse
         )
         around_px = whole.reach_px + WIDEST * half_diagonal_px + margin_px
         part = part_of(sheet, whole.middle_px, around_px)
@@ -327,22 +325,26 @@ class JudgedRegion:
     prior: Prior
 
     @functools.cached_property
-    def judged(self) -> list[Placed]:
+    def search(self) -> Search:
+        """The search for the view in the region."""
+        return Search(self.sheet, self.view, self.prior)
+
+    @functools.cached_property
+    def judged(self) -> list[Place]:
         """Places near the middle of the region, under headings and scales around its own, at the
         level where views are judged, best first."""
-        view, region, registrar = self.view, self.region, self.sheet.registrar
+        view, region, search = self.view, self.region, self.search
         east, north = self.sheet.sheet.frame.en_from_latlon(*region.latlon_deg)
         turns = (region.turn_rad + sign * region.turn_std_rad for sign in (-1, 0, 1))
         seen_from = (np.array([east, north, turn, region.log_scale]) for turn in turns)
-        poses = [Candidate(0.0, self.sheet.pose_of(view, each)) for each in seen_from]
-        reach_px, scales = region.reach_m / self.sheet.grid.gsd_m, self.sheet.plan.nearby_log_scales
-        near = registrar.nearby(view.templates, view.levels, poses, reach_px, scales)
-        return registrar.judged(view.templates, view.levels, near, view.levels.coarse, view.prior)
+        poses = [Peak(0.0, self.sheet.pose_of(view, each)) for each in seen_from]
+        near = search.nearby(poses, region.reach_m / self.sheet.grid.gsd_m)
+        return search.placer.judge([each.pose for each in near], view.levels.coarse)
 
     @property
     def look(self) -> float:
         """Score of the best of them, less the cost of its prior."""
-        return self.judged[0].score - self.view.prior.cost(self.judged[0].pose)
+        return self.search.placer.standing(self.judged)[0]
 
     @property
     def latlon_deg(self) -> tuple[float, float]:
@@ -351,34 +353,30 @@ class JudgedRegion:
 
     def finished(self) -> SheetMatch:
         """The match at the best of them."""
-        view, ground = self.view, self.sheet.on_ground(self.view)
-        placed = ground.placed_on_terrain(self.judged, 1)
-        found = self.sheet.registrar.finished(
-            view.templates, view.levels, placed, view.prior, len(placed), finish=ground.finish
-        )
-        return self._match(ground.by_camera(found))
+        placer = self.search.placer
+        places = placer.on_terrain(self.judged, 1)
+        return self._match(placer.below_camera(placer.finished(places, len(places))))
 
     def searched(self) -> SheetMatch | None:
         """The best match in all of the region; this takes ten times as long."""
-        ground = self.sheet.on_ground(self.view)
-        found = self.sheet.best(self.view, self.prior, ground)
-        return None if found is None else self._match(ground.by_camera(found))
+        found = self.search.best()
+        return None if found is None else self._match(self.search.placer.below_camera(found))
 
     def _latlon_deg(self, pose: Pose) -> tuple[float, float]:
         camera_en_m = self.sheet.camera_en_m(self.view, pose)
         lat, lon = self.sheet.sheet.frame.latlon_from_en(camera_en_m)
         return float(lat), float(lon)
 
-    def _match(self, found: Registered) -> SheetMatch:
-        pose = found.placed.pose
+    def _match(self, found: Place) -> SheetMatch:
+        pose = found.pose
         place = *self._latlon_deg(pose), pose.turn_rad, pose.log_scale
-        return SheetMatch(*place, found.evidence(), self.sheet.confidence)
+        return SheetMatch(*place, found.scores, self.sheet.confidence)
 
 
 SEARCHED = 4
 """At most so many candidates are searched: the right one and the best rivals are among them
 (docs/decisions/atlas.md)."""
-PROVEN = logit(1 - DEFAULT_PLAN.trial_doubt, 0.0)
+PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""
 RIVAL_SHARE = 0.25

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.logistic import fit_weights
+from orthonav.ground.build.fit import fit_weights
 from orthonav.ground.check.recalibrate import PLAIN, expit, logit
 from orthonav.ground.check.trials import Trial
 

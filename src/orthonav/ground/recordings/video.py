@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.flight.telemetry_track import RecordedTrack
-from orthonav.ground.recordings.logs import log_kind, read_log
+from orthonav.ground.recordings.logs import end_ns, log_kind, read_log
 from orthonav.ground.recordings.recording import (
     Recording,
+    SourceOptions,
     SourceView,
     check_overlap,
     given_camera,
@@ -28,7 +28,6 @@ from orthonav.ground.recordings.recording import (
     warnings_of,
     with_mean_velocities,
 )
-from orthonav.ground.recordings.subtitles import end_ns
 
 SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
 _SHORT_NS = 1_000_000_000
