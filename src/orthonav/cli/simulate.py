@@ -127,16 +127,17 @@ def add(parser: argparse.ArgumentParser) -> None:
 def _add_errors(parser: argparse.ArgumentParser) -> None:
     """Options for the fields of `Errors`."""
 
-    def option(flag: str, text: str, default: float | None = 0.0, **more: str) -> None:
-        group.add_argument(flag, type=float, default=default, help=text, **more)  # type: ignore[arg-type]
+    def option(
+        flag: str, text: str, default: float | None = 0.0, metavar: str | None = None
+    ) -> None:
+        group.add_argument(flag, type=float, default=default, help=text, metavar=metavar)
 
-    fraction = {"metavar": "FRACTION"}
     group = parser.add_argument_group("telemetry noise")
     option("--yaw-std-deg", "standard deviation of the reported heading (default 0)")
     option(
         "--agl-std",
         "standard deviation of the reported height, as a fraction of it (default 0)",
-        **fraction,
+        metavar="FRACTION",
     )
     option(
         "--tilt-std-deg",
@@ -154,7 +155,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         "standard deviation of the scale error (a fraction) and the direction error (rad) of the "
         "reported velocity (default: no velocity is reported)",
         None,
-        **fraction,
+        metavar="FRACTION",
     )
     group = parser.add_argument_group("unreported tilt")
     option(
@@ -174,7 +175,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     option(
         "--agl-bias",
         "reported height minus true height, as a fraction of it: 0.05 is 5 %%",
-        **fraction,
+        metavar="FRACTION",
     )
     added = "to which --mount-std-deg adds"
     option("--pitch-bias-deg", f"unreported pitch of the camera mount, {added}")

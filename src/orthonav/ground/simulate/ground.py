@@ -19,6 +19,16 @@ from orthonav.ground.simulate.perspective import Raster, coloured, met, rays_enu
 
 COVERAGE_PX = 1024
 """Size of the coverage mask; bounds its memory for any imagery."""
+MAX_NODES = 4000
+"""Heights along a side of the area, at most; bounds their memory."""
+READ_ROWS = 64
+FARTHEST = 12.0
+"""Ground farther away than so many heights above it is not rendered: it is sky."""
+NEAR = 3.0
+"""Ground nearer than so many heights must be covered by imagery."""
+MANY_PX = 500_000
+"""Of larger pictures every second ray is followed."""
+BORDER = 9
 Array = NDArray[np.float64]
 
 
@@ -130,19 +140,6 @@ def reflected(index: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64
     size = high - low
     folded = (index - low) % (2 * size)
     return np.asarray(low + np.minimum(folded, 2 * size - 1 - folded))
-
-
-MAX_NODES = 4000
-"""Heights along a side of the area, at most; bounds their memory."""
-READ_ROWS = 64
-FARTHEST = 12.0
-"""Ground farther away than so many heights above it is not rendered: it is sky."""
-NEAR = 3.0
-"""Ground nearer than so many heights must be covered by imagery."""
-MANY_PX = 500_000
-"""Of larger pictures every second ray is followed."""
-BORDER = 9
-Array = NDArray[np.float64]
 
 
 def ground_below_m(terrain: TerrainHeights, frame: LocalFrame, places_en_m: Array) -> Array:

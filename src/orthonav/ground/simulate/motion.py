@@ -25,6 +25,8 @@ SHARPEST_DEG = 179.0
 """Sharper corners are flown as turns on the spot."""
 LONGEST_STEP_S = 0.5
 """Longest time step with constant wind and course."""
+HORIZON_TIME_S = 15.0
+"""Correlation time of the horizon. Errors of real autopilots change within 10 to 30 s."""
 MAX_STEPS = 1_000_000
 """Limit of the time steps of a flight in wind: 139 hours."""
 Array = NDArray[np.float64]
@@ -229,11 +231,6 @@ def direction(course_deg: float) -> Array:
     """Unit vector (2,), east and north, of a course clockwise from north."""
     angle = math.radians(course_deg)
     return np.array([math.sin(angle), math.cos(angle)])
-
-
-HORIZON_TIME_S = 15.0
-"""Correlation time of the horizon. Errors of real autopilots change within 10 to 30 s."""
-Array = NDArray[np.float64]
 
 
 def horizon_errors(std_deg: float, times_s: Array, rng: np.random.Generator) -> Array:

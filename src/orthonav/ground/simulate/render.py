@@ -138,9 +138,6 @@ def _enlarged(part: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     return np.asarray(enlarged, dtype=np.float32)
 
 
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class ViewEffects:
     """Image degradation.
