@@ -138,7 +138,7 @@ def flown(area, frame, dem, tmp_path_factory):
         terrain=open_dem(dem, "msl"), seed=1,
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
+        patch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)
         simulate_flight(request)
     return out
 
