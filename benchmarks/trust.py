@@ -1,47 +1,39 @@
 """How far confidence can be trusted on ground that it was not learnt on: whole scenes left out.
 
 `python -m benchmarks.trust --work DIR [--views 40] [--seed 1] [--workers 2] [--fit]` places views
-of all scenes of two dates beside the checkout (`../shared/data`, or the folder that ORTHONAV_DATA
-names) and of generated ones, and views that are on no map. It prints what the shipped confidence
-says of them, and what one says that was fitted to the other scenes only. `--fit` prints weights
-fitted to all of these views. DIR keeps maps, flights and the evidence of every view: a second run
-takes seconds. About an hour on two cores. `DIR/worst` shows the worst views of every scene.
+of scenes of two dates, and views that are on no map. It prints what the shipped confidence says of
+them, and what one says that was fitted to the other scenes only. `--fit` prints weights fitted to
+all of these views. About an hour on two cores; rerun to resume.
 """
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from benchmarks.inputs import file_of
-from benchmarks.record import Table, provenance
-from benchmarks.trust_pictures import write_worst
-from benchmarks.trust_views import pairs, views_of
-from benchmarks.verdicts import percent
-from orthonav.core.files import write_text
-from orthonav.core.localize.registered import (
+from benchmarks.record import Section, Table, percent, resumed, run, say
+from benchmarks.scenes import chosen, leave_one_out_pairs, map_of, ortho
+from benchmarks.trust_views import views_of
+from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,
-    LEAST,
     USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
     features_of,
 )
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.build.fit import LEAST
 from orthonav.ground.evaluate.calibration import calibrate
 
+NAME = "trust"
 RIDGE = 1e-5
 """Weight of the ridge of the fit: only against weights without bound."""
 Array = NDArray[np.float64]
@@ -130,56 +122,33 @@ def fit_judge(
     return RegisteredConfidence(biases, tuple(float(each) for each in weights), USUAL_CHANCES)
 
 
-def main() -> None:
-    """Place, fit, print; write Markdown where a file is named."""
-    options = _parser().parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
-    about = provenance("trust")
-    every = pairs()
-    chosen = [each for each in every if each.is_there]
-    for each in set(every) - set(chosen):
-        print(f"not there, left out: {each.map}")
-    for each in chosen:  # before processes share them
-        file_of(each.map, options.work)
-    rows: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        jobs = [
-            pool.submit(views_of, each, chosen, options.views, options.seed, options.work)
-            for each in chosen
-        ]
-        for pair, job in zip(chosen, jobs, strict=True):
-            rows += job.result()
-            print(f"{pair.scene}: {pair.map} seen by {pair.views}", flush=True)
-    judged = Judged.of(rows)
-    tables = [_scenes_table(judged), _features_table(judged), _cases_table(judged)]
-    head = (
-        f"commit {about['commit'][:10]}, sources {about['sources']}, {about['cpu']}; "
-        f"{len(rows)} views, seed {options.seed}"
-    )
-    text = "\n".join([head, "", *(table.markdown() for table in tables)])
-    print("\n" + text)
-    for path in write_worst(rows, judged.right, judged.left_out(), options.work):
-        print(f"worst views: {path}")
-    if options.fit:
-        everything = np.ones(len(rows), np.bool_)
-        judge = judged.fitted(everything)
-        print("USUAL_BIASES =", tuple(round(each, 2) for each in judge.biases))
-        print("USUAL_WEIGHTS =", tuple(round(each, 2) for each in judge.weights))
-    if options.out:
-        write_text(options.out, text + "\n")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.trust", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--work", type=Path, required=True, help="folder for maps and flights")
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=40, help="views per kind (default 40)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="pairs at a time")
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="pairs whose name has this")
     parser.add_argument("--fit", action="store_true", help="print weights fitted to all scenes")
-    parser.add_argument("--out", type=Path, help="Markdown file to write too")
-    return parser
+
+
+def measure(options: argparse.Namespace) -> Section:
+    pairs = chosen(leave_one_out_pairs(), options.only)
+    for each in pairs:  # before processes share them
+        map_of(ortho(each.map, options.work), options.work)
+        ortho(each.views, options.work)
+    views = 2 if options.quick else options.views
+    tasks = {each.name: (each, pairs, views, options.seed, options.work) for each in pairs}
+    stored = options.work / f"views-{views}-{options.seed}.jsonl"
+    rows: list[dict[str, Any]] = []
+    for name, found in zip(tasks, resumed(stored, views_of, tasks, options.workers), strict=True):
+        rows += found
+        say(name)
+    judged = Judged.of(rows)
+    if options.fit:
+        judge = judged.fitted(np.ones(len(rows), np.bool_))
+        print("USUAL_BIASES =", tuple(round(each, 2) for each in judge.biases))
+        print("USUAL_WEIGHTS =", tuple(round(each, 2) for each in judge.weights))
+    tables = [_scenes_table(judged), _features_table(judged), _cases_table(judged)]
+    return Section(f"Trust: {len(rows)} views, seed {options.seed}", tables)
 
 
 def _verdict(judged: Judged, confidence: Array, inside: NDArray[np.bool_]) -> list[str]:
@@ -279,4 +248,4 @@ def _cases_table(judged: Judged) -> Table:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NAME, __doc__, measure, add))

@@ -4,57 +4,36 @@ Each pair of dates is a map and an orthophoto that views are simulated over. Vie
 to be found; mirrored views, views of other scenes and views of ground beside the map are not.
 """
 
-import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
-from lab.landscape import DEFAULT_DATES
 from rasterio.warp import transform_bounds
 
-from benchmarks.inputs import DATA, file_of, map_of
-from orthonav.core.errors import OutputError
-from orthonav.core.files import write_text
-from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.folder import read_image
+from benchmarks.placing import views_in
+from benchmarks.scenes import USUAL, Pair, agl_of, flight, gsd_of, map_of, ortho, place_of
+from benchmarks.scenes import far_m as far_m_of
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
-from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
-YAW_STD_DEG, AGL_STD = 10.0, 0.1
-TILT_STD_DEG = 1.0
-"""Of the mount and of the horizon, in pitch and in roll, not reported."""
+Task = tuple[Pair, Sequence[Pair], int, int, Path]
+"""Pair, all pairs, number of views, seed, and folder of work."""
 TRACK_YAW_STD_DEG, TRACK_AGL_STD = 2.0, 0.03
 """Errors of heading and height, and what a track knows of them."""
-FAR_PX, FAR_M, FAR_FROM_PRIOR_PX = 10.0, 35.0, 20.0
-"""A view is right within the larger of the first two, one with a prior within the third: chance
-finds places within 35 m of it too. Maps and views of Tours are up to 17 px apart."""
+FAR_FROM_PRIOR_PX = 20.0
+"""A view with a prior is right within this: chance finds places within 35 m of it too. Maps and
+views of Tours are up to 17 px apart."""
 METRES_PER_DEG = 111_320.0
 BESIDE_SHARE = 0.9
 """Views beside the map are farther from its border than this share of their width. One that reaches
 onto it all the same, and is placed where it was taken, is right."""
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A map and an orthophoto of another date; `scene` is left out as a whole."""
-
-    scene: str
-    map: str
-    views: str
-
-    @property
-    def is_there(self) -> bool:
-        """Whether both exist, or can be generated."""
-        names = (self.map, self.views)
-        return all(name.startswith("generated:") or (DATA / name).exists() for name in names)
 
 
 @dataclass(frozen=True)
@@ -107,73 +86,37 @@ CASES = (
 )
 
 
-def pairs() -> list[Pair]:
-    """All pairs of dates."""
-    szada = [("szada", f"airchange/szada_{n}_a.tif", f"airchange/szada_{n}_b.tif") for n in "157"]
-    szada.append(("szada", "airchange/szada_mosaic_a.tif", "airchange/szada_mosaic_b.tif"))
-    dates = {
-        "garching": (("2001_09", "2015_04"), ("2020_03", "2009_04")),
-        "schiphol": (("2004_05", "2018_04"), ("2021_06", "2008_05")),
-        "solar_farm": (("2009_12", "2017_12"), ("2012_12", "2015_12")),
-        "atlanta": (("2012_11", "2021_08"), ("2024_02", "2016_12")),
-        "aral": (("1985_12", "2012_12"), ("2000_12", "2015_12")),
-        "tours": (("1964", "1976"),),
-    }
-    past, present, other = (date.name for date in DEFAULT_DATES)
-    found = [
-        ("naip", "naip_nd/20090818.tif", "naip_nd/20120731.tif"),
-        ("naip", "naip_nd/20090818.tif", "naip_nd/20180716.tif"),
-        *szada,
-        *(
-            (scene, f"scenes/{scene}/{a}.tif", f"scenes/{scene}/{b}.tif")
-            for scene, both in dates.items()
-            for a, b in both
-        ),
-        ("generated", f"generated:31:{past}", f"generated:31:{present}"),
-        ("generated", f"generated:32:{other}", f"generated:32:{past}"),
-    ]
-    return [Pair(*each) for each in found]
-
-
-def views_of(
-    pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
-) -> list[dict[str, Any]]:
-    """Rows of all views of a pair; stored in `work`, like maps and flights."""
-    stored = work / f"{_plain(pair.map)}-{_plain(pair.views)}-{views}-{seed}.json"
-    if not stored.is_file():
-        cv2.setNumThreads(1)
-        rows = list(_rows(pair, others, views, seed, work))
-        write_text(stored, json.dumps(rows))
-    found: list[dict[str, Any]] = json.loads(stored.read_text(encoding="utf-8"))
-    return found
+def views_of(task: Task) -> list[dict[str, Any]]:
+    """Rows of all views of a pair."""
+    cv2.setNumThreads(1)
+    return list(_rows(*task))
 
 
 def _rows(
     pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
 ) -> Iterator[dict[str, Any]]:
-    ortho, flown = file_of(pair.map, work), file_of(pair.views, work)
-    whole = _localizer(ortho, work)
-    west, south, east, north = _bounds_deg(ortho)
+    past, flown = ortho(pair.map, work), ortho(pair.views, work)
+    whole = _registration(map_of(past, work))
+    with rasterio.open(past) as source:
+        west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
     middle = (west + east) / 2
-    half_deg = west, south, middle, north
-    half = _localizer(ortho, work, half_deg)
-    other_scenes = [each for each in others if each.scene != pair.scene]
+    half = _registration(map_of(past, work, (west, south, middle, north)))
+    other_scenes = [each for each in others if place_of(each) != place_of(pair)]
     for number, case in enumerate(CASES):
         count = max(1, round(case.share * views))
         over, gsd_m = flown, None
         if case.kind == "other scene":
-            over = file_of(other_scenes[(seed + number) % len(other_scenes)].views, work)
-            gsd_m = _gsd_m(over)
+            over = ortho(other_scenes[(seed + number) % len(other_scenes)].views, work)
+            gsd_m = gsd_of(over)
         folder = _flight(over, case, count, seed + number, work)
         localizer = half if case.kind == "beside" else whole
-        for name, view, truth in _flown_for(case, folder, _gsd_m(over), middle):
+        for name, view, truth in _flown_for(case, folder, gsd_of(over), middle):
             if gsd_m is not None:
                 scale = localizer.grid.gsd_m / gsd_m
                 view = replace(view, telemetry=_scaled(view.telemetry, scale))
             row = _placed(localizer, case, view, truth)
             if row is not None:
-                about = {**asdict(pair), **asdict(case), "frame": f"{folder.name}/{name}"}
-                about["bounds_deg"] = half_deg if case.kind == "beside" else None
+                about = {"scene": place_of(pair), "pair": pair.name, **asdict(case), "frame": name}
                 if case.kind == "found" and not is_covered(localizer, truth, case.width_px):
                     about["kind"] = "beside"
                 yield {**about, **row}
@@ -183,7 +126,7 @@ def _flown_for(
     case: Case, folder: Path, gsd_m: float, middle_deg: float
 ) -> Iterator[tuple[str, View, tuple[float, float]]]:
     """The views of a flight as a case needs them: mirrored, or some left out."""
-    flown = list(views_in(folder))
+    flown = [(each.frame, each.view, each.truth_latlon_deg) for each in views_in(folder)]
     if case.kind == "other prior":
         yield from _with_other_priors(flown, case, gsd_m)
         return
@@ -203,26 +146,24 @@ def _placed(
 ) -> dict[str, Any] | None:
     """Evidence, error and verdict of a view; None where it was refused."""
     prior = None if case.prior_px is None else view.telemetry.prior
-    seen = localizer.register(view, prior, case.heading_known)
-    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
+    search = localizer.search(view, prior, case.heading_known)
+    found = search if isinstance(search, NoFix) else search.run()
+    if isinstance(search, NoFix) or isinstance(found, NoFix):
         return None
-    found, gsd_m = seen.found, localizer.grid.gsd_m
+    gsd_m = localizer.grid.gsd_m
     assert localizer.confidence is not None
-    fix, frame = localizer.fix(seen, found, view.telemetry), localizer.sheet.frame
+    fix, frame = localizer.fix(search, found, view.telemetry), localizer.sheet.frame
     off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
     error_m = float(np.hypot(*off_m))
-    far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
+    far_m = far_m_of(gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
     far_m = max(far_m, RADIUS_SHARE * fix.agl_m)
     right = case.kind in ("found", "beside") and error_m <= far_m
     return {
-        "evidence": found.evidence(),
+        "evidence": found.scores,
         "chances": asdict(localizer.confidence.chances),
         "error_px": error_m / gsd_m,
         "nees": float(off_m @ np.linalg.solve(fix.cov_en_m2, off_m)),
         "right": right,
-        "pose": astuple(found.placed.pose),
-        "side_px": seen.prepared.side_px,
-        "confidence": localizer.confidence(found.evidence()),
     }
 
 
@@ -240,17 +181,6 @@ def is_covered(
         for dx in steps
     ]
     return all(inside)
-
-
-def views_in(folder: Path) -> Iterator[tuple[str, View, tuple[float, float]]]:
-    """Name, view and true latitude and longitude of the views of a flight."""
-    flight, truth = open_flight(folder), read_truth(folder / "truth.csv")
-    for each in flight.views:
-        yield (
-            each.frame,
-            View(read_image(each.path), flight.camera, each.telemetry),
-            truth[each.frame],
-        )
 
 
 def _with_other_priors(
@@ -279,54 +209,16 @@ def _scaled(telemetry: Telemetry, scale: float) -> Telemetry:
     )
 
 
-def _plain(name: str) -> str:
-    return name.replace("/", "-").replace(":", "-")
-
-
-def _localizer(
-    ortho: Path, work: Path, bounds_deg: tuple[float, float, float, float] | None = None
-) -> RegistrationLocalizer:
-    found = Localizer(open_map(map_of(ortho, work, bounds_deg))).registration
+def _registration(map_path: Path) -> RegistrationLocalizer:
+    found = Localizer(open_map(map_path)).registration
     assert found is not None
     return found
 
 
-def _flight(ortho: Path, case: Case, count: int, seed: int, work: Path) -> Path:
-    """A simulated flight at random places, stored in `work`."""
-    name = f"{ortho.parent.name}-{ortho.stem}-{case.width_px}-{count}-{case.prior_px}-{seed}"
-    name += "-tracked" if case.tracked else ""
-    folder = work / name
-    if not folder.is_dir():
-        gsd_m = _gsd_m(ortho)
-        prior_m = None if case.prior_px is None else case.prior_px * gsd_m
-        yaw_std_deg, agl_std = YAW_STD_DEG, AGL_STD
-        if case.tracked:
-            yaw_std_deg, agl_std = TRACK_YAW_STD_DEG, TRACK_AGL_STD
-        errors = Errors(
-            yaw_std_deg=yaw_std_deg,
-            agl_std=agl_std,
-            prior_std_m=prior_m,
-            mount_std_deg=TILT_STD_DEG,
-            horizon_std_deg=TILT_STD_DEG,
-        )
-        agl_m = case.width_px * gsd_m / min(DEFAULT_CAMERA.extent)
-        request = SimulateRequest(
-            [ortho], folder, random=count, agl_m=agl_m, errors=errors, seed=seed
-        )
-        try:
-            simulate_flight(request)
-        except OutputError:
-            if not folder.is_dir():  # else another process has made the same flight meanwhile
-                raise
-    return folder
-
-
-def _gsd_m(ortho: Path) -> float:
-    with rasterio.open(ortho) as source:
-        return float(abs(source.transform.a))
-
-
-def _bounds_deg(ortho: Path) -> tuple[float, float, float, float]:
-    with rasterio.open(ortho) as source:
-        west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
-    return west, south, east, north
+def _flight(path: Path, case: Case, count: int, seed: int, work: Path) -> Path:
+    gsd_m = gsd_of(path)
+    errors = replace(USUAL, prior_std_m=None if case.prior_px is None else case.prior_px * gsd_m)
+    if case.tracked:
+        errors = replace(errors, yaw_std_deg=TRACK_YAW_STD_DEG, agl_std=TRACK_AGL_STD)
+    agl_m = agl_of(case.width_px, gsd_m)
+    return flight(path, work, views=count, errors=errors, seed=seed, agl_m=agl_m)

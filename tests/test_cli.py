@@ -22,7 +22,7 @@ from orthonav.cli import COMMANDS, common, main
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
-from orthonav.ground.report import Drawing
+from orthonav.ground.report.drawing import Drawing
 
 WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "2"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
@@ -63,7 +63,7 @@ def ortho(make_ortho, tmp_path_factory):
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture
@@ -237,7 +237,9 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
 
 @pytest.mark.long
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out, monkeypatch):
-    monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other configurations are not tried
+    monkeypatch.setattr(
+        "orthonav.ground.recordings.setups.FEW", 0.0
+    )  # other configurations are not tried
     mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
     shorten(shutil.copytree(flight_path, few), 10)
     gnss = ["--gnss-positions", few / "truth.csv", "--gnss-std-m", "2"]

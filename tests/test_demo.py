@@ -23,9 +23,9 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.ground.check.places.FEWEST_TRIALS", 24)
     monkeypatch.setattr("orthonav.ground.check.run.usable_cores", lambda: 1)
-    monkeypatch.setattr("orthonav.ground.report.canvas.DPI", 30)
+    monkeypatch.setattr("orthonav.ground.report.drawing.DPI", 30)
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
     quicker = functools.partial(BuildRequest, calibration_views=2)
     monkeypatch.setattr("orthonav.ground.build.BuildRequest", quicker)
 

@@ -12,11 +12,10 @@ import pytest
 from orthonav.cli import main
 from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight import open_flight
-from orthonav.core.flight.fixes import read_results
-from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.camera import Camera
 from orthonav.core.grey import grey_levels
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Telemetry, View
 
@@ -206,7 +205,7 @@ def test_paths_may_be_text(map_path, few, area, tmp_path):
     from orthonav.ground.build import BuildRequest, build_map
     from orthonav.ground.recordings import SourceOptions, open_source
     from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
-    from orthonav.ground.view.opening import ViewRequest
+    from orthonav.ground.view.run import ViewRequest
 
     made = str(tmp_path / "small.onav")
     small = {"tile_px": 64, "gsd_m": 5.0, "registration": False}

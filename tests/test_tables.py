@@ -11,7 +11,7 @@ from orthonav.core.flight.fixes import MAX_LINE_BYTES, read_results
 from orthonav.core.flight.folder import read_truth
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows, bounded_lines
 from orthonav.ground.planning.route import read_route
-from orthonav.ground.recordings.table import read_table
+from orthonav.ground.recordings.logs import read_table
 
 TRUTH = "frame,lat_deg,lon_deg\n"
 TABLE = "time_s,pitch_deg,roll_deg\n"

@@ -58,7 +58,7 @@ COMMANDS: dict[str, Sequence[str]] = {
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
 SCRIPTS = {
     "ros2": "import cyclonedds.domain, rosbags.typesys",
-    "web": "from orthonav.ground.view.assets import load_assets; assert '/' in load_assets()",
+    "web": "from orthonav.ground.view.server import load_assets; assert '/' in load_assets()",
     "neural": "import onnxruntime; assert onnxruntime.get_available_providers()",
 }
 """Where a command would serve until it is stopped, or would need a map of gigabytes."""

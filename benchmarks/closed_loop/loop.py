@@ -8,11 +8,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.closed_loop.ground import CAMERA, Demo, Grey
 from benchmarks.closed_loop.inertial import FILTERS, STATES, Filter
 from benchmarks.closed_loop.physics import (
+    CALM,
+    CONSUMER,
     STEP_S,
     VEHICLES,
+    Grade,
+    Instruments,
     Motion,
     Vehicle,
     Wind,
@@ -20,14 +23,18 @@ from benchmarks.closed_loop.physics import (
     euler_rad,
     increments,
 )
+from benchmarks.closed_loop.recorded import CAMERA, Demo, Grey
 from benchmarks.closed_loop.replays import Rule, is_wrong
-from benchmarks.closed_loop.sensors import CALM, CONSUMER, Grade, Instruments
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
-from orthonav.onboard.messages.correlation import FilterCovariance
-from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, estimate_from_result
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    FilterCovariance,
+    NavigationEstimate,
+    estimate_from_result,
+)
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import locate_view
 

@@ -1,10 +1,13 @@
-"""Recorded flights of real autopilots in simulation: what they stated, and the views again.
+"""The demo area, and recorded flights of autopilots in simulation over it: what they stated, and
+the views again.
 
 A flight folder has `truth.csv`, `autopilot.csv` (what the autopilot stated, by time of arrival),
 `exposures.csv` (true pose of each exposure) and `events.csv`.
 """
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,10 +17,70 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.closed_loop.ground import CAMERA, EFFECTS, Angles, Demo, Grey
-from benchmarks.flights import read_rows
+from benchmarks.faults import Ground
+from benchmarks.looped_flight import read_rows
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
 from orthonav.core.records import Prior, Telemetry, View
+from orthonav.ground.simulate.render import ViewEffects
 from orthonav.onboard.telemetry import TelemetryBuffer, wxyz_of_angles
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+"""The camera of the recorded flights; it looks straight down the body, image top to the nose."""
+EFFECTS = ViewEffects()
+MAP, PRESENT = "area.onav", "2021-10.tif"
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+Angles = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Files of `orthonav demo` in a folder."""
+
+    folder: Path
+
+    @classmethod
+    def made(cls, work: Path) -> "Demo":
+        """The demo in `work`, made where it is absent (a minute or two)."""
+        folder = work / "demo"
+        if not (folder / MAP).is_file():
+            work.mkdir(parents=True, exist_ok=True)
+            command = (sys.executable, "-m", "orthonav", "demo", "--out", str(folder))
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        return cls(folder)
+
+    @cached_property
+    def localizer(self) -> Localizer:
+        """Places views on the map."""
+        return Localizer(open_map(self.folder / MAP))
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The plane of the map."""
+        return self.localizer.sheet.frame
+
+    @cached_property
+    def _ground(self) -> Ground:
+        """The ground of the later date."""
+        grid = self.localizer.grid
+        return Ground(
+            self.folder / PRESENT,
+            self.localizer,
+            corner=(grid.west_m, grid.north_m),
+            size_px=(grid.width_px, grid.height_px),
+            gsd_m=grid.gsd_m,
+        )
+
+    def picture(
+        self, place_en_m: Array, attitude_deg: Angles, agl_m: float, rng: np.random.Generator
+    ) -> Grey:
+        """What the camera sees at a place (2,), with heading, pitch and roll, and a height."""
+        made = self._ground.picture(place_en_m, attitude_deg, agl_m, rng, CAMERA, EFFECTS)
+        return np.asarray(made, np.uint8)
+
 
 GROUND_AMSL_M = 40.0
 LATE_S = 0.02
@@ -35,7 +98,6 @@ PHASES = {
     "camera right": AFTER,
 }
 """What begins with an event that is so named."""
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ The autopilot flew on what orthonav 2bf6196 sent, so its errors of attitude and 
 of a closed loop; what is located now is not fed back.
 """
 
+import argparse
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,18 +14,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.closed_loop.ground import Demo
-from benchmarks.closed_loop.recorded import MIRRORED, OFF, ON, SHIFTED, Exposure, Recorded
+from benchmarks.closed_loop.recorded import MIRRORED, OFF, ON, SHIFTED, Demo, Exposure, Recorded
 from benchmarks.fault_flights import FAR_M, FAR_STD
-from benchmarks.inputs import DATA
-from benchmarks.record import Section, Table, number
+from benchmarks.record import Section, Table, number, quantiles, say
+from benchmarks.scenes import DATA
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.aiding import ABSOLUTE, FIX_3D, Aiding
 from orthonav.onboard.messages.estimate import Clock, estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
+from orthonav.onboard.telemetry import ABSOLUTE, FIX_3D, Aiding
 
 RECORDED = DATA / "closed_loop"
 METHODS = ("single", "single, no prior", "track")
@@ -197,8 +196,7 @@ def _cells(rows: Sequence[Row]) -> list[str]:
     """A row of the table from all views of one flight by one method."""
     alone = [row for row in rows if row.exposure.phase == OFF]
     good = judged(rows)
-    errors = [row.error_m for row in good] or [np.nan]
-    speeds = [row.velocity_off_mps for row in good] or [np.nan]
+    errors = [row.error_m for row in good]
     wrong = []
     for phase in (SHIFTED, MIRRORED):
         sent = [row for row in rows if row.exposure.phase == phase]
@@ -210,12 +208,11 @@ def _cells(rows: Sequence[Row]) -> list[str]:
         rows[0].method,
         str(len(alone)),
         number(math.sqrt(float(np.mean([np.square(row.tilt_off_deg).sum() for row in alone])))),
-        number(float(np.median(errors))),
-        number(float(np.percentile(errors, 95))),
+        *quantiles(errors, 50, 95),
         number(float(np.mean([row.nees for row in good] or [np.nan]))),
         f"{confident:.0%}",
         f"{tracking:.0%}" if rows[0].state is not None else "-",
-        number(float(np.median(speeds))),
+        *quantiles([row.velocity_off_mps for row in good], 50),
         *wrong,
     ]
 
@@ -234,19 +231,18 @@ def table(rows: Sequence[Row]) -> Table:
     return Table("Replays", HEADER, cells, notes)
 
 
-def measure(
-    work: Path,
-    only: Sequence[str] = (),
-    *,
-    methods: Sequence[str] = METHODS,
-    rule: Rule = stated,
-    views: int | None = None,
-    disturbed: bool = True,
-) -> Section:
-    """All flights, or `only` those named."""
+def measure(options: argparse.Namespace) -> Section:
+    """All flights, or only those named."""
     rows: list[Row] = []
-    for flight in flights(only):
-        found = replay(flight, work, methods=methods, rule=rule, views=views, disturbed=disturbed)
-        print(table(found).markdown(), file=sys.stderr, flush=True)
+    for flight in flights(options.only or ()):
+        found = replay(
+            flight,
+            options.work,
+            methods=options.methods,
+            rule=plain if options.plain else stated,
+            views=options.views,
+            disturbed=not options.undisturbed,
+        )
+        say(table(found).markdown())
         rows += found
     return Section("Replays of flights with autopilots", [table(rows)] if rows else [])

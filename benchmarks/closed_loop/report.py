@@ -1,20 +1,18 @@
 """Figures of simulated flights in the loop."""
 
+import argparse
 import math
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.closed_loop.ground import Demo
 from benchmarks.closed_loop.loop import Flown, Located, Scenario, fly, spans, tilt_off_rad
-from benchmarks.closed_loop.replays import Rule
+from benchmarks.closed_loop.recorded import Demo
+from benchmarks.closed_loop.replays import plain, stated
 from benchmarks.fault_flights import FAR_M, FAR_STD
-from benchmarks.record import Section, Table, number
+from benchmarks.record import Section, Table, number, quantiles, say
 
 GNSS_S, BEFORE_S, AFTER_S = 60.0, 60.0, 60.0
 """With GNSS, then without it before a disturbance, and after it."""
@@ -22,7 +20,7 @@ SCENARIOS = ("gnss", "nothing", "fixes", "start", "shifted", "mirrored", "frozen
 LASTS_S = {"shifted": 40.0, "mirrored": 40.0, "frozen": 10.0}
 HEADER = (
     *("scenario", "position median m", "95 %", "max", "position NEES", "velocity m/s", "95 %"),
-    *("tilt deg", "fixes median m", "95 %", "NEES", "tilt correlation", "slope", "sent", "wrong"),
+    *("tilt deg", "fixes median m", "95 %", "NEES", "tilt correlation", "slope", "sent", "false"),
 )
 Array = NDArray[np.float64]
 
@@ -44,12 +42,6 @@ def scenario(name: str, minutes: float, send: str) -> Scenario:
     return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, send, name, begin_s, lasts_s)
 
 
-def _median_95(values: Array) -> list[str]:
-    if not len(values):
-        return ["-", "-"]
-    return [number(float(each)) for each in np.percentile(values, [50, 95])]
-
-
 def by_tilt(views: Sequence[Located]) -> list[str]:
     """Correlations, ahead and right, of the errors of fixes with those that the error of the
     stated tilt makes, and the slopes."""
@@ -64,7 +56,6 @@ def by_tilt(views: Sequence[Located]) -> list[str]:
 
 
 def cells(flown: Flown) -> list[str]:
-    """A row of the table."""
     samples, views = spans(flown)
     off = np.array([each.estimate.position - each.truth.position for each in samples])
     far_m = np.hypot(*off[:, :2].T)
@@ -75,12 +66,12 @@ def cells(flown: Flown) -> list[str]:
     errors = np.array([np.hypot(*view.error_m) for view in sent])
     return [
         flown.scenario.name,
-        *_median_95(far_m),
+        *quantiles(far_m, 50, 95),
         number(float(far_m.max())),
         number(float(np.mean((far_m / claimed) ** 2))),
-        *_median_95(np.array(mps)),
+        *quantiles(mps, 50, 95),
         number(math.sqrt(float((tilts**2).sum(1).mean()))),
-        *_median_95(errors),
+        *quantiles(errors, 50, 95),
         number(float(np.mean([view.nees for view in sent]))) if sent else "-",
         *by_tilt(sent),
         f"{len(sent) / len(views):.0%}" if views else "-",
@@ -88,43 +79,30 @@ def cells(flown: Flown) -> list[str]:
     ]
 
 
-def measure(
-    work: Path,
-    *,
-    vehicle: str,
-    autopilot: str,
-    send: str,
-    minutes: float,
-    seeds: Sequence[int],
-    rule: Rule,
-    only: Sequence[str] = SCENARIOS,
-) -> Section:
-    """All scenarios of a vehicle with a filter, or `only` some, each with each seed."""
-    demo, rows = Demo.made(work), []
-    for seed in seeds:
-        for name in only:
-            begin = time.perf_counter()
+def measure(options: argparse.Namespace) -> Section:
+    """All scenarios of a vehicle with a filter, or only some, each with each seed."""
+    demo, rows = Demo.made(options.work), []
+    for seed in options.seed:
+        for name in options.only or SCENARIOS:
             flown = fly(
-                scenario(name, minutes, send),
+                scenario(name, options.minutes, options.send),
                 demo,
-                vehicle=vehicle,
-                autopilot=autopilot,
+                vehicle=options.vehicle,
+                autopilot=options.filter,
                 seed=seed,
-                rule=rule,
+                rule=plain if options.plain else stated,
             )
             rows.append(cells(flown))
-            if len(seeds) > 1:
+            if len(options.seed) > 1:
                 rows[-1][0] += f", seed {seed}"
-            wall_s, withheld = time.perf_counter() - begin, flown.withheld
-            print(" | ".join(rows[-1]), f"{wall_s:.0f} s", withheld, file=sys.stderr, flush=True)
+            say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
-        f"{minutes:g} minutes without GNSS after {GNSS_S:g} s with it; the disturbances begin "
+        f"{options.minutes:g} minutes without GNSS after {GNSS_S:g} s with it; disturbances begin "
         f"{BEFORE_S:g} s later; judged from 5 s after GNSS was cut on; nothing: no fixes",
         "position, velocity, tilt: errors of the autopilot, tilt as RMS; NEES: mean, 2 is right; "
-        "fixes: those sent, NEES by their own covariance",
-        "tilt correlation, slope: of the errors of fixes with height times the tangent of the "
-        "autopilot's error of tilt, ahead and right",
-        f"wrong: sent, and more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
+        "fixes: those sent; tilt correlation, slope: of the errors of fixes with height times the "
+        "tangent of the autopilot's error of tilt, ahead and right; false: sent, and more than "
+        f"{FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
-    title = f"{vehicle}, filter like {autopilot}'s, sent: {send}"
+    title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"
     return Section("Flights in the loop", [Table(title, HEADER, rows, notes)])

@@ -13,19 +13,19 @@ import pytest
 from orthonav.core.errors import AreaError, AtlasError, StorageError, WorkerError
 from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas import build as building
-from orthonav.ground.atlas import sheet_tasks as tasks
-from orthonav.ground.atlas.build import build_atlas, build_sheet
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.cluster import SerialRunner
-from orthonav.ground.atlas.coarse import read_coarse
-from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.ground.atlas.sheet_tasks import (
+from orthonav.ground.atlas import build as tasks
+from orthonav.ground.atlas.build import (
     AtlasRequest,
     Imagery,
+    build_atlas,
+    build_sheet,
     plan_sheets,
     request_digest,
     versions,
 )
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.cluster import SerialRunner
+from orthonav.ground.atlas.coarse import read_coarse
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.route import Route
 
@@ -46,7 +46,7 @@ RECIPE = AtlasRecipe(**{"gsd_m": 1.0, **SMALL, "coarse": COARSE})
 def fewer_crops(monkeypatch):
     """Calibration from few crops: it takes longest."""
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def built(ortho, tmp_path_factory):
     place = tmp_path_factory.mktemp("built") / "atlas"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
-        patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+        patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
         return place, made(place, ortho)
 
 

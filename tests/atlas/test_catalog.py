@@ -16,10 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthonav.core.errors import AreaError, AtlasError, MissingFileError, StorageError
-from orthonav.ground.atlas.catalog import Atlas, copy_sheets
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe, copy_sheets
 from orthonav.ground.atlas.integrity import check_atlas
 from orthonav.ground.atlas.item import Sheet, StoredFile, canonical, read_item
-from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
 from orthonav.ground.atlas.store import Store
 
 RECIPE = AtlasRecipe(gsd_m=1.0)
@@ -354,7 +353,7 @@ import sys
 from pathlib import Path
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.recipe import AtlasRecipe
+from orthonav.ground.atlas.catalog import AtlasRecipe
 
 url, files, number = sys.argv[1:]
 atlas = Atlas.open_or_create(url, AtlasRecipe(1.0))

@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import MissingExtraError, WorkerError
-from orthonav.ground.atlas.build import build_atlas
+from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
-from orthonav.ground.atlas.sheet_tasks import AtlasRequest
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 
 SMALL = {
     "sheet_km": 0.3,

@@ -7,12 +7,11 @@ import pytest
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.logistic import LogisticConfidence
-from orthonav.core.localize.registered import Chances, RegisteredConfidence
+from orthonav.core.localize.confidence import Chances, LogisticConfidence, RegisteredConfidence
 from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.ground.atlas.cut_sheets import pooled_registered, pooled_tiles
+from orthonav.ground.atlas.cut import pooled_registered, pooled_tiles
 from orthonav.ground.atlas.warp import Warp, _turn
-from orthonav.ground.build.blocks import Block
+from orthonav.ground.build.sheet import Block
 
 TILES = [LogisticConfidence(-6.2, (11.0, 12.0)), LogisticConfidence(-4.2, (5.6, 21.7))]
 REGISTERED = [

@@ -13,8 +13,7 @@ from orthonav.core.records import NoFix, View
 from orthonav.core.track import State
 from orthonav.ground.atlas import locate
 from orthonav.ground.atlas.agreement import Placement
-from orthonav.ground.atlas.find import FoundPlace
-from orthonav.ground.atlas.locate import LocalTrack
+from orthonav.ground.atlas.locate import FoundPlace, LocalTrack
 
 STD_M = 12.5
 BEGUN = 3

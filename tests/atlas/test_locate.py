@@ -17,20 +17,17 @@ from orthonav.core.flight.folder import open_flight
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.records import Fix, NoFix, View
 from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.find import rectified
-from orthonav.ground.atlas.index import make_index
-from orthonav.ground.atlas.index_manifest import (
+from orthonav.ground.atlas.index import (
     MANIFEST,
     IndexManifest,
+    make_index,
     read_manifest,
     stale_sheets,
 )
 from orthonav.ground.atlas.item import canonical
-from orthonav.ground.atlas.locate import AtlasLocator
-from orthonav.ground.atlas.matches import against
-from orthonav.ground.atlas.sheet_registration import SheetRegistrar
+from orthonav.ground.atlas.locate import AtlasLocator, rectified
+from orthonav.ground.atlas.search import SheetRegistrar, TileSearch, against
 from orthonav.ground.atlas.store import Store
-from orthonav.ground.atlas.tile_search import TileSearch
 from orthonav.onboard.run import locate_view
 
 CANDIDATES = 6
@@ -39,7 +36,7 @@ CANDIDATES = 6
 
 @pytest.fixture(autouse=True)
 def fewer_candidates(monkeypatch):
-    monkeypatch.setattr("orthonav.ground.atlas.find.CANDIDATES", CANDIDATES)
+    monkeypatch.setattr("orthonav.ground.atlas.locate.CANDIDATES", CANDIDATES)
 
 
 @pytest.fixture(scope="module")

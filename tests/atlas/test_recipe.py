@@ -3,7 +3,7 @@
 import pytest
 
 from orthonav.core.errors import AtlasError
-from orthonav.ground.atlas.recipe import AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.catalog import AtlasRecipe, CoarseRecipe
 
 RECIPE = AtlasRecipe(gsd_m=1.0)
 

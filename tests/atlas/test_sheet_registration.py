@@ -14,16 +14,17 @@ pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[
 from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import PRIOR_SIGMAS, Prior, View
-from orthonav.ground.atlas import matches
-from orthonav.ground.atlas.find import PlaceFinder, rectified
-from orthonav.ground.atlas.matches import SEARCHED, ViewMatches
-from orthonav.ground.atlas.sheet_registration import (
+from orthonav.ground.atlas import search as matches
+from orthonav.ground.atlas.locate import PlaceFinder, rectified
+from orthonav.ground.atlas.search import (
+    SEARCHED,
     PyramidPart,
     SearchRegion,
     SheetMatch,
     SheetRegistrar,
+    TileSearch,
+    ViewMatches,
 )
-from orthonav.ground.atlas.tile_search import TileSearch
 
 SIDE_M = 300.0
 
@@ -78,10 +79,10 @@ def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, can
     telemetry = replace(seen.telemetry, yaw_deg=yaw_deg, yaw_std_deg=std_deg)
     turned = replace(seen, telemetry=telemetry)
     prior = Prior(*candidate.latlon_deg, candidate.reach_m / PRIOR_SIGMAS)
-    whole = sheet.register(turned, prior)
+    whole = sheet.search(turned, prior).run()
     for name in ("strength", "look", "detail_ratio", "local_phase", "local_gradients"):
-        assert found.evidence[name] == pytest.approx(whole.found.evidence()[name], rel=0.05)
-    assert found.turn_rad == pytest.approx(whole.found.placed.pose.turn_rad, abs=2e-3)
+        assert found.evidence[name] == pytest.approx(whole.scores[name], rel=0.05)
+    assert found.turn_rad == pytest.approx(whole.pose.turn_rad, abs=2e-3)
     assert found.confidence == sheet.confidence
 
 

@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import AtlasError
-from orthonav.ground.atlas.index_manifest import Part, ShardInfo
-from orthonav.ground.atlas.index_shards import ShardedIndex, write_shard
-from orthonav.ground.atlas.quantizers import QUANTIZERS_NAME, Quantizers, VectorRecipe, train
+from orthonav.ground.atlas.vectors import (
+    QUANTIZERS_NAME,
+    Part,
+    Quantizers,
+    ShardedIndex,
+    ShardInfo,
+    VectorRecipe,
+    train,
+    write_shard,
+)
 
 DIMS, COUNT = 16, 6000
 RECIPE = VectorRecipe(DIMS, list_bits=6, quantizers=8)

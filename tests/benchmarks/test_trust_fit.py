@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from benchmarks.trust import fit_judge
 
-from orthonav.core.localize.registered import FEATURES, USUAL_CHANCES, RegisteredConfidence
+from orthonav.core.localize.confidence import FEATURES, USUAL_CHANCES, RegisteredConfidence
 
 TRUE = RegisteredConfidence((-2.0, -1.0), (1.0, 2.0, 1.5, 0.5, 1.0, 2.0, 1.0), USUAL_CHANCES)
 

@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from lab.landscape import DEFAULT_DATES, generate_area
 
+from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 
 
@@ -33,9 +34,19 @@ def half_blank(made_once):
         request = BuildRequest(dates[:1], out, tile_px=128, overlap=0.75, calibration_views=10)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("orthonav.ground.build.calibrate.CROPS", 48)
-            patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 4)
+            patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 4)
             build_map(request)
 
     folder = made_once("half-blank", make)
     past, present = sorted(folder.glob("*.tif"))
     return SimpleNamespace(past=past, present=present, map=folder / "half.onav")
+
+
+@pytest.fixture(scope="module")
+def opened(map_path):
+    return open_map(map_path)
+
+
+@pytest.fixture(scope="module")
+def frame(opened):
+    return opened.manifest.sheets[0].frame

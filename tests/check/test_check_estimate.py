@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_trials import lost, misplaced, right
 
-from orthonav.ground.check import estimate
 from orthonav.ground.check.estimate import Predictor
 
 SIDE_M = 1000.0
@@ -36,15 +35,6 @@ def test_places_are_told_by_the_trials_around():
     assert west.probability[0] > 0.8 and east.probability[0] < 0.25
     assert west.low[0] > east.high[0]
     assert west.wrong[0] == east.wrong[0] == 0
-
-
-def test_doubtful_and_wrong_views_are_no_fixes():
-    doubtful = [right(en, confidence=0.5) for en in places(100)]
-    wrong = [misplaced(en, en + 300.0) for en in places(100)]
-    for trials, share in ((doubtful, 0.0), (wrong, 1.0)):
-        found = predictor(trials).at(WEST)
-        assert found.probability[0] < 0.1 and found.wrong[0] == pytest.approx(share, abs=0.01)
-    assert predictor(wrong).wrong.sum() == 100 and predictor(doubtful).right.sum() == 0
 
 
 @settings(max_examples=10, deadline=None)
@@ -107,15 +97,3 @@ def test_error_of_fixes():
     trials = [right(en, error_m=3.0) for en in places(300)]
     assert predictor(trials).at(WEST).error_m[0] == pytest.approx(3.0)
     assert predictor(trials, least_error_m=4.0).at(WEST).error_m[0] == pytest.approx(5.0)
-
-
-def test_no_places_and_many(monkeypatch):
-    found = predictor(half_good())
-    nothing = found.at(np.zeros((0, 2)))
-    assert all(each.shape == (0,) for each in vars(nothing).values())
-    points = places(500, seed=5)
-    whole = found.at(points)
-    monkeypatch.setattr(estimate, "_PAIRS_AT_ONCE", 700)
-    parts = found.at(points)
-    for name, values in vars(whole).items():
-        np.testing.assert_allclose(getattr(parts, name), values, rtol=1e-9, err_msg=name)

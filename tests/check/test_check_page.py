@@ -7,25 +7,25 @@ import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import made_check
 import numpy as np
 import pytest
 from made_check import EVIL, FILES, small_route
-from matplotlib import colormaps
-from matplotlib.colors import to_rgb
 
-from orthonav.core.mapfile import open_map
-from orthonav.ground.check.outcome import CELL_VALUES, BlindStretch
-from orthonav.ground.check.write import figures, write_check
-from orthonav.ground.check.write.figures import MAX_SIDE_PX, jpeg, map_image, visible_box
-from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN, _known_cells
-from orthonav.ground.check.write.plain import to_plain
-from orthonav.ground.check.write.risk import RISKS, segments, shade
-from orthonav.ground.check.write.wording import better_sentence, probability_text, remedies
-from orthonav.ground.report import Drawing, metres_text
-from orthonav.ground.report.leaflet import load_leaflet
+from orthonav.ground.check.outcome import CELL_VALUES
+from orthonav.ground.check.write import write_check
+from orthonav.ground.check.write.figures import (
+    MAX_SIDE_PX,
+    map_image,
+    page_jpeg,
+    visible_box,
+)
+from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN
+from orthonav.ground.check.write.plain import check_to_plain
+from orthonav.ground.check.write.wording import probability_text
+from orthonav.ground.report.drawing import Drawing
+from orthonav.ground.report.numbers import metres_text
 from orthonav.ground.report.page import static_text
 
 VOID = {"meta", "img", "input", "br"}
@@ -65,21 +65,11 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def opened(map_path):
-    return open_map(map_path)
-
-
-@pytest.fixture(scope="module")
-def frame(opened):
-    return opened.manifest.sheets[0].frame
-
-
-@pytest.fixture(scope="module")
 def folder(opened, frame, tmp_path_factory):
     """Checks of all kinds, and one whose names are markup, by name."""
     root = tmp_path_factory.mktemp("checks")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.report.canvas.DPI", 20)
+        patch.setattr("orthonav.ground.report.drawing.DPI", 20)
         path = write_check(small_route(frame), opened, root / "small_route")
         assert path == root / "small_route" / "index.html"
         for name in ("draw_axes", "draw_figure"):  # drawing takes longest
@@ -143,17 +133,6 @@ def all_cells(cells):
         cells[name] = [grid[start : start + cells["cols"]] for start in starts]
 
 
-def test_cells_around_a_band_cost_nothing(frame):
-    cells = to_plain(made_check.small_route(frame))["cells"]
-    known = _known_cells(cells)
-    empty = [[None] * cells["cols"]] * 300
-    wide = {**cells, "rows": cells["rows"] + 300}
-    for name in CELL_VALUES:
-        zero = [[0] * cells["cols"]] * 300
-        wide[name] = [*cells[name], *(zero if name in ZERO_IF_UNKNOWN else empty)]
-    assert {**_known_cells(wide), "rows": cells["rows"]} == known
-
-
 def test_the_script_is_given_the_json_of_the_check(folder, frame):
     for name in KINDS:
         page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
@@ -161,7 +140,7 @@ def test_the_script_is_given_the_json_of_the_check(folder, frame):
         drawn = plain.pop("drawn")
         all_cells(plain["cells"])
         if name != "evil":
-            assert plain == json.loads(json.dumps(to_plain(getattr(made_check, name)(frame))))
+            assert plain == json.loads(json.dumps(check_to_plain(getattr(made_check, name)(frame))))
         assert (drawn["route"] is None) == (name in ("tiny", "nearly_empty"))
         assert len(drawn["lookalikes"]) == len(plain["lookalikes"])
         assert len(drawn["blind"]) == len(plain["stretches"])
@@ -198,70 +177,14 @@ def test_who_signs_sees_what_was_checked(folder):
         assert said in signed
 
 
-def test_a_go_needs_no_help_and_a_no_go_names_what_it_tried(frame):
-    assert remedies(made_check.tiny(frame)) == []
-    result = made_check.small_route(frame)
-    assert remedies(result)[0] == better_sentence(result.alternatives, "agl_m")
-    lost = BlindStretch(100, 1100, 5, 55, 0.2, drift_m=20, allowed_m=15)
-    (sentence,) = remedies(replace(result, alternatives=(), stretches=(lost,)))
-    assert "drifts by at most 1.5 % (assumed: 2 %)" in sentence
-    ended = replace(lost, ends_lost=True)
-    (sentence,) = remedies(replace(result, alternatives=(), stretches=(ended,)))
-    assert sentence.startswith("End the route before km 0.1")
-    (sentence,) = remedies(replace(result, alternatives=(), stretches=()))
-    assert sentence.startswith("No other height was tried")
-
-
 def test_the_picture_lies_where_the_map_does(opened, frame):
     result = made_check.tiny(frame)
     found = map_image(opened, visible_box(result))
-    west, south, east, north = found.west_m, found.south_m, found.east_m, found.north_m
+    west, south, east, north = found.box
     rows, cols = found.grey.shape
     assert max(rows, cols) <= MAX_SIDE_PX
     assert (east - west) / cols == pytest.approx((north - south) / rows, rel=0.01)
-    assert jpeg(found.grey)[:2] == b"\xff\xd8"
-
-
-def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
-    monkeypatch.setattr(figures, "GreyLayer", SimpleNamespace(of=lambda _: None))
-    found = map_image(opened, visible_box(made_check.tiny(frame)))
-    grid = opened.manifest.sheets[0].grid
-    assert found.west_m == grid.west_m and found.north_m == grid.north_m
-    assert max(found.grey.shape) <= 384
-
-
-def test_pictures_of_noise_stay_small():
-    noise = np.random.default_rng(1).integers(0, 255, (1300, 2000), dtype=np.uint8)
-    assert len(jpeg(noise)) <= figures.MAX_BYTES
-
-
-def test_the_route_has_the_colours_of_the_cells():
-    """One scale: light is likely, and dark blue is not, on the route as in the cells."""
-    for risk in RISKS[:-1]:
-        above = min((r.least for r in RISKS[:-1] if r.least > risk.least), default=1.0)
-        wanted = to_rgb(colormaps["cividis"](shade((risk.least + above) / 2)))
-        np.testing.assert_allclose(to_rgb(risk.colour), wanted, atol=0.02)
-
-
-def test_ambiguous_places_are_no_reason_to_go(folder):
-    """They cost fixes, so they have no green tick."""
-    text = (folder / "small_route" / "index.html").read_text(encoding="utf-8")
-    found = re.findall(r'<li class="is-(\w[\w-]*)"><b [^>]*>(.)</b> ([^<]*)', text)
-    (kind,) = {(kind, mark) for kind, mark, said in found if "ambiguous places" in said}
-    assert kind == ("info", "i")
-    assert 'setAttribute("aria-label", "North is up")' in text
-
-
-def test_segments_take_the_worse_end():
-    assert segments(np.array([0.95, 0.93, 0.6, 0.95, np.nan])) == [
-        (0, 0, 1),
-        (2, 1, 3),
-        (4, 3, 4),
-    ]
-
-
-def test_leaflet_brings_its_licence():
-    assert "Leaflet" in load_leaflet().script[:200] and "url(images" not in load_leaflet().style
+    assert page_jpeg(found)[:2] == b"\xff\xd8"
 
 
 # In a browser
@@ -375,13 +298,6 @@ def test_other_screens(visit, options):
     page = visit("small_route", **options)
     assert page.locator("html.live").count() == 1
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_without_scripts_figures_are_shown(visit):
-    page = visit("small_route", java_script_enabled=False)
-    assert page.locator(".still-part img").count() == 2
-    assert page.locator(".still-part img").first.is_visible()
-    assert not page.locator("#map").is_visible()
 
 
 def test_scripts_write_numbers_as_python_does(browser):

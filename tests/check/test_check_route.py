@@ -11,8 +11,8 @@ from made_trials import CONDITIONS
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.estimate import Prediction
+from orthonav.ground.check.findings import BLIND, blind_stretches, expected_drift, predicted_along
 from orthonav.ground.check.outcome import Along
-from orthonav.ground.check.route import BLIND, blind_stretches, expected_drift, predicted_along
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 
@@ -60,10 +60,6 @@ def test_sure_fixes_leave_their_own_error():
     np.testing.assert_allclose(found, 4.0)
 
 
-def test_a_single_point_has_no_drift():
-    assert expected_drift(np.zeros(1), np.array([0.3]), np.array([5.0]), 0.03, SIDE_M) == [5.0]
-
-
 def predicted(probability, error_m):
     """A prediction of these values, with an interval of no width."""
     nothing = np.zeros_like(probability)
@@ -105,23 +101,6 @@ def test_the_worst_over_the_width_of_every_leg():
         late = along.distance_m > 1400
         assert (along.across_low[early] == first).all() and (along.across_low[late] == last).all()
         assert (along.probability[early] == 0.9).all()
-
-
-@pytest.mark.parametrize(
-    "points", [[[30, 40]], [[30, 40], [30, 40]]], ids=["one", "twice the same"]
-)
-def test_a_route_of_one_place(points):
-    along = predicted_along(area_of(points), [100.0], SIDE_M, CONDITIONS, even)
-    assert along.distance_m.tolist() == [0.0] and along.probability.tolist() == [0.8]
-    np.testing.assert_allclose(along.points_en_m, [[30, 40]], atol=0.01)
-    assert blind_stretches(along, CONDITIONS, SIDE_M) == ()
-
-
-def test_very_long_and_very_short_routes():
-    long = predicted_along(area_of([[0, 0], [4900, 0]]), [100.0], 0.5, CONDITIONS, even)
-    assert len(long.distance_m) <= 4001 and np.isfinite(long.drift_m).all()
-    short = predicted_along(area_of([[0, 0], [3, 0]]), [100.0], SIDE_M, CONDITIONS, even)
-    assert short.distance_m == pytest.approx([0, 3], abs=1e-3)
 
 
 def test_the_route_ends_at_its_last_waypoint():

@@ -9,9 +9,8 @@ import onnx
 import pytest
 
 from orthonav.core.errors import MapFileError, MissingExtraError, VariantError
-from orthonav.core.tiles.embed import TABLE
+from orthonav.core.tiles.embed import TABLE, embedder_of
 from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
-from orthonav.core.tiles.stored import embedder_of
 from orthonav.core.variants import variant_recipe
 
 helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT

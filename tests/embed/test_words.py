@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import MissingExtraError, VariantError
-from orthonav.core.tiles.gray import Gray
+from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.words import (
     WordsEmbedder,
     WordsRecipe,

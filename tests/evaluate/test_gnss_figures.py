@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from orthonav.core.flight.fixes import write_results
-from orthonav.core.flight.gnss import BIASES, FAULTS, fault_of
+from orthonav.core.flight.gnss import BIASES, FAULTS
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
-from orthonav.ground.evaluate.gnss import gnss_rows, gnss_to_json, measure_gnss
 from orthonav.ground.evaluate.metrics import compare
+from orthonav.ground.evaluate.tables import gnss_rows, gnss_to_json
+from orthonav.ground.evaluate.track import measure_gnss
 
 FRAME = LocalFrame(48.0, 2.0)
 STEP = float(FAULTS.index("gnss_step") + 1)
@@ -78,14 +79,8 @@ def test_without_gnss_there_are_no_figures():
     assert measure_gnss(compare(truth(3), results, FRAME), results) is None
 
 
-def test_codes_of_faults_are_read_safely():
-    assert fault_of({}) == fault_of({"gnss_fault": 0.0}) == fault_of({"gnss_fault": 99.0}) == ""
-    assert fault_of({"gnss_fault": float("nan")}) == ""
-    assert fault_of({"gnss_fault": STEP}) == "gnss_step"
-
-
 @pytest.mark.long
-def test_the_report_has_the_figure(tmp_path, run, only_new):
+def test_the_report_has_the_figure(tmp_path, run, no_plots):
     fixes, true = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
     write_results(fixes, RESULTS)
     rows = [f"{name},{lat:.9f},{lon:.9f}" for name, (lat, lon) in truth(10).items()]

@@ -9,12 +9,19 @@ import pytest
 from benchmarks.posed import Picture
 from experiments.paper import field, matchers, runs, scenes
 from experiments.paper.__main__ import main
-from experiments.paper.field_tables import Placed
 from experiments.paper.matchers import FeatureMap, Features, Sift
-from experiments.paper.methods import FIELD_SCENES, Method, flown, methods, tuned
+from experiments.paper.methods import (
+    FIELD_SCENES,
+    FULL,
+    REDUCED,
+    TABLE_1,
+    Method,
+    flown,
+    methods,
+    tuned,
+)
 from experiments.paper.results import Result, compact, name_of, read
-from experiments.paper.tables import tables
-from experiments.paper.trajectories import FULL, REDUCED, TABLE_1
+from experiments.paper.tables import Placed, tables
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid

@@ -7,10 +7,10 @@ import pytest
 
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.planning import estimate
+from orthonav.ground.planning import spacing as estimate
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.estimate import estimate_map
 from orthonav.ground.planning.route import Route, read_route
+from orthonav.ground.planning.spacing import estimate_map
 
 L_ROUTE = Route(((46.5, 2.5), (46.53, 2.5), (46.53, 2.56)), leg_bands_m=(200, 900))
 

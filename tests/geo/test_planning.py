@@ -15,12 +15,13 @@ from orthonav.ground.planning.spacing import (
     FINEST_IMAGERY_M,
     LEAST_TILE_SHARE,
     ViewPlan,
+    profile,
     rate_cautions,
     suited_map,
     suited_tile_px,
+    terrain_cautions,
     view_cautions,
 )
-from orthonav.ground.planning.terrain import profile, terrain_cautions
 
 CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 

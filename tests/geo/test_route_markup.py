@@ -8,7 +8,7 @@ import pytest
 
 from orthonav.core.errors import RouteError
 from orthonav.ground.planning.route import Height, read_route
-from orthonav.ground.planning.routes import kml, markup
+from orthonav.ground.planning.routes import markup
 
 BAD_LATITUDE = "a latitude within 90"
 PLACES = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
@@ -231,7 +231,7 @@ def test_broken_and_harmful_files_are_refused(read, name, content, message):
 
 
 def test_what_unpacks_to_too_much_is_refused(read, monkeypatch):
-    monkeypatch.setattr(kml, "MAX_KML_BYTES", 1000)
+    monkeypatch.setattr(markup, "MAX_KML_BYTES", 1000)
     with pytest.raises(RouteError, match="KML in the KMZ is larger than"):
         read(archive(("doc.kml", "<kml>" + " " * 100_000 + "</kml>")), "a.kmz")
     monkeypatch.setattr(markup, "MAX_ELEMENTS", 10)

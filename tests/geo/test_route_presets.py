@@ -7,8 +7,7 @@ from pyproj import Geod
 
 from orthonav.core.errors import RouteError
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Height, leg_lengths_m, read_route
-from orthonav.ground.planning.routes.presets import TABLE_1, preset
+from orthonav.ground.planning.route import TABLE_1, Height, leg_lengths_m, preset, read_route
 
 GEOD = Geod(ellps="WGS84")
 

@@ -8,8 +8,7 @@ from orthonav.core.errors import AreaError, RouteError
 from orthonav.core.geo.swapped import HINT, swapped_hint
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
-from orthonav.ground.planning.sheets import sheets_of_bounds
-from orthonav.ground.planning.world import WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets, sheets_of_bounds
 
 
 def near(lat_deg, lon_deg):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.world import LARGEST_SIDE_M, SMALLEST_SIDE_M, WorldSheets
+from orthonav.ground.planning.sheets import LARGEST_SIDE_M, SMALLEST_SIDE_M, WorldSheets
 
 SIDES_M = [SMALLEST_SIDE_M, 1234.5, 10_000.0, LARGEST_SIDE_M]
 LATITUDES = st.floats(-90, 90)

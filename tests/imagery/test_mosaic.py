@@ -357,18 +357,6 @@ def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
     assert off[clear].max() <= 3
 
 
-def test_more_files_than_may_be_open(tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.ground.imagery.raster.MAX_OPEN", 2)
-    paths = []
-    for index in range(5):
-        strip = np.full((3, 24, SIZE), 50 * index, np.uint8)
-        transform = placed() * Affine.translation(0, 24 * index)
-        paths.append(write(tmp_path / f"{index}.tif", strip, transform=transform))
-    pixels = read(paths)
-    assert (pixels.rgb[12::24, 4:-4, 0] == np.arange(0, 250, 50)[:, None]).all()
-    assert pixels.valid[INNER].all()
-
-
 @pytest.mark.parametrize(
     "name, tags, expected",
     [

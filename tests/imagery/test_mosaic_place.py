@@ -76,7 +76,7 @@ def test_marks_lie_where_proj_puts_them(tmp_path, crs, frame, source_gsd_m, turn
     "source_gsd_m, window", [pytest.param(0.3, 200, marks=pytest.mark.slow), (0.2, 63)]
 )
 def test_marks_of_a_palette_thinned_in_strips(tmp_path, monkeypatch, source_gsd_m, window):
-    monkeypatch.setattr("orthonav.ground.imagery.thin.STRIP_BYTES", 100_000)
+    monkeypatch.setattr("orthonav.ground.imagery.joined.STRIP_PX", 2_000)
     size = int(290 / source_gsd_m)
     transform = placed(LAMBERT, source_gsd_m, size, frame=BREST)
     path = tmp_path / "ortho.tif"

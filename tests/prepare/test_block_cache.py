@@ -17,17 +17,12 @@ from rasterio.transform import Affine
 
 from helpers import textured
 from orthonav.core.errors import AreaError, ImageryError, OutputError, VariantError
-from orthonav.core.localize.registered import USUAL_CONFIDENCE
-from orthonav.core.tiles.gray import Gray
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE
+from orthonav.core.tiles.represent import Gray
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.block_cache import BlockCache
-from orthonav.ground.build.blocks import Block
-from orthonav.ground.build.calibrate import CropSampler
-from orthonav.ground.build.calibrate_registration import RegistrationCalibration
-from orthonav.ground.build.layout import grid_of
-from orthonav.ground.build.parallel import AHEAD, in_order
-from orthonav.ground.build.pictures import SheetPictures
-from orthonav.ground.build.sheet import SheetReader
+from orthonav.ground.build.calibrate import CropSampler, RegistrationCalibration
+from orthonav.ground.build.sheet import AHEAD, Block, SheetPictures, SheetReader, grid_of, in_order
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route

@@ -18,8 +18,11 @@ from orthonav.core.errors import (
 )
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
-from orthonav.core.localize.logistic import FEATURES, LogisticConfidence
-from orthonav.core.localize.registered import RegisteredConfidence
+from orthonav.core.localize.confidence import (
+    TILE_FEATURES,
+    LogisticConfidence,
+    RegisteredConfidence,
+)
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles import represent
@@ -57,7 +60,7 @@ def frame(ortho):
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture
@@ -409,8 +412,8 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
 def test_confidence_is_a_probability_whatever_the_evidence(localizer):
     rng = np.random.default_rng(0)
     for scale in (0, 1, 1e3, 1e300):
-        for values in rng.uniform(-1, 1, (20, len(FEATURES))) * scale:
-            confidence = localizer.tiles.confidence(dict(zip(FEATURES, values, strict=True)))
+        for values in rng.uniform(-1, 1, (20, len(TILE_FEATURES))) * scale:
+            confidence = localizer.tiles.confidence(dict(zip(TILE_FEATURES, values, strict=True)))
             assert 0 <= confidence <= 1
 
 

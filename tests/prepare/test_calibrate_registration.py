@@ -10,19 +10,19 @@ import pytest
 from helpers import textured
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.registered import (
+from orthonav.core.localize.confidence import (
     USUAL_CHANCES,
     USUAL_CONFIDENCE,
     RegisteredConfidence,
 )
-from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import SheetInfo, open_map
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build import calibrate_registration as module
-from orthonav.ground.build.calibrate import Crop
-from orthonav.ground.build.calibrate_registration import (
+from orthonav.ground.build import calibrate as module
+from orthonav.ground.build.calibrate import (
     FLOOR_LIMITS_PX,
     FLOOR_PX,
+    Crop,
     RegistrationCalibration,
     calibrate_registration,
 )
@@ -136,9 +136,9 @@ def verdicts(localizer, confidence, crops, mirrored):
     for crop in crops:
         picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirrored else crop.grey
         view = module._view(rng, picture, localizer.grid)
-        best = localizer.best(localizer.prepared(view, True), None)
-        said.append(confidence(best.evidence()))
-        pose = best.placed.pose
+        best = localizer.search(view).run()
+        said.append(confidence(best.scores))
+        pose = best.pose
         off.append(np.hypot(pose.x_px - crop.col_px, pose.y_px - crop.row_px))
     return np.array(said), np.array(off)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.register.evidence import evidence
-from orthonav.ground.build.change import changed
+from orthonav.core.register.channels import channels_of
+from orthonav.ground.build.calibrate import changed
 
 SIZE = 128
 GREY, OTHER = textured((SIZE, SIZE), 1), textured((SIZE, SIZE), 2)
@@ -18,7 +18,7 @@ def drawn(seed, grey=GREY, other=OTHER):
 def alike(one, other):
     """Correlation of the evidence of edges of two pictures."""
     valid = np.ones(one.shape, bool)
-    parts = [evidence(each, valid)[..., :2] for each in (one, other)]
+    parts = [channels_of(each, valid)[..., :2] for each in (one, other)]
     return float((parts[0] * parts[1]).sum() / np.sqrt(np.prod([(p**2).sum() for p in parts])))
 
 

@@ -170,7 +170,7 @@ def test_a_flight_reports_heights_above_sea_and_take_off(flown):
 def test_a_terrain_places_views_that_level_ground_does_not(
     run, flown, map_path, dem, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other set-ups are not tried
+    monkeypatch.setattr("orthonav.ground.recordings.setups.FEW", 0.0)  # other set-ups are not tried
     few, found = shutil.copytree(flown, tmp_path / "flight"), {}
     header, *lines = (few / "telemetry.csv").read_text().splitlines()
     (few / "telemetry.csv").write_text("\n".join([header, *lines[::3]]) + "\n")

@@ -15,22 +15,17 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import MissingExtraError, OutputError
-from orthonav.ground.report import (
-    Background,
-    Drawing,
+from orthonav.ground.report.drawing import Background, Drawing, draw_axes, draw_map, map_size_in
+from orthonav.ground.report.numbers import measure_text, metres_text
+from orthonav.ground.report.page import (
+    LIST,
     Figure,
-    draw_axes,
-    draw_map,
     file_names,
-    map_size_in,
-    measure_text,
-    metres_text,
+    joined_scripts,
     render,
     write_figures,
     write_page,
 )
-from orthonav.ground.report.figures import LIST
-from orthonav.ground.report.page import joined_scripts
 
 
 def figure(name: str, content: str = "a") -> Figure:
@@ -44,7 +39,7 @@ def names(folder: Path) -> list[str]:
 
 def drawn_map() -> Drawing:
     box = (0.0, 900.0, 0.0, 600.0)
-    background = Background(np.full((60, 90), 200, np.uint8), *(box[0], box[2], box[1], box[3]))
+    background = Background(np.full((60, 90), 200, np.uint8), (0.0, 0.0, 900.0, 600.0))
 
     def draw(axes) -> None:
         draw_map(axes, box, background)
@@ -85,12 +80,6 @@ def test_drawings_are_reproducible() -> None:
     assert "date" not in here.svg.lower()
 
 
-def test_a_drawing_of_very_many_points_stays_small() -> None:
-    random = np.random.default_rng(1).random((2, 60_000))
-    drawing = draw_axes((4.0, 3.0), lambda axes: axes.plot(*random, "."))
-    assert len(drawing.svg) < 400_000 and "<image" in drawing.svg
-
-
 def test_characters_that_xml_forbids_are_replaced() -> None:
     drawing = draw_axes((3.0, 2.0), lambda axes: axes.set_title("a\x01b 日本", parse_math=False))
     assert "日本" in "".join(ElementTree.fromstring(drawing.svg).itertext())
@@ -105,7 +94,7 @@ def test_without_matplotlib_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch)
 
 def test_importing_does_not_import_matplotlib() -> None:
     code = (
-        "import sys, orthonav.ground.report; unwanted = {'matplotlib', 'jinja2', 'PIL', 'cv2'}; "
+        "import sys, orthonav.ground.report.page; unwanted = {'matplotlib', 'PIL'}; "
         "assert not unwanted & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -114,66 +103,42 @@ def test_importing_does_not_import_matplotlib() -> None:
 # Files.
 
 
-def test_figures_are_written_with_a_list_that_sha256sum_reads(tmp_path: Path) -> None:
-    paths = write_figures(tmp_path / "new" / "report", [figure("map"), figure("error-curve")])
-    assert [path.name for path in paths] == [
-        *("map.svg", "map.png"),
-        *("error-curve.svg", "error-curve.png"),
-    ]
-    assert paths[0].read_text() == "<svg>a</svg>" and paths[1].read_bytes() == b"png a"
+def test_figures_are_replaced_whole_with_a_list_that_sha256sum_reads(tmp_path: Path) -> None:
+    write_figures(tmp_path / "new", [figure("map"), figure("old")])
+    write_figures(tmp_path / "new", [figure("map", "b"), figure("error-curve")])
+    paths = sorted((tmp_path / "new" / "figures").glob("*.[ps][nv]g"))
+    assert [p.name for p in paths] == ["error-curve.png", "error-curve.svg", "map.png", "map.svg"]
+    assert paths[2].read_bytes() == b"png b" and paths[3].read_text() == "<svg>b</svg>"
     listed = (paths[0].parent / LIST).read_text().splitlines()
     found = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.name}" for p in paths]
     assert sorted(listed) == sorted(found)
 
 
-def test_a_rerun_replaces_figures_and_removes_stale_ones(tmp_path: Path) -> None:
-    write_figures(tmp_path, [figure("map"), figure("old")])
-    (tmp_path / "figures" / "notes.txt").write_text("mine")
-    (tmp_path / "figures" / "mine.png").write_bytes(b"mine")
-    write_figures(tmp_path, [figure("map", "b")])
-    assert names(tmp_path) == ["map.png", "map.svg", "mine.png", "notes.txt", LIST]
-    assert (tmp_path / "figures" / "map.svg").read_text() == "<svg>b</svg>"
+def changed(folder: Path) -> None:
+    (folder / "map.svg").write_text("drawn over by hand")
 
 
-def test_a_stale_figure_that_was_changed_stays(tmp_path: Path) -> None:
-    write_figures(tmp_path, [figure("map"), figure("old")])
-    (tmp_path / "figures" / "old.svg").write_text("drawn over by hand")
-    write_figures(tmp_path, [figure("map")])
-    assert names(tmp_path) == ["map.png", "map.svg", "old.svg", LIST]
+def other(folder: Path) -> None:
+    (folder / "mine.png").write_bytes(b"mine")
 
 
-@pytest.mark.parametrize("before", [[], [figure("map")]])
-def test_a_file_that_is_not_ours_is_not_written_over(tmp_path: Path, before) -> None:
-    write_figures(tmp_path, [figure("other"), *before])
-    (tmp_path / "figures" / "map.svg").write_text("drawn by hand")
-    kept = names(tmp_path)
-    with pytest.raises(OutputError, match=r"orthonav did not write.*map\.svg$"):
-        write_figures(tmp_path, [figure("map", "b"), figure("new")])
-    assert names(tmp_path) == kept
-    assert (tmp_path / "figures" / "map.svg").read_text() == "drawn by hand"
+def linked(folder: Path) -> None:
+    (folder / "map.svg").rename(folder.parent / "outside.svg")
+    (folder / "map.svg").symlink_to(folder.parent / "outside.svg")
 
 
-def test_links_are_not_ours(tmp_path: Path) -> None:
-    write_figures(tmp_path, [figure("map")])
-    outside = tmp_path / "outside.svg"
-    (tmp_path / "figures" / "map.svg").rename(outside)
-    (tmp_path / "figures" / "map.svg").symlink_to(outside)
-    with pytest.raises(OutputError, match=r"map\.svg"):
-        write_figures(tmp_path, [figure("map", "b")])
-    write_figures(tmp_path, [figure("new")])
-    assert outside.read_text() == "<svg>a</svg>"
-    assert (tmp_path / "figures" / "map.svg").is_symlink()
+def unlisted(folder: Path) -> None:
+    (folder / LIST).write_text("\0 forged\n")
 
 
-def test_a_forged_list_removes_nothing(tmp_path: Path) -> None:
-    victim = tmp_path / "victim.svg"
-    victim.write_text("kept")
-    total = hashlib.sha256(b"kept").hexdigest()
-    (tmp_path / "figures").mkdir()
-    lines = f"{total}  ../victim.svg\n{total}  {victim}\n\xff\n{total}  .\n"
-    (tmp_path / "figures" / LIST).write_text(lines, encoding="latin-1")
-    write_figures(tmp_path, [figure("map")])
-    assert victim.read_text() == "kept"
+@pytest.mark.parametrize("spoil", [changed, other, linked, unlisted])
+def test_a_folder_with_files_that_are_not_ours_is_refused(tmp_path: Path, spoil) -> None:
+    write_page(tmp_path, "before", [figure("map")])
+    spoil(tmp_path / "figures")
+    before = names(tmp_path)
+    with pytest.raises(OutputError, match=r"figures$"):
+        write_page(tmp_path, "after", [figure("map", "b")])
+    assert names(tmp_path) == before and (tmp_path / "index.html").read_text() == "before"
 
 
 @pytest.mark.parametrize("fails_at", [1, 3, 5])
@@ -193,49 +158,6 @@ def test_where_there_is_no_room_all_stays_as_it_was(tmp_path: Path, monkeypatch,
     with pytest.raises(OutputError, match="disk full"):
         write_page(tmp_path, "after", [figure("a", "b"), figure("c", "b")])
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
-
-
-def test_a_run_that_was_cut_off_can_be_repeated(tmp_path: Path, monkeypatch) -> None:
-    write_figures(tmp_path, [figure("a"), figure("stale")])
-    renamed, replace = [], Path.replace
-
-    def failing(self: Path, target: Path) -> Path:
-        renamed.append(target)
-        if len(renamed) == 4:
-            raise KeyboardInterrupt
-        return replace(self, target)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Path, "replace", failing)
-        with pytest.raises(KeyboardInterrupt):
-            write_figures(tmp_path, [figure("a", "b"), figure("c", "b")])
-    assert not [name for name in names(tmp_path) if name.startswith(".")]
-    assert len(names(tmp_path)) > 5
-    write_figures(tmp_path, [figure("a", "c"), figure("c", "c")])
-    assert names(tmp_path) == ["a.png", "a.svg", "c.png", "c.svg", LIST]
-
-
-def test_a_file_in_place_of_the_folder_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "figures").write_text("a file")
-    with pytest.raises(OutputError, match="figures"):
-        write_figures(tmp_path, [figure("map")])
-
-
-@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "a b", "é", "-x", "a\n"])
-def test_names_that_are_no_file_names_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ValueError, match="plain file name"):
-        write_figures(tmp_path, [figure(name)])
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_name_is_given_once(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="same name"):
-        write_figures(tmp_path, [figure("map"), figure("Map")])
-
-
-def test_nothing_is_written_for_no_figures(tmp_path: Path) -> None:
-    assert write_figures(tmp_path, []) == []
-    assert not list(tmp_path.iterdir())
 
 
 def test_names_of_files_are_safe_and_differ() -> None:
@@ -294,12 +216,6 @@ def test_only_the_scripts_and_the_style_of_a_page_may_run(rendered) -> None:
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         assert f"{kind}-src 'sha256-{digest}'" in policy
     assert "script-src 'none'" in unescape(rendered("a"))
-
-
-def test_without_jinja_the_remedy_is_named(rendered, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):
-        rendered("a")
 
 
 def test_scripts_of_a_page_are_joined_without_module_syntax() -> None:

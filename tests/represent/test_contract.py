@@ -11,10 +11,8 @@ import pytest
 from edge_networks import write
 
 from orthonav.core.errors import VariantError
-from orthonav.core.tiles.canny import Canny
 from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.core.tiles.gray import Gray
-from orthonav.core.tiles.represent import TABLE
+from orthonav.core.tiles.represent import TABLE, Canny, Gray
 from orthonav.core.variants import make_variant, variant_from_recipe, variant_recipe
 from orthonav.research.segments import Segments
 

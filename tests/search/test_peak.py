@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.tiles.peak import TileNeighbours, find, parabola_peak
+from orthonav.core.tiles.position import TileNeighbours, find, parabola_peak
 
 GRID = TileGrid.covering((0.0, 0.0, 900.0, 600.0), gsd_m=1.0, tile_px=256, overlap=0.875)
 

@@ -5,8 +5,7 @@ import pytest
 
 from orthonav.core.errors import VariantError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.tiles.peak import TileNeighbours
-from orthonav.core.tiles.position import RULES, check_rule, offset_en_m
+from orthonav.core.tiles.position import RULES, TileNeighbours, check_rule, offset_en_m
 
 GRID = TileGrid.covering((0.0, 0.0, 800.0, 640.0), gsd_m=1.0, tile_px=256, overlap=0.875)
 ROWS, COLS = np.mgrid[: GRID.rows, : GRID.cols]

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "localizer"))  # blots.py: the k
 from small_run import PLACES_EN_M, Small, result, serving, write_small_flight, write_small_map
 
 from orthonav.core.flight.fixes import write_results
-from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.view.run import ViewRequest, open_run
 
 
 @pytest.fixture(scope="session")

@@ -16,8 +16,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import Manifest, SheetInfo, write_map
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.build.layer import GreyLayerWriter
-from orthonav.ground.view.assets import load_assets
-from orthonav.ground.view.server import Pages, Server
+from orthonav.ground.view.server import Pages, Server, load_assets
 
 FRAME = LocalFrame(46.5, 2.5)
 WEST_M, NORTH_M, GSD_M = -180.0, 160.0, 0.5

@@ -8,7 +8,7 @@ from small_run import COV_EN_M2, FRAME, GSD_M, NORTH_M, WEST_M
 
 from orthonav.core.flight.gnss import FAULTS
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.view.columns import columns_of
+from orthonav.ground.view.run import columns_of
 
 SHEET = SimpleNamespace(
     frame=FRAME,

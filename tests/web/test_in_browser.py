@@ -1,20 +1,19 @@
 """The page as people have it: drawn, reached by keys and by touch, in a real browser."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
-from benchmarks.view_page import write_long_run
 from browsing import LAPTOP, TABLET, Visit, painted
+from long_run import write_long_run
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
 from orthonav.core.flight.fixes import result_to_json, write_results
-from orthonav.ground.report import metres_text
-from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.report.numbers import metres_text
+from orthonav.ground.view.run import ViewRequest, open_run
 
 pytestmark = pytest.mark.long
 
@@ -204,29 +203,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
 
 
-def test_keys_for_one_view(page):
-    page.keyboard.press("b")
-    expect(page.locator("#blink")).to_have_attribute("aria-pressed", "true")
-    page.keyboard.press("b")
-    before = int(page.locator("#opacity").input_value())
-    page.keyboard.press("]")
-    assert int(page.locator("#opacity").input_value()) == before + 10
-    page.keyboard.press("o")
-    expect(page.locator("#on-map")).not_to_be_checked()
-    page.keyboard.press("?")
-    expect(page.locator("#help")).to_be_visible()
-    page.locator("#keys-on").uncheck()
-    page.keyboard.press("Escape")
-    expect(page.locator("#help")).to_be_hidden()
-    page.js("document.activeElement.blur()")
-    page.keyboard.press("n")
-    page.keyboard.press("b")
-    page.chosen(0, COUNT)
-    expect(page.locator("#blink")).to_have_attribute("aria-pressed", "false")
-    page.keyboard.press("ArrowRight")
-    page.chosen(1, COUNT)
-
-
 def test_keys_belong_to_what_has_the_focus(page):
     """The slider of the overlay, the map, and where somebody types."""
     page.locator("#opacity").focus()
@@ -291,16 +267,6 @@ def test_everything_is_reached_by_tab_in_order(page):
     assert set(reached) - set(expected) <= {"list-box"}
 
 
-def test_nothing_sticks_out_on_a_laptop(page):
-    show_wrong(page)
-    fits(page)
-    for part in MAIN_PARTS:
-        assert page.locator(part).bounding_box()["height"] > 20, part
-    height = page.locator("#time-part").bounding_box()
-    assert height["y"] + height["height"] <= LAPTOP["viewport"]["height"]
-    assert page.js("document.documentElement.scrollHeight") <= LAPTOP["viewport"]["height"]
-
-
 def fits(page):
     """Nothing is wider than the screen or than its box (newer Chromiums count the border too)."""
     wide = page.js(
@@ -357,62 +323,6 @@ def test_on_a_phone(visit, server):
     assert len({each.bounding_box()["y"] for each in steps.all()}) == 1
     map_box, legend = (page.locator(each).bounding_box() for each in ("#map", "#legend"))
     assert legend["y"] >= map_box["y"] + map_box["height"] - 1
-
-
-def test_a_chosen_view_comes_into_sight_with_its_truth(page, columns):
-    """Its fix and its true position, also where the map was zoomed in on another view."""
-    page.keyboard.press("z")
-    page.settled()
-    page.locator(f"#list [data-view='{WRONG}']").click()
-    page.chosen(WRONG, COUNT)
-    page.settled()
-    box = page.locator("#map").bounding_box()
-    for x, y in (("x", "y"), ("tx", "ty")):
-        place = page.on_screen((columns[x][WRONG], columns[y][WRONG]), CHUNK_PX)
-        assert box["x"] < place[0] < box["x"] + box["width"]
-        assert box["y"] < place[1] < box["y"] + box["height"]
-
-
-def test_guesses_have_a_colour_of_their_own(visit, small, tmp_path):
-    """Single fixes of low confidence, or below the criterion of the run, are shown as such."""
-    results = [result(i, None) for i in range(COUNT)]
-    results[0] = replace(results[0], outcome=replace(results[0].outcome, confidence=0.4))
-    results[1] = replace(results[1], accepted=False)
-    fixes = tmp_path / "fixes.jsonl"
-    fixes.write_text("".join(result_to_json(each) + "\n" for each in results))
-    run = open_run(ViewRequest(fixes, small.map_path, flight=small.flight))
-    with serving(run) as server:
-        page = visit(server)
-        page.chosen(0, COUNT)
-        expect(page.locator("#sentence")).to_contain_text("low confidence, error")
-        assert page.locator("#legend").inner_text().split("\n")[:2] == [
-            "●confident",
-            "●low confidence",
-        ]
-        mark = page.locator("#list button").first.locator(".mark")
-        expect(mark).to_have_attribute("aria-label", "low confidence")
-        page.select_option("#which", "doubt")
-        expect(page.locator("#shown-count")).to_have_text(f"2 of {COUNT} views")
-        page.settled()
-        place = page.on_screen(((PLACES_EN_M[1][0] + 180) / GSD_M, (160 - 25) / GSD_M), CHUNK_PX)
-        assert painted(page.picture(), page.colour("low"), place) > 15
-
-
-@pytest.mark.slow  # the contrast of dark colours is tried in every run
-def test_in_the_dark(visit, server, columns):
-    """Other colours, and also those of the canvases, and changed while the page is open."""
-    page = visit(server, color_scheme="dark")
-    page.chosen(0, COUNT)
-    page.settled()
-    dark, picture = page.colour("confident"), page.picture()
-    assert picture[760, 100].max() < 60
-    place = page.on_screen((columns["x"][5], columns["y"][5]), CHUNK_PX)
-    assert painted(picture, dark, place) > 15
-    page.emulate_media(color_scheme="light")
-    page.wait_for_timeout(200)
-    light, picture = page.colour("confident"), page.picture()
-    assert picture[760, 100].min() > 200 and np.abs(light - dark).max() > 40
-    assert painted(picture, light, place) > 15
 
 
 def test_by_the_rules_of_axe(page):

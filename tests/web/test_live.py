@@ -18,9 +18,8 @@ from orthonav.ground.view import feed as feed_module
 from orthonav.ground.view import logs as logs_module
 from orthonav.ground.view.feed import LineFeed
 from orthonav.ground.view.logs import LogReader
-from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.view.run import ViewRequest, open_run
 from orthonav.onboard.log import FlightLog
-from orthonav.onboard.outputs import JsonOut
 
 HEALTH = {"health": "DEGRADED", "reasons": ["searching"], "utc_s": 1.5, "counts": {"taken": 3}}
 
@@ -49,25 +48,6 @@ def test_a_file_that_grows(fixes):
         out.write(line(1)[40:] + line(2))
     assert [each.frame for each in feed.poll().results] == [result(1).frame, result(2).frame]
     assert feed.poll().results == []
-
-
-def test_what_the_runner_writes(fixes):
-    """Views with more than `fixes.jsonl` has, and health between them."""
-    feed = LineFeed(fixes, live=True)
-    out = JsonOut(fixes)
-    out.view(result(0), 12.0, ["global-position"], None)
-    out.health(HEALTH)
-    out.view(result(1), 12.0, [], "low_confidence")
-    batch = feed.poll()
-    assert len(batch.results) == 2 and batch.problems == []
-    assert batch.health[0][0] == 1
-    assert batch.health[0][1] == {
-        "level": "DEGRADED",
-        "reasons": ["searching"],
-        "utc_s": 1.5,
-        "counts": {"taken": 3},
-    }
-    out.close()
 
 
 def test_a_file_that_is_begun_anew(fixes):
@@ -170,21 +150,6 @@ def test_a_log_while_it_is_written(tmp_path):
     assert np.array_equal(shot.load(), expected)
 
 
-def test_thumbnails_are_shown_too(tmp_path, small):
-    write_log(tmp_path, range(2), views="thumbnails")
-    run = open_run(ViewRequest(tmp_path, small.map_path))
-    detail = run.detail(1)
-    assert detail["window"]["side_m"] > 0 and run.view_png(1).startswith(b"\x89PNG")
-    assert run.news(0, 0, 0)["health"][0]["level"] == "DEGRADED"
-
-
-def test_a_log_without_images_is_reported(tmp_path, small):
-    write_log(tmp_path, range(2), views="none")
-    run = open_run(ViewRequest(tmp_path / "flight_0001.mcap", small.map_path))
-    assert run.detail(0)["why_no_window"] == "the log has no images"
-    assert run.count == 2
-
-
 def test_another_flight_of_that_name(tmp_path):
     """Live, the newest is followed; else one must be named."""
     write_log(tmp_path, range(2))
@@ -259,9 +224,3 @@ def test_an_invalid_mount_of_a_log_is_reported(tmp_path, small):
 def test_a_log_that_is_not_there(tmp_path):
     with pytest.raises(MissingFileError, match="does not exist"):
         LogReader(tmp_path / "flight.mcap").poll()
-
-
-def test_another_map_than_that_of_the_flight_is_reported(tmp_path, small, caplog):
-    write_log(tmp_path, range(1))
-    open_run(ViewRequest(tmp_path, small.map_path))
-    assert "the flight used another map" in caplog.text

@@ -9,11 +9,9 @@ from dataclasses import replace
 import pytest
 from small_run import NO_FIX, WRONG, result
 
-from orthonav.cli import view as view_module
-from orthonav.core.flight.fixes import write_results
-from orthonav.core.flight.identity import Identity
+from orthonav.core.flight.fixes import Identity, write_results
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.view.opening import ViewRequest, open_run
+from orthonav.ground.view.run import ViewRequest, open_run
 
 
 def refused(done, *words):
@@ -31,13 +29,6 @@ def served(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("orthonav.ground.view.server.Server.serve_forever", stop)
-
-
-def test_it_prints_the_address_and_ends(run, small, served):
-    done = run("view", small.fixes, "--map", small.map_path, "--flight", small.flight)
-    assert done.code == 0 and done.err == ""
-    first, last = done.out.splitlines()
-    assert first.startswith("http://127.0.0.1:") and last == "ended"
 
 
 def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
@@ -62,17 +53,6 @@ def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
 def test_a_public_address_is_warned_about(run, small, served):
     done = run("view", small.fixes, "--map", small.map_path, "--host", "0.0.0.0")
     assert done.code == 0 and "anyone who can reach this computer" in done.err
-
-
-def test_no_browser_but_on_a_terminal(run, small, served, monkeypatch):
-    opened = []
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    monkeypatch.setenv("DISPLAY", ":0")
-    assert run("view", small.fixes, "--map", small.map_path).code == 0
-    assert opened == []
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    assert run("view", small.fixes, "--map", small.map_path, "--no-browser").code == 0
-    assert opened == [] and view_module._has_screen()
 
 
 def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp_path):

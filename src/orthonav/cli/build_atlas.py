@@ -85,8 +85,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Build, print a summary; returns 1 where a sheet failed."""
     from orthonav.core.errors import AtlasError
-    from orthonav.ground.atlas.build import build_atlas
-    from orthonav.ground.atlas.sheet_tasks import AtlasRequest
+    from orthonav.ground.atlas.build import AtlasRequest, build_atlas
     from orthonav.ground.planning.route import read_route
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:

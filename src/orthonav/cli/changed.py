@@ -10,7 +10,7 @@ from orthonav.core.errors import MapFileError
 if TYPE_CHECKING:
     from orthonav.cli.common import Progress
     from orthonav.core.flight.recording import Flight
-    from orthonav.core.localize.registration import RegistrationLocalizer
+    from orthonav.core.localize.localizer import RegistrationLocalizer
     from orthonav.core.mapfile.reader import MapFile
     from orthonav.core.records import ViewResult
     from orthonav.ground.changes.record import ChangedGround
@@ -51,9 +51,8 @@ def report_changes(
     """
     from orthonav.core.localize import Localizer
     from orthonav.core.mapfile.signature import map_digest
-    from orthonav.ground.changes.ground import changed_ground
+    from orthonav.ground.changes.ground import cell_side_m, changed_ground, views_beside_map
     from orthonav.ground.changes.record import ChangeGrid, write_changes
-    from orthonav.ground.changes.views import cell_side_m, views_beside_map
 
     if options.report_changes is None:
         return None

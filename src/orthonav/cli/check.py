@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from orthonav.ground.check.outcome import CheckedInputs
     from orthonav.ground.check.request import CheckRequest
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.planning.terrain import LegProfile
+    from orthonav.ground.planning.spacing import LegProfile
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -94,66 +94,47 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
         help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
     )
     heading = group.add_mutually_exclusive_group()
-    heading.add_argument(
-        "--yaw-std-deg",
-        type=float,
-        default=5.0,
-        help="standard deviation of the reported heading (default 5)",
-    )
+    _add_number(heading, "--yaw-std-deg", 5.0, "standard deviation of the reported heading")
     heading.add_argument(
         "--heading",
         choices=("known", "unknown"),
         default="known",
         help="known: with an error of --yaw-std-deg (default); unknown: all headings are tried",
     )
-    group.add_argument(
-        "--agl-std",
-        type=float,
-        metavar="FRACTION",
-        default=0.05,
-        help="standard deviation of the reported height, as a fraction of it (default 0.05)",
-    )
+    said = "standard deviation of the reported height, as a fraction of it"
+    _add_number(group, "--agl-std", 0.05, said, "FRACTION")
     prior = group.add_mutually_exclusive_group()
-    prior.add_argument(
-        "--prior-std-m",
-        type=float,
-        default=150.0,
-        help="standard deviation of the prior position, per axis (default 150)",
-    )
+    _add_number(prior, "--prior-std-m", 150.0, "standard deviation of the prior position, per axis")
     prior.add_argument(
         "--prior",
         choices=("telemetry", "none"),
         default="telemetry",
         help="telemetry: search around a prior position (default); none: search the whole map",
     )
-    group.add_argument(
-        "--relief-m",
-        type=float,
-        default=3.0,
-        help="standard deviation of the height of houses and trees, which causes relief "
-        "displacement (default 3)",
-    )
-    group.add_argument(
-        "--tilt-std-deg",
-        type=float,
-        default=1.5,
-        help="standard deviation of the error of the reported pitch and roll, which displaces "
-        "fixes (default 1.5)",
-    )
+    said = "standard deviation of the height of houses and trees, which causes relief displacement"
+    _add_number(group, "--relief-m", 3.0, said)
+    said = "standard deviation of the error of the reported pitch and roll, which displaces fixes"
+    _add_number(group, "--tilt-std-deg", 1.5, said)
     group.add_argument(
         "--other-sensor",
         action="store_true",
         help="camera and map imagery are of different kinds (drone against satellite, infrared): "
         "predicts fewer fixes",
     )
-    group.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
-    group.add_argument(
-        "--drift",
-        type=float,
-        metavar="FRACTION",
-        default=0.03,
-        help="error of dead reckoning per metre flown without a fix (default 0.03)",
-    )
+    _add_number(group, "--speed-mps", 20.0, "ground speed")
+    said = "error of dead reckoning per metre flown without a fix"
+    _add_number(group, "--drift", 0.03, said, "FRACTION")
+
+
+def _add_number(
+    group: argparse._ActionsContainer,
+    option: str,
+    default: float,
+    said: str,
+    metavar: str | None = None,
+) -> None:
+    said = f"{said} (default {default:g})"
+    group.add_argument(option, type=float, metavar=metavar, default=default, help=said)
 
 
 def _add_effort(group: argparse._ActionsContainer) -> None:
@@ -165,13 +146,7 @@ def _add_effort(group: argparse._ActionsContainer) -> None:
         help="criterion of a confident fix and its threshold, a confidence (default "
         "confidence:0.9)",
     )
-    group.add_argument(
-        "--effort",
-        type=float,
-        default=1.0,
-        metavar="FACTOR",
-        help="factor on the number of trials (default 1)",
-    )
+    _add_number(group, "--effort", 1.0, "factor on the number of trials", "FACTOR")
     group.add_argument(
         "--quick", action="store_true", help="skip the trials of other errors and other heights"
     )
@@ -186,7 +161,9 @@ def run(options: argparse.Namespace) -> int:
     import json
 
     from orthonav.ground.check.run import check_map
-    from orthonav.ground.check.write import require_free, to_json, verdict_text, write_check
+    from orthonav.ground.check.write import require_free, write_check
+    from orthonav.ground.check.write.plain import to_json
+    from orthonav.ground.check.write.wording import text
 
     require_free(options.out)
     request = _request(options)
@@ -196,7 +173,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print_json(json.loads(to_json(result)))
     else:
-        print(verdict_text(result))
+        print(text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
 
@@ -204,7 +181,7 @@ def run(options: argparse.Namespace) -> int:
 def _accepted(text: str) -> float:
     """The least confidence of `--accept`; raises `VariantError`."""
     from orthonav.core.errors import VariantError
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
 
     accept = Acceptance.parse(text)
     if accept.criterion != "confidence":
@@ -276,7 +253,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
     from orthonav.core.errors import CheckError
-    from orthonav.ground.planning.terrain import LANDING_M
+    from orthonav.ground.planning.spacing import LANDING_M
 
     if options.dem_datum is not None and options.dem is None:
         raise CheckError("--dem-datum needs a terrain model: give --dem too")
@@ -313,7 +290,7 @@ def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProf
     from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
-    from orthonav.ground.planning.terrain import profile
+    from orthonav.ground.planning.spacing import profile
 
     dem = dem_for_route(options, route)
     terrain = TerrainLayer.of(open_map(options.map)) if dem is None else dem

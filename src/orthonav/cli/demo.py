@@ -111,14 +111,13 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
     from orthonav.core.flight import open_flight, read_truth
-    from orthonav.core.flight.fixes import write_results
-    from orthonav.core.flight.identity import Identity, flight_digest
+    from orthonav.core.flight.fixes import Identity, flight_digest, write_results
     from orthonav.core.localize import Localizer
     from orthonav.core.mapfile import open_map
     from orthonav.ground.build import BuildRequest, build_map
-    from orthonav.ground.evaluate.flights import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.evaluate.metrics import compare, measure
     from orthonav.ground.evaluate.report import MadeFrom, write_report
+    from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
     from orthonav.onboard.run import SingleViews, localize_flight

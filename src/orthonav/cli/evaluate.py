@@ -7,7 +7,7 @@ import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orthonav.cli.changed import (
     add_report_changes,
@@ -20,14 +20,12 @@ from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
     from orthonav.core.flight import FlightFolder
-    from orthonav.core.mapfile.layer import GreyLayer
     from orthonav.core.mapfile.reader import MapFile
-    from orthonav.core.records import ViewResult
     from orthonav.ground.changes.record import ChangedGround
     from orthonav.ground.evaluate.contact_sheet import Row
-    from orthonav.ground.evaluate.flights import FlightReport
-    from orthonav.ground.evaluate.metrics import Comparison, Metrics
-    from orthonav.ground.report import Background
+    from orthonav.ground.evaluate.metrics import Metrics
+    from orthonav.ground.evaluate.tables import FlightReport
+    from orthonav.ground.report.drawing import Background
 
 log = logging.getLogger(__name__)
 
@@ -90,10 +88,41 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
-    from orthonav.core.errors import FlightError
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.evaluate.flights import flights_to_json, total
+    from orthonav.ground.evaluate.tables import (
+        covariance_verdict,
+        flights_to_json,
+        summary,
+        table,
+        total,
+        verdict,
+    )
+
+    _check_options(options)
+    opened = open_map(options.map) if options.map else None
+    flights = _measured(options, opened)
+    whole = total(flights)
+    if options.report:
+        _write_report(options.report, flights, whole, opened)
+    changed = _changed(options, opened)
+    plain = flights_to_json(flights, whole) | changes_to_plain(options, changed)
+    if options.metrics:
+        write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+    with beside(options.metrics, options.report_changes):
+        if options.json:
+            print_json(plain)
+        else:
+            print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
+            print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+            report = [f"report: {options.report / 'index.html'}"] if options.report else []
+            for line in (*changes_text(options, changed), *report):
+                print(line)
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    """Raise what is wrong with the options; fill in one flight and one truth per file of fixes."""
+    from orthonav.core.errors import FlightError
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
     options.truth = _one_each(options.truth, options.fixes, "--truth")
@@ -102,28 +131,16 @@ def run(options: argparse.Namespace) -> None:
         options.wrong_usage(
             "give --flight FLIGHT_DIR, whose truth.csv is used, or --truth truth.csv"
         )
-    if not 0 < options.radius_m < 1e7:
-        raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
-    if not 0 < options.rpe_distance_m < 1e7:
-        raise FlightError(f"--rpe-distance-m must be above 0, got {options.rpe_distance_m}")
+    for option in ("radius_m", "rpe_distance_m"):
+        value = getattr(options, option)
+        if not 0 < value < 1e7:
+            raise FlightError(f"--{option.replace('_', '-')} must be above 0, got {value}")
     if options.report:
         require_extras("evaluate --report")
     if options.report_changes and not (options.map and options.flight):
         raise FlightError(
             "--report-changes compares views with the map; give --map and --flight too"
         )
-    opened = open_map(options.map) if options.map else None
-    flights = _measured(options, opened)
-    whole = total(flights)
-    if options.report:
-        _write_report(options.report, flights, whole, opened)
-    plain = flights_to_json(flights, whole)
-    changed = _changed(options, opened)
-    plain |= changes_to_plain(options, changed)
-    if options.metrics:
-        write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    with beside(options.metrics, options.report_changes):
-        _print(options, flights, whole, plain, changed)
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
@@ -138,27 +155,6 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
             f"{len(given)}"
         )
     return given
-
-
-def _print(
-    options: argparse.Namespace,
-    flights: "list[FlightReport]",
-    whole: "Metrics",
-    plain: dict[str, Any],
-    changed: "ChangedGround | None",
-) -> None:
-    from orthonav.ground.evaluate.calibration_report import covariance_verdict
-    from orthonav.ground.evaluate.flights import summary, table, verdict
-
-    if options.json:
-        print_json(plain)
-        return
-    print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
-    print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
-    for line in changes_text(options, changed):
-        print(line)
-    if options.report:
-        print(f"report: {options.report / 'index.html'}")
 
 
 def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
@@ -180,17 +176,16 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     """Metrics of every flight, with its worst views if their images are given."""
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
-    from orthonav.ground.evaluate.flights import FlightReport
-    from orthonav.ground.evaluate.gnss import measure_gnss
-    from orthonav.ground.evaluate.metrics import compare, measure
-    from orthonav.ground.evaluate.track import measure_track
-    from orthonav.ground.evaluate.truth import check_truth
+    from orthonav.ground.evaluate.contact_sheet import worst_rows
+    from orthonav.ground.evaluate.metrics import check_truth, compare, measure
+    from orthonav.ground.evaluate.tables import FlightReport
+    from orthonav.ground.evaluate.track import measure_gnss, measure_track
+    from orthonav.ground.report.imagery import SheetImagery
 
-    local = opened.manifest.sheets[0].frame if opened else None
+    sheet = SheetImagery(opened) if opened else None
+    local = sheet.frame if sheet else None
     background = map_background(opened) if opened else None
-    layer = _grey_layer(opened) if opened and options.flight and options.report else None
     folders = [open_flight(path, images_needed=False) for path in options.flight]
-    names = _names(options.fixes)
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
         results = read_results(fixes)
@@ -199,14 +194,20 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
         _warn_of_another_run(fixes, truth, folders[i] if folders else None, opened)
         worst: tuple[Row, ...] = ()
-        if opened and layer:
-            worst = _worst(comparison, results, folders[i], opened, layer)
+        if sheet and folders and options.report:
+            worst = tuple(worst_rows(comparison, results, folders[i], sheet))
         metrics = measure(comparison, options.radius_m, rpe_distance_m=options.rpe_distance_m)
-        track = measure_track(comparison, results, options.radius_m)
-        gnss = measure_gnss(comparison, results)
-        command = _view_command(options, i)
         flights.append(
-            FlightReport(names[i], comparison, metrics, background, track, worst, gnss, command)
+            FlightReport(
+                _names(options.fixes)[i],
+                comparison,
+                metrics,
+                background,
+                measure_track(comparison, results, options.radius_m),
+                worst,
+                measure_gnss(comparison, results),
+                _view_command(options, i),
+            )
         )
     return flights
 
@@ -220,7 +221,7 @@ def _warn_of_another_run(
     """
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
-    from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity
 
     if flight is None and (truth.parent / "telemetry.csv").is_file():
         with suppress(OrthonavError):
@@ -233,31 +234,6 @@ def _warn_of_another_run(
     )
     if other:
         log.warning("fixes are of %s: %s", other, fixes)
-
-
-def _grey_layer(opened: "MapFile") -> "GreyLayer":
-    """The grey pyramid of a map; raises `MapFileError` without one."""
-    from orthonav.core.errors import MapFileError
-    from orthonav.core.mapfile.layer import GreyLayer
-
-    layer = GreyLayer.of(opened)
-    if layer is None:
-        raise MapFileError(f"--flight needs a map with a registration layer: {opened.path}")
-    return layer
-
-
-def _worst(
-    comparison: "Comparison",
-    results: "list[ViewResult]",
-    folder: "FlightFolder",
-    opened: "MapFile",
-    layer: "GreyLayer",
-) -> "tuple[Row, ...]":
-    """Rows of the contact sheet of one flight."""
-    from orthonav.ground.evaluate.contact_sheet import worst_rows
-
-    grid = opened.manifest.sheets[0].grid
-    return tuple(worst_rows(comparison, results, folder, layer, grid))
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -305,6 +281,6 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
 def map_background(opened: "MapFile") -> "Background":
     """The preview of a map as background; raises `MapFileError` where it is damaged."""
     from orthonav.core.mapfile.layer import preview
-    from orthonav.ground.report import Background
+    from orthonav.ground.report.drawing import Background
 
-    return Background(preview(opened), *opened.manifest.sheets[0].grid.extent_en_m)
+    return Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)

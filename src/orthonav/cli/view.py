@@ -76,9 +76,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read the run and serve it until interrupted."""
-    from orthonav.ground.view.assets import load_assets
-    from orthonav.ground.view.opening import ViewRequest, open_run
-    from orthonav.ground.view.server import Pages, Server
+    from orthonav.ground.view.run import ViewRequest, open_run
+    from orthonav.ground.view.server import Pages, Server, load_assets
 
     request = ViewRequest(
         run=options.run,

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.errors import MapFileError
 from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.whitened import CellSheet
 
 MIDDLE, LEVELS = 128, 127
 WHOLE = 255

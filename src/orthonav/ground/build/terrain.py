@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError
-from orthonav.ground.planning.area import Area
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.imagery.terrain import Dem
 from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, MAX_POSTING_M, TerrainInfo
 from orthonav.core.mapfile.terrain import encode_terrain, terrain_part_names
-from orthonav.ground.build.layout import rounded_gsd_m
+from orthonav.ground.build.sheet import rounded_gsd_m
+from orthonav.ground.imagery.terrain import Dem
+from orthonav.ground.planning.area import Area
 
 POSTING_M = 10.0
 """Distance of samples; that of the terrain model where it is coarser."""

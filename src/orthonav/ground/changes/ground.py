@@ -1,19 +1,211 @@
-"""From views beside the map to the ground that changed.
+"""One view beside the map: how well they agree in every cell of the ground.
 
-Light, exposure and haze are taken out by an affine relation of a view's tone to the map's, fitted
-to the cells whose structure agrees and which did not change, and held to that of the whole flight.
-What is left is measured in units of what is usual on this flight where the ground is the same, so
-that seasons count less where they change everything. Scores of a cell are the median over views.
+Two kinds of evidence. *Structure*: the correlation of grey levels without local mean and contrast,
+as registration compares them. *Tone*: the mean grey levels of view and map, from which
+`orthonav.ground.changes.ground` takes light and exposure out.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.errors import OrthonavError
+from orthonav.core.flight.recording import Flight
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.view import PreparedView, check_view
+from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
+from orthonav.core.register.channels import channels_of
+from orthonav.core.register.pose import Pose
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid
-from orthonav.ground.changes.views import SeenCells
+
+CELLS_PER_VIEW = 8.0
+"""Cells along the side of a view: each has some 16 x 16 pixels of the level it is compared at."""
+MIN_COVER = 0.5
+"""A view counts in the cells of which it shows at least this share."""
+MIN_MOVE = 0.25
+"""A view counts only if it moved by this share of its side since the last one that counted: views
+of one place under one light are one view."""
+MIN_BLOCKS_T = 2.5
+"""Views whose blocks agree less at their place are left out (blur, cloud, a wrong position). Chance
+reaches this in 0.6 % of views."""
+TILT_DEG = 5.0
+"""Unreported tilt that a view may be displaced by from where its fix puts it."""
+AGL_STD, YAW_STD_DEG = 0.03, 2.0
+"""Standard deviations of the height (a share of it) and heading of a fix."""
+_GREY, _VALID = 2, 3
+"""Channels of the evidence."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCells:
+    """Cells (N,) that one view shows, as numbers row by row, and what it says of each.
+
+    `structure`: correlation with the map, -1 to 1; `view_tone`, `map_tone`: mean grey levels.
+    """
+
+    cells: NDArray[np.intp]
+    structure: Array
+    view_tone: Array
+    map_tone: Array
+
+
+def cell_side_m(flights: Sequence[tuple[Camera, Sequence[ViewResult]]]) -> float | None:
+    """Side of the cells for these flights, by the median view; None without a confident fix."""
+    sides = [
+        result.outcome.agl_m * math.sqrt(math.prod(camera.extent))
+        for camera, results in flights
+        for result in results
+        if isinstance(result.outcome, Fix) and result.is_confident
+    ]
+    return float(np.median(sides)) / CELLS_PER_VIEW if sides else None
+
+
+def views_beside_map(
+    registration: RegistrationLocalizer,
+    grid: ChangeGrid,
+    flight: Flight,
+    results: Sequence[ViewResult],
+    progress: Callable[[float], None] = lambda share: None,
+) -> Iterator[SeenCells]:
+    """The confident views of a flight beside the map, those left out that hardly moved.
+
+    Pictures that cannot be decoded are left out. Raises `CameraError` where one has not the
+    camera's size.
+    """
+    confident: Mapping[str, Fix] = {
+        result.frame: result.outcome
+        for result in results
+        if isinstance(result.outcome, Fix) and result.is_confident
+    }
+    last, done = None, 0
+    for view in flight.views:
+        fix = confident.get(view.frame)
+        if fix is None:
+            continue
+        done += 1
+        progress(done / len(confident))
+        place = grid.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+        side_m = fix.agl_m * math.sqrt(math.prod(flight.camera.extent))
+        if last is not None and math.dist(place, last) < MIN_MOVE * side_m:
+            continue
+        try:
+            shown = View(view.grey(), flight.camera, view.telemetry)
+        except OrthonavError:
+            continue
+        seen = beside_map(registration, grid, shown, fix)
+        if seen is not None:
+            last = place
+            yield seen
+
+
+def beside_map(
+    registration: RegistrationLocalizer, grid: ChangeGrid, view: View, fix: Fix
+) -> SeenCells | None:
+    """A view beside the map where its fix puts it; None where it cannot be compared there."""
+    pitch_deg, roll_deg = fix.tilt_deg(view.telemetry)
+    telemetry = replace(
+        view.telemetry,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
+        yaw_deg=fix.heading_deg,
+        agl_m=fix.agl_m,
+        yaw_std_deg=YAW_STD_DEG,
+        agl_std_m=AGL_STD * fix.agl_m,
+    )
+    view = replace(view, telemetry=telemetry)
+    if check_view(view, registration.grid.gsd_m, heading_known=True) is not None:
+        return None
+    # Fixes of tiles and of earlier versions may not state the tilt.
+    tilt_m = fix.agl_m * math.tan(math.radians(TILT_DEG))
+    std_m = math.hypot(math.sqrt(float(np.trace(fix.cov_en_m2)) / 2), tilt_m)
+    if not math.isfinite(std_m):
+        return None
+    search = registration.search(view, Prior(fix.lat_deg, fix.lon_deg, std_m))
+    if isinstance(search, NoFix):
+        return None
+    found = search.run()
+    if isinstance(found, NoFix) or not found.fit.blocks_t >= MIN_BLOCKS_T:
+        return None
+    return _compared(registration, grid, search.view, found.pose)
+
+
+def _compared(
+    registration: RegistrationLocalizer, grid: ChangeGrid, view: PreparedView, pose: Pose
+) -> SeenCells | None:
+    level = view.levels.final
+    rectified = view.rectified_at(level)
+    shape = rectified.grey.shape
+    map_grey, map_valid = _map_under(registration, pose, level, (shape[0], shape[1]))
+    mine = channels_of(rectified.grey, rectified.valid)
+    theirs = channels_of(map_grey, map_valid)
+    counts = (mine[..., _VALID] > 0) & (theirs[..., _VALID] > 0)
+    numbers = _cell_numbers(registration, grid, pose, 2.0**level, (shape[0], shape[1]))
+    inside = counts & (numbers >= 0)
+    if not inside.any():
+        return None
+    used, index = np.unique(numbers[inside], return_inverse=True)
+
+    def sums(values: NDArray[np.generic]) -> Array:
+        weights = values[inside].astype(np.float64)
+        return np.asarray(np.bincount(index, weights, len(used)), np.float64)
+
+    a, b = mine[..., _GREY], theirs[..., _GREY]
+    pixels = sums(np.ones(shape))
+    structure = sums(a * b) / np.sqrt(np.maximum(sums(a * a) * sums(b * b), 1e-9))
+    pixel_m = registration.grid.gsd_m * 2**level * math.exp(pose.log_scale)
+    kept = pixels >= MIN_COVER * (grid.side_m / pixel_m) ** 2
+    if not kept.any():
+        return None
+    tones = [sums(each) / pixels for each in (rectified.grey, map_grey)]
+    return SeenCells(used[kept], structure[kept], tones[0][kept], tones[1][kept])
+
+
+def _map_under(
+    registration: RegistrationLocalizer, pose: Pose, level: int, shape: tuple[int, int]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Grey and valid (H, W) of the map as a view's window at `pose` shows it."""
+    height, width = shape
+    unit = 2.0**level
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]
+    at = pose.map_px(corners * unit) / unit
+    low, high = np.floor(at.min(axis=0)).astype(int) - 2, np.ceil(at.max(axis=0)).astype(int) + 2
+    size = high - low
+    grey, valid = registration.pyramid.read(level, low[1], low[0], int(size[1]), int(size[0]))
+    linear = pose.linear
+    middle = np.array([pose.x_px, pose.y_px]) / unit - low
+    # Pixel-is-area to pixel centres: source and target are both half a pixel off.
+    move = middle - linear @ [width / 2 - 0.5, height / 2 - 0.5] - 0.5
+    matrix = np.column_stack([linear, move])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpAffine(grey, matrix, (width, height), flags=flags)
+    whole = cv2.warpAffine(valid.astype(np.uint8) * 255, matrix, (width, height), flags=flags)
+    return np.asarray(warped, np.uint8), np.asarray(whole) > 252
+
+
+def _cell_numbers(
+    registration: RegistrationLocalizer,
+    grid: ChangeGrid,
+    pose: Pose,
+    unit: float,
+    shape: tuple[int, int],
+) -> NDArray[np.intp]:
+    """Number of the cell (H, W) under every pixel of a view's window, -1 outside the grid."""
+    height, width = shape
+    x = (np.arange(width) + 0.5 - width / 2) * unit
+    y = (np.arange(height) + 0.5 - height / 2) * unit
+    at = pose.map_px(np.stack(np.meshgrid(x, y), axis=-1))
+    sheet = registration.grid
+    east = sheet.west_m + at[..., 0] * sheet.gsd_m
+    north = sheet.north_m - at[..., 1] * sheet.gsd_m
+    return grid.numbers(np.stack([east, north], axis=-1))
+
 
 # Chosen on the scenes of `python -m benchmarks.changes` (docs/changes.md).
 TONE_WEIGHT, STRUCTURE_WEIGHT, BIAS = 2.0, 2.0, 3.0
@@ -36,8 +228,6 @@ _FLIGHT_SPREAD = 200.0
 """Variance of the tones (grey levels squared) that these cells stand for."""
 _STEPS = 8
 _LEAST_WEIGHT = 1e-3
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -30,18 +30,61 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ChangeGrid:
-    """Square cells of `side_m` in the plane `frame`, from a north-west corner, row 0 in the north.
+class CellGrid:
+    """Square cells of `side_m` from a north-west corner, row 0 in the north."""
 
-    Raises `FlightError` for sizes that cannot be.
-    """
-
-    frame: LocalFrame
     west_m: float
     north_m: float
     side_m: float
     rows: int
     cols: int
+
+    @classmethod
+    def over(cls, extent: tuple[float, float, float, float], side_m: float) -> "CellGrid":
+        """Cells over an extent (west, south, east, north)."""
+        west, south, east, north = extent
+        rows, cols = (max(1, math.ceil(d / side_m - 1e-9)) for d in (north - south, east - west))
+        return cls(west, north, side_m, rows, cols)
+
+    @property
+    def centres_en_m(self) -> Array:
+        """Centres (rows * cols, 2) of the cells, row by row."""
+        east = self.west_m + (np.arange(self.cols) + 0.5) * self.side_m
+        north = self.north_m - (np.arange(self.rows) + 0.5) * self.side_m
+        return np.stack(np.meshgrid(east, north), axis=-1).reshape(-1, 2)
+
+    def drawn(self, rng: np.random.Generator) -> Array:
+        """A random point in every cell (rows * cols, 2)."""
+        off = rng.uniform(-0.5, 0.5, (self.rows * self.cols, 2)) * self.side_m
+        return np.asarray(self.centres_en_m + off)
+
+    def numbers(self, points_en_m: Array, margin: int = 0) -> NDArray[np.intp]:
+        """Number (...) of the cell, row by row, under each of points (..., 2); -1 outside.
+
+        `margin` cells are added and counted on each side.
+        """
+        cols = np.floor((points_en_m[..., 0] - self.west_m) / self.side_m).astype(np.intp) + margin
+        rows = np.floor((self.north_m - points_en_m[..., 1]) / self.side_m).astype(np.intp) + margin
+        height, width = self.rows + 2 * margin, self.cols + 2 * margin
+        inside = (rows >= 0) & (cols >= 0) & (rows < height) & (cols < width)
+        return np.where(inside, rows * width + cols, -1)
+
+    def counts(self, points_en_m: Array) -> NDArray[np.int32]:
+        """Number (rows, cols) of points (N, 2) in each cell."""
+        found = np.bincount(self.numbers(points_en_m) + 1, minlength=self.rows * self.cols + 1)
+        return found[1:].astype(np.int32).reshape(self.rows, self.cols)
+
+    def ring_en_m(self, row: int, col: int) -> Array:
+        """Corners (5, 2) of a cell, counter-clockwise, the first one again at the end."""
+        corners = (_CORNERS + np.array([col, row])) * (self.side_m, -self.side_m)
+        return np.asarray(corners + np.array([self.west_m, self.north_m]))
+
+
+@dataclass(frozen=True)
+class ChangeGrid(CellGrid):
+    """Cells in the plane `frame`. Raises `FlightError` for sizes that cannot be."""
+
+    frame: LocalFrame
 
     def __post_init__(self) -> None:
         finite = all(map(math.isfinite, (self.west_m, self.north_m, self.side_m)))
@@ -55,18 +98,17 @@ class ChangeGrid:
     @classmethod
     def of_sheet(cls, sheet: SheetInfo, side_m: float) -> "ChangeGrid":
         """Cells over a sheet of a map, of a side or as small as `MAX_CELLS` allows."""
-        grid = sheet.grid
-        size_m = grid.height_px * grid.gsd_m, grid.width_px * grid.gsd_m
-        side_m = max(side_m, math.sqrt(math.prod(size_m) / (0.9 * MAX_CELLS)))
-        rows, cols = (max(1, math.ceil(length / side_m - 1e-9)) for length in size_m)
-        return cls(sheet.frame, grid.west_m, grid.north_m, side_m, rows, cols)
+        west, south, east, north = extent = sheet.grid.extent_en_m
+        least_m = math.sqrt((east - west) * (north - south) / (0.9 * MAX_CELLS))
+        return cls(**vars(CellGrid.over(extent, max(side_m, least_m))), frame=sheet.frame)
 
-    def numbers(self, points_en_m: Array) -> NDArray[np.intp]:
-        """Number of the cell, row by row, under each of points (..., 2); -1 outside."""
-        cols = np.floor((points_en_m[..., 0] - self.west_m) / self.side_m).astype(np.intp)
-        rows = np.floor((self.north_m - points_en_m[..., 1]) / self.side_m).astype(np.intp)
-        inside = (rows >= 0) & (cols >= 0) & (rows < self.rows) & (cols < self.cols)
-        return np.where(inside, rows * self.cols + cols, -1)
+
+def lonlat(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
+    """Longitude and latitude of points (N, 2) for GeoJSON, with no jump at the date line."""
+    lat, lon = frame.latlon_from_en(points_en_m)
+    lon = frame.lon_deg + (lon - frame.lon_deg + 180) % 360 - 180
+    found: list[list[float]] = np.round(np.stack([lon, lat], axis=-1), 7).tolist()
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +165,7 @@ def write_changes(path: Path, found: ChangedGround) -> None:
         "version": VERSION,
         "map": {"name": found.map_name, "sha256": found.map_sha256},
         "plane": {"origin_lat_deg": grid.frame.lat_deg, "origin_lon_deg": grid.frame.lon_deg},
-        "cells": {
-            "rows": grid.rows,
-            "cols": grid.cols,
-            "side_m": grid.side_m,
-            "west_m": grid.west_m,
-            "north_m": grid.north_m,
-        },
+        "cells": {name: each for name, each in vars(grid).items() if name != "frame"},
     }
     lines = [json.dumps(_feature(found, row, col)) for row, col in np.argwhere(found.views > 0)]
     start = json.dumps(head, ensure_ascii=False, allow_nan=False)[:-1]
@@ -138,10 +174,6 @@ def write_changes(path: Path, found: ChangedGround) -> None:
 
 
 def _feature(found: ChangedGround, row: int, col: int) -> dict[str, Any]:
-    grid = found.grid
-    ring = (_CORNERS + np.array([col, row])) * (grid.side_m, -grid.side_m)
-    lat, lon = grid.frame.latlon_from_en(ring + np.array([grid.west_m, grid.north_m]))
-    lon = grid.frame.lon_deg + (lon - grid.frame.lon_deg + 180) % 360 - 180  # across the date line
     return {
         "type": "Feature",
         "properties": {
@@ -154,7 +186,7 @@ def _feature(found: ChangedGround, row: int, col: int) -> dict[str, Any]:
         },
         "geometry": {
             "type": "Polygon",
-            "coordinates": [np.round(np.stack([lon, lat], axis=-1), 7).tolist()],
+            "coordinates": [lonlat(found.grid.frame, found.grid.ring_en_m(row, col))],
         },
     }
 
@@ -187,14 +219,9 @@ def read_changes(path: Path) -> ChangedGround:
 def _from_plain(plain: dict[str, Any]) -> ChangedGround:
     plane, cells = plain["plane"], plain["cells"]
     frame = LocalFrame(float(plane["origin_lat_deg"]), float(plane["origin_lon_deg"]))
-    grid = ChangeGrid(
-        frame,
-        float(cells["west_m"]),
-        float(cells["north_m"]),
-        float(cells["side_m"]),
-        int(cells["rows"]),
-        int(cells["cols"]),
-    )
+    west_m, north_m, side_m = (float(cells[name]) for name in ("west_m", "north_m", "side_m"))
+    rows, cols = (int(cells[name]) for name in ("rows", "cols"))
+    grid = ChangeGrid(west_m, north_m, side_m, rows, cols, frame)
     shape = grid.rows, grid.cols
     score, views = np.full(shape, np.nan), np.zeros(shape, np.int32)
     changed = np.zeros(shape, np.bool_)

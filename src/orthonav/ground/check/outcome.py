@@ -4,13 +4,17 @@
 probability refers to one view; NaN means unknown (no imagery, or outside the band of the route).
 """
 
+import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import CONFIDENT
+from orthonav.ground.changes.record import CellGrid
 
 Array = NDArray[np.float64]
 
@@ -77,6 +81,11 @@ class Cells:
     trials: NDArray[np.int32]
     persistence: Array
     changed: Array
+
+    @property
+    def grid(self) -> CellGrid:
+        """The cells without their values."""
+        return CellGrid(self.west_m, self.north_m, self.side_m, *self.probability.shape)
 
 
 CELL_VALUES = {
@@ -264,3 +273,47 @@ class CheckResult:
     lookalikes: tuple[Lookalike, ...] = ()
     envelope: Envelope | None = None
     alternatives: tuple[Alternative, ...] = ()
+
+
+def summarize(result: CheckResult) -> dict[str, Any]:
+    """The key figures of a check, which the page, the terminal and `check.json` share.
+
+    `route_share_from_0_9`: fraction of the length with a probability of `CONFIDENT` or more.
+    `error_m`: expected error of a correct fix (root mean square), along the route or over the map.
+    `longest_stretch`: number of the longest gap, from 1. Without a route its figures are
+    NaN, 0 or None.
+    """
+    along, cells, stretches = result.along, result.cells, result.stretches
+    route_m = likely = math.nan
+    if along is None or not len(along.distance_m):
+        error_m = _rms(cells.error_m, cells.probability)
+    else:
+        route_m = float(along.distance_m[-1] - along.distance_m[0])
+        # Length of the route (N,) that each of its points represents.
+        lengths_m = np.gradient(along.distance_m) if route_m else np.ones(len(along.distance_m))
+        lengths_m[[0, -1]] /= 2 if route_m else 1
+        known = np.isfinite(along.probability)
+        confident = np.where(known, along.probability, 0.0) >= CONFIDENT
+        likely = float(lengths_m[confident].sum() / lengths_m.sum()) if known.any() else math.nan
+        error_m = _rms(along.error_m, lengths_m * np.nan_to_num(along.probability))
+    longest = max(stretches, key=lambda each: each.length_m, default=None)
+    return {
+        "area_km2": result.area_km2,
+        "second_date": result.second_date,
+        "mean_probability": result.mean,
+        "error_m": error_m,
+        "route_m": route_m,
+        "route_s": route_m / result.conditions.speed_mps,
+        "route_share_from_0_9": likely,
+        "blind_stretches": len(stretches),
+        "unrecoverable_stretches": sum(not each.recoverable for each in stretches),
+        "longest_stretch": None if longest is None else stretches.index(longest) + 1,
+    }
+
+
+def _rms(values: Array, weights: Array) -> float:
+    """Weighted root mean square of the known values; NaN for none."""
+    known = np.isfinite(values) & np.isfinite(weights) & (weights > 0)
+    if not known.any():
+        return math.nan
+    return float(np.sqrt(np.average(values[known] ** 2, weights=weights[known])))

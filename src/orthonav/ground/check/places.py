@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.register.reference import GreyPyramid
-from orthonav.ground.changes.record import ChangedGround
+from orthonav.core.register.window import GreyPyramid
+from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.planning.area import Area, Extent
 
 # Limits of work and of what a page can show; the benchmark's maps need no more trials.
@@ -30,52 +30,6 @@ _PROBES_ACROSS, _PROBES_PER_BAND, _MAX_POINTS = 400, 4, 1_000_000
 _SAMPLES_PER_CELL = 4
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class CellGrid:
-    """Square cells of `side_m` from a north-west corner, row 0 in the north."""
-
-    west_m: float
-    north_m: float
-    side_m: float
-    rows: int
-    cols: int
-
-    @classmethod
-    def over(cls, extent: Extent, side_m: float) -> "CellGrid":
-        """Cells over an extent (west, south, east, north)."""
-        west, south, east, north = extent
-        rows, cols = (max(1, math.ceil(d / side_m - 1e-9)) for d in (north - south, east - west))
-        return cls(west, north, side_m, rows, cols)
-
-    @property
-    def centres_en_m(self) -> Array:
-        """Centres (rows * cols, 2) of the cells, row by row."""
-        east = self.west_m + (np.arange(self.cols) + 0.5) * self.side_m
-        north = self.north_m - (np.arange(self.rows) + 0.5) * self.side_m
-        return np.stack(np.meshgrid(east, north), axis=-1).reshape(-1, 2)
-
-    def drawn(self, rng: np.random.Generator) -> Array:
-        """A random point in every cell (rows * cols, 2)."""
-        off = rng.uniform(-0.5, 0.5, (self.rows * self.cols, 2)) * self.side_m
-        return np.asarray(self.centres_en_m + off)
-
-    def numbers(self, points_en_m: Array, margin: int = 0) -> NDArray[np.intp]:
-        """Number (N,) of the cell, row by row, under each of points (N, 2); -1 outside.
-
-        `margin` cells are added and counted on each side.
-        """
-        cols = np.floor((points_en_m[:, 0] - self.west_m) / self.side_m).astype(np.intp) + margin
-        rows = np.floor((self.north_m - points_en_m[:, 1]) / self.side_m).astype(np.intp) + margin
-        height, width = self.rows + 2 * margin, self.cols + 2 * margin
-        inside = (rows >= 0) & (cols >= 0) & (rows < height) & (cols < width)
-        return np.where(inside, rows * width + cols, -1)
-
-    def counts(self, points_en_m: Array) -> NDArray[np.int32]:
-        """Number (rows, cols) of points (N, 2) in each cell."""
-        found = np.bincount(self.numbers(points_en_m) + 1, minlength=self.rows * self.cols + 1)
-        return found[1:].astype(np.int32).reshape(self.rows, self.cols)
 
 
 @dataclass(frozen=True, eq=False)

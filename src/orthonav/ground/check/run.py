@@ -16,14 +16,17 @@ from orthonav.core.files import Progress, no_progress
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import MAP_STD_M
-from orthonav.ground.check.envelope import (
+from orthonav.ground.changes.record import CellGrid
+from orthonav.ground.check.estimate import Prediction, Predictor
+from orthonav.ground.check.findings import (
+    blind_stretches,
     envelope_of,
     envelope_work,
+    found_lookalikes,
     heights_of,
     heights_work,
+    predicted_along,
 )
-from orthonav.ground.check.estimate import Prediction, Predictor
-from orthonav.ground.check.lookalikes import found_lookalikes
 from orthonav.ground.check.outcome import (
     Along,
     Alternative,
@@ -33,17 +36,21 @@ from orthonav.ground.check.outcome import (
     Envelope,
 )
 from orthonav.ground.check.places import (
-    CellGrid,
     MapCoverage,
     cell_side_m,
     checked_m2,
     trial_places,
 )
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.check.route import blind_stretches, predicted_along
-from orthonav.ground.check.trials import Trial, registration_of, run_many
+from orthonav.ground.check.trials import (
+    MIN_VALID,
+    Trial,
+    TrialPlan,
+    registration_of,
+    require_overlap,
+    run_many,
+)
 from orthonav.ground.check.verdict import verdict_of
-from orthonav.ground.check.views import MIN_VALID, TrialPlan, require_overlap
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
@@ -355,10 +362,8 @@ class _Check:
         route, widths = self.request.route, set(self.bands_m)
         if route is None or len(widths) != 1:
             return found
-        rows, cols = cells.probability.shape
-        grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, rows, cols)
         line = route.points_en_m(self.sheet.frame)
-        away_m = distance_to_polyline_m(grid.centres_en_m, line)
+        away_m = distance_to_polyline_m(cells.grid.centres_en_m, line)
         probability = cells.probability.ravel()
         bands = []
         for part in (*BANDS, 1.0):

@@ -10,13 +10,12 @@ Arrays only: no records, no files, no plots. Undefined figures are NaN.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, share, wilson
+from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, share_of, wilson
 
 N_BINS = 10
 """Of the reliability diagram, as usual for a few hundred fixes."""
@@ -118,7 +117,7 @@ def calibrate(
         ece=sum(gaps) / stated.size if stated.size else math.nan,
         brier=mean((stated - right) ** 2),
         mean_confidence=mean(stated),
-        share_right=share(int(np.count_nonzero(right)), stated.size),
+        share_right=share_of(right),
         bins=bins,
     )
 
@@ -141,9 +140,6 @@ def check_covariance(
     without = np.isnan(cov_en_m2).any(axis=(1, 2))
     usable = is_covariance(cov_en_m2)
     nees = np.sort(normalized_squared(errors_en_m[right][usable], cov_en_m2[usable]))
-    inside = {
-        p: share(int(np.count_nonzero(nees <= nees_bound(p))), nees.size) for p in NEES_LEVELS
-    }
     return CovarianceConsistency(
         n_right=int(np.count_nonzero(right)),
         n_without=int(np.count_nonzero(without)),
@@ -151,7 +147,7 @@ def check_covariance(
         nees=frozen(nees),
         nees_mean=mean(nees),
         nees_median=float(np.median(nees)) if nees.size else math.nan,
-        within=MappingProxyType(inside),
+        within={level: share_of(nees <= nees_bound(level)) for level in NEES_LEVELS},
     )
 
 
@@ -211,4 +207,4 @@ def _is_radius(own_radius_m: FloatArray) -> NDArray[np.bool_]:
 def _bin(lower: float, upper: float, stated: FloatArray, right: NDArray[np.bool_]) -> Bin:
     n_right = int(np.count_nonzero(right))
     low, high = wilson(n_right, stated.size)
-    return Bin(lower, upper, stated.size, mean(stated), share(n_right, stated.size), low, high)
+    return Bin(lower, upper, stated.size, mean(stated), share_of(right), low, high)

@@ -5,20 +5,23 @@ criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined. Con
 covariance are checked in `calibration`, standard figures of the field are in `standard`.
 """
 
+import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import read_results
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.core.geo.swapped import HINT
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     ConfidenceCalibration,
@@ -29,15 +32,18 @@ from orthonav.ground.evaluate.calibration import (
 from orthonav.ground.evaluate.figures import (
     BoolArray,
     FloatArray,
+    Longest,
     frozen,
+    longest,
+    path_so_far_m,
     percentile,
+    seconds_since_first,
     share,
+    share_of,
     upper_bound,
     wilson,
 )
-from orthonav.ground.evaluate.gaps import Longest, longest, path_so_far_m, seconds_since_first
 from orthonav.ground.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
-from orthonav.ground.evaluate.truth import check_truth
 
 Positions = Mapping[str, tuple[float, float]]
 """Frame name -> (latitude, longitude) in degrees."""
@@ -55,6 +61,11 @@ CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     }
 )
 """Confidence criterion -> thresholds; a view is accepted if its value is at least that."""
+_OTHER_FLIGHT_M = 50_000.0
+"""A larger median error is none of the method: maps of one sheet are smaller."""
+_SWAPPED_M = 1000.0
+"""Nearer true positions are not examined: latitude and longitude may be nearly equal."""
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,43 +215,6 @@ def wrong_key(far_m: float) -> str:
     return f"wrong_by_{far_m:g}m"
 
 
-def compare(
-    truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
-) -> Comparison:
-    """Results matched with ground truth by frame name.
-
-    `local` is the plane of the positions, by default centred on the first true position. A true
-    position that is not finite counts as missing. Raises `FlightError` where no result has a
-    truth or a frame has two results.
-    """
-    known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
-    _refuse_twice(result.frame for result in results)
-    matched = [result for result in results if result.frame in known]
-    if not matched:
-        raise FlightError(_no_overlap(known, results))
-    local = local or LocalFrame(*known[matched[0].frame])
-    truth_en_m = _local(local, [known[result.frame] for result in matched])
-    fix_en_m = _local(local, [_position(result.outcome) for result in matched])
-    criteria = {name: frozen([_criterion(result, name) for result in matched]) for name in CRITERIA}
-    return Comparison(
-        lat_deg=local.lat_deg,
-        lon_deg=local.lon_deg,
-        frames=tuple(result.frame for result in matched),
-        time_ns=tuple(result.time_ns for result in matched),
-        truth_en_m=truth_en_m,
-        fix_en_m=fix_en_m,
-        errors_m=frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
-        cov_en_m2=frozen(np.array([_covariance(result.outcome) for result in matched])),
-        own_radius_m=frozen([_own_radius(result.outcome) for result in matched]),
-        confident=_flags([result.is_confident for result in matched]),
-        criteria=MappingProxyType(criteria),
-        reasons=tuple(_reason(result.outcome) for result in matched),
-        latency_ms=frozen([result.latency_ms for result in matched]),
-        n_without_truth=len(results) - len(matched),
-        n_without_result=len(known) - len(matched),
-    )
-
-
 def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
     """Metrics of a file of fixes (`fixes.jsonl`) against the true positions of a `truth.csv`.
 
@@ -252,6 +226,84 @@ def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Me
     return measure(compare(known, results), radius_m)
 
 
+def check_truth(
+    truth: Positions,
+    results: Sequence[ViewResult],
+    centre_latlon_deg: tuple[float, float] | None,
+    path: Path,
+) -> None:
+    """Log a warning where true positions are far from the fixes of the same views or, without any,
+    from the centre of the map.
+
+    Raises `FlightError` where they are near once latitude and longitude are exchanged.
+    """
+    both = [
+        (truth[result.frame], (result.outcome.lat_deg, result.outcome.lon_deg))
+        for result in results
+        if isinstance(result.outcome, Fix) and result.frame in truth
+    ]
+    compared = "the fixes" if both else "the map"
+    if not both and centre_latlon_deg is not None:
+        both = [(place, centre_latlon_deg) for place in truth.values()]
+    if not both:
+        return
+    true, expected = np.array(both).transpose(1, 0, 2)
+    far_m, swapped_m = (
+        float(np.nanmedian(distances_m(places, expected))) for places in (true, true[:, ::-1])
+    )
+    far = f"true positions are {far_m / 1000:,.0f} km from {compared} (median)"
+    if far_m > _SWAPPED_M and swapped_m < far_m / 10:
+        raise FlightError(f"{far}; {HINT}: {path}")
+    if far_m > _OTHER_FLIGHT_M:
+        log.warning("%s; are these of the same flight?: %s", far, path)
+
+
+def compare(
+    truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
+) -> Comparison:
+    """Results matched with ground truth by frame name.
+
+    `local` is the plane of the positions, by default centred on the first true position. A true
+    position that is not finite counts as missing. Raises `FlightError` where no result has a
+    truth or a frame has two results.
+    """
+    known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
+    twice = [name for name, n in Counter(result.frame for result in results).items() if n > 1]
+    if twice:
+        raise FlightError(f"{len(twice)} frames have more than one result, such as {twice[0]!r}")
+    matched = [result for result in results if result.frame in known]
+    if not matched:
+        first_known = repr(next(iter(known))) if known else "none"
+        first_result = repr(results[0].frame) if results else "none"
+        raise FlightError(
+            "no view has both a result and a true position: "
+            f"{len(results)} results (first {first_result}), {len(known)} true positions "
+            f"(first {first_known}); are these of the same flight?"
+        )
+    local = local or LocalFrame(*known[matched[0].frame])
+    outcomes = [result.outcome for result in matched]
+    truth_en_m = _local(local, [known[result.frame] for result in matched])
+    fix_en_m = _local(local, [_position(outcome) for outcome in outcomes])
+    radii_m = [outcome.radius_m if isinstance(outcome, Fix) else math.nan for outcome in outcomes]
+    return Comparison(
+        lat_deg=local.lat_deg,
+        lon_deg=local.lon_deg,
+        frames=tuple(result.frame for result in matched),
+        time_ns=tuple(result.time_ns for result in matched),
+        truth_en_m=truth_en_m,
+        fix_en_m=fix_en_m,
+        errors_m=frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
+        cov_en_m2=frozen(np.array([_covariance(outcome) for outcome in outcomes])),
+        own_radius_m=frozen(radii_m),
+        confident=np.array([result.is_confident for result in matched], dtype=np.bool_),
+        criteria={n: frozen([_criterion(each, n) for each in outcomes]) for n in CRITERIA},
+        reasons=tuple(_reason(outcome) for outcome in outcomes),
+        latency_ms=frozen([result.latency_ms for result in matched]),
+        n_without_truth=len(results) - len(matched),
+        n_without_result=len(known) - len(matched),
+    )
+
+
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
     """Several flights as one, for metrics; positions stay in their own planes.
 
@@ -259,31 +311,28 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
     """
     if not comparisons:
         raise ValueError("no results: expected at least one flight")
-    parts = list(comparisons)
-    starts: list[int] = []
-    views = 0
-    for part in parts:
-        starts += [views + start for start in part.starts]
-        views += len(part.frames)
-    joined = {n: frozen(np.concatenate([p.criteria[n] for p in parts])) for n in CRITERIA}
-    return Comparison(
-        lat_deg=parts[0].lat_deg,
-        lon_deg=parts[0].lon_deg,
-        frames=tuple(name for p in parts for name in p.frames),
-        time_ns=tuple(time for p in parts for time in p.time_ns),
-        truth_en_m=frozen(np.concatenate([p.truth_en_m for p in parts])),
-        fix_en_m=frozen(np.concatenate([p.fix_en_m for p in parts])),
-        errors_m=frozen(np.concatenate([p.errors_m for p in parts])),
-        cov_en_m2=frozen(np.concatenate([p.cov_en_m2 for p in parts])),
-        own_radius_m=frozen(np.concatenate([p.own_radius_m for p in parts])),
-        confident=_flags(np.concatenate([p.confident for p in parts])),
-        criteria=MappingProxyType(joined),
-        reasons=tuple(reason for p in parts for reason in p.reasons),
-        latency_ms=frozen(np.concatenate([p.latency_ms for p in parts])),
-        n_without_truth=sum(p.n_without_truth for p in parts),
-        n_without_result=sum(p.n_without_result for p in parts),
-        starts=tuple(starts),
+    lengths = [len(part.frames) for part in comparisons]
+    firsts = np.cumsum([0, *lengths[:-1]]).tolist()
+    joined: dict[str, Any] = {
+        field.name: _joined([getattr(part, field.name) for part in comparisons])
+        for field in fields(Comparison)
+    }
+    joined |= {"lat_deg": comparisons[0].lat_deg, "lon_deg": comparisons[0].lon_deg}
+    joined["starts"] = tuple(
+        first + start
+        for first, part in zip(firsts, comparisons, strict=True)
+        for start in part.starts
     )
+    return Comparison(**joined)
+
+
+def _joined(values: list[Any]) -> Any:
+    """Values of one field of several comparisons as one: joined, or counts added."""
+    if isinstance(values[0], np.ndarray):
+        return np.concatenate(values)
+    if isinstance(values[0], Mapping):
+        return {name: np.concatenate([each[name] for each in values]) for name in values[0]}
+    return sum(values, start=type(values[0])())
 
 
 def measure(
@@ -311,6 +360,13 @@ def measure(
     reasons = Counter(reason for reason in comparison.reasons if reason)
     if comparison.n_without_result:
         reasons[NO_RESULT] += comparison.n_without_result
+    standard, of_confident = (
+        standard_figures(comparison.truth_en_m, fix_en_m, comparison.starts, rpe_distance_m)
+        for fix_en_m in (
+            comparison.fix_en_m,
+            np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
+        )
+    )
     return Metrics(
         radius_m=float(radius_m),
         n_views=n_views,
@@ -325,13 +381,17 @@ def measure(
         availability_95=wilson(n_confident, n_views),
         coverage=share(of_fixes_m.size, n_views),
         gap=_longest_gap(comparison),
-        acc_at_m=_within(of_fixes_m, radii, n_views),
-        acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
-        accuracy_of_confident=share(int(np.count_nonzero(of_confident_m <= radius_m)), n_confident),
+        acc_at_m={r: share_of(of_fixes_m <= r, n_views) for r in radii},
+        acc_fixes_at_m={r: share_of(of_fixes_m <= r) for r in radii},
+        accuracy_of_confident=share_of(of_confident_m <= radius_m),
         latency_median_ms=percentile(comparison.latency_ms, 50.0),
         latency_p95_ms=percentile(comparison.latency_ms, 95.0),
-        reasons=MappingProxyType(dict(reasons.most_common())),
-        criteria=criterion_rows(comparison, radius_m, far_m),
+        reasons=dict(reasons.most_common()),
+        criteria=tuple(
+            _criterion_row(comparison, name, threshold, radius_m, far_m)
+            for name, thresholds in CRITERIA.items()
+            for threshold in thresholds
+        ),
         curves=tuple(criterion_curve(comparison, name, radius_m) for name in CRITERIA),
         calibration=calibrate(
             comparison.criteria["confidence"], errors_m, own_radius_m, float(radius_m)
@@ -339,26 +399,8 @@ def measure(
         consistency=check_covariance(
             errors_en_m, comparison.cov_en_m2, own_radius_m, float(radius_m)
         ),
-        standard=standard_figures(
-            comparison.truth_en_m, comparison.fix_en_m, comparison.starts, rpe_distance_m
-        ),
-        of_confident=standard_figures(
-            comparison.truth_en_m,
-            np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
-            comparison.starts,
-            rpe_distance_m,
-        ),
-    )
-
-
-def criterion_rows(
-    comparison: Comparison, radius_m: float, far_m: float = FAR_M
-) -> tuple[CriterionRow, ...]:
-    """One row per criterion and threshold of `CRITERIA`."""
-    return tuple(
-        _criterion_row(comparison, name, threshold, radius_m, far_m)
-        for name, thresholds in CRITERIA.items()
-        for threshold in thresholds
+        standard=standard,
+        of_confident=of_confident,
     )
 
 
@@ -431,21 +473,8 @@ def _longest_gap(comparison: Comparison) -> Longest:
 
 def _covariance(outcome: Fix | NoFix) -> FloatArray:
     """(2, 2) m2; NaN without one, and for one of another shape."""
-    nothing = np.full((2, 2), np.nan)
-    if not isinstance(outcome, Fix):
-        return nothing
-    stated = np.asarray(outcome.cov_en_m2, dtype=np.float64)
-    return stated if stated.shape == (2, 2) else nothing
-
-
-def _flags(values: Sequence[bool] | BoolArray) -> BoolArray:
-    flags = np.array(values, dtype=np.bool_)
-    flags.setflags(write=False)
-    return flags
-
-
-def _own_radius(outcome: Fix | NoFix) -> float:
-    return outcome.radius_m if isinstance(outcome, Fix) else math.nan
+    stated = np.asarray(outcome.cov_en_m2 if isinstance(outcome, Fix) else math.nan, np.float64)
+    return stated if stated.shape == (2, 2) else np.full((2, 2), np.nan)
 
 
 def _position(outcome: Fix | NoFix) -> tuple[float, float]:
@@ -462,8 +491,7 @@ def _reason(outcome: Fix | NoFix) -> str:
     return "" if _is_fix(outcome) else "not_finite"
 
 
-def _criterion(result: ViewResult, name: str) -> float:
-    outcome = result.outcome
+def _criterion(outcome: Fix | NoFix, name: str) -> float:
     if not isinstance(outcome, Fix) or not _is_fix(outcome):
         return math.nan
     return outcome.confidence if name == "confidence" else outcome.evidence.get(name, math.nan)
@@ -477,24 +505,3 @@ def _local(local: LocalFrame, positions: Sequence[tuple[float, float]]) -> Float
     if known.any():
         en_m[known] = local.en_from_latlon(lat_lon_deg[known, 0], lat_lon_deg[known, 1])
     return frozen(en_m)
-
-
-def _within(errors_m: FloatArray, radii_m: Iterable[float], total: int) -> Mapping[float, float]:
-    shares = {r: share(int(np.count_nonzero(errors_m <= r)), total) for r in radii_m}
-    return MappingProxyType(shares)
-
-
-def _refuse_twice(frames: Iterable[str]) -> None:
-    twice = [name for name, count in Counter(frames).items() if count > 1]
-    if twice:
-        raise FlightError(f"{len(twice)} frames have more than one result, such as {twice[0]!r}")
-
-
-def _no_overlap(known: Positions, results: Sequence[ViewResult]) -> str:
-    first_known = repr(next(iter(known))) if known else "none"
-    first_result = repr(results[0].frame) if results else "none"
-    return (
-        "no view has both a result and a true position: "
-        f"{len(results)} results (first {first_result}), {len(known)} true positions "
-        f"(first {first_known}); are these of the same flight?"
-    )

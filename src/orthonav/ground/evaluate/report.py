@@ -6,33 +6,29 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.ground.evaluate import plots
-from orthonav.ground.evaluate.calibration_report import (
+from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
+from orthonav.ground.evaluate.figures import share
+from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
+from orthonav.ground.evaluate.tables import (
+    FlightReport,
     bins_rows,
-    calibration_figures,
     confidence_text,
     covariance_card,
     covariance_text,
     criteria_header,
     criteria_rows,
+    gnss_rows,
     levels_rows,
     standard_rows,
+    table_header,
+    table_rows,
+    total,
+    track_rows,
+    verdict,
+    wrong_bound_text,
 )
-from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
-from orthonav.ground.evaluate.figures import share
-from orthonav.ground.evaluate.flights import FlightReport, table_header, table_rows, total, verdict
-from orthonav.ground.evaluate.gnss import gnss_figure, gnss_rows
-from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
-from orthonav.ground.evaluate.track_plots import track_figures
-from orthonav.ground.evaluate.track_report import track_rows
-from orthonav.ground.report import (
-    Figure,
-    file_names,
-    measure_text,
-    percent_text,
-    plain_text,
-    render,
-    write_page,
-)
+from orthonav.ground.report.numbers import measure_text, percent_text, plain_text
+from orthonav.ground.report.page import Figure, file_names, render, write_page
 
 _N_WORST = 10
 
@@ -47,7 +43,6 @@ class MadeFrom:
     flight: str = ""
     command: str = ""
     version: str = ""
-    date: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,39 +53,46 @@ class _Drawn:
     track: tuple[Figure, ...] = ()
     worst: tuple[Figure, ...] = ()
 
+    def named(self, name: str, file_name: str) -> "_Drawn":
+        """The same with the flight's name in texts and, if given, in file names.
+
+        Two dashes separate it: neither `file_names` nor the names of figures contain any.
+        """
+        start = f"{file_name}--" if file_name else ""
+
+        def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
+            return tuple(
+                replace(each, name=f"{start}{each.name}", alt=f"{name}: {each.alt}")
+                for each in figures
+            )
+
+        return _Drawn(named(self.general), named(self.track), named(self.worst))
+
 
 def write_report(
     out_dir: Path,
     flights: Sequence[FlightReport],
     made_from: MadeFrom | None = None,
-    title: str = "",
     whole: Metrics | None = None,
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
     `whole`: what `total` gives for these flights, computed where it is None. Figures are also
-    written beside the page, as `orthonav.ground.report.write_page` does. Raises `ValueError` as
-    `total`,
-    `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot be written.
+    written beside the page, as `orthonav.ground.report.page.write_page` does. Raises `ValueError`
+    as `total`, `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot
+    be written.
     """
-    page, figures = page_of(flights, whole or total(flights), made_from or MadeFrom(), title)
-    return write_page(out_dir, page, figures)
-
-
-def page_of(
-    flights: Sequence[FlightReport], whole: Metrics, made_from: MadeFrom, title: str = ""
-) -> tuple[str, list[Figure]]:
-    """The page as HTML, and its figures; those of several flights carry the flights' names."""
+    whole = whole or total(flights)
     several = len(flights) > 1
     drawn = [_drawn(flight) for flight in flights]
     if several:
         drawn.append(_Drawn(_figures(pool([flight.comparison for flight in flights]), whole)))
     names = [*(flight.name for flight in flights), "all flights"]
     files = file_names(names) if several else [""]
-    drawn = [_named(*each) for each in zip(drawn, names, files, strict=False)]
+    drawn = [each.named(*named) for each, *named in zip(drawn, names, files, strict=False)]
     subject = f"{len(flights)} flights" if several else flights[0].name
     values: dict[str, Any] = {
-        "title": title or f"Evaluation of {subject}",
+        "title": f"Evaluation of {subject}",
         "kind": "Evaluation of flights",
         "verdict": verdict(whole),
         "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
@@ -99,23 +101,26 @@ def page_of(
         "notes": _notes(whole),
         "radius": f"{whole.radius_m:g} m",
         "wrong_above": f"{whole.wrong_above_m:g} m",
-        "table_header": table_header(flights),
+        "table_header": table_header(whole),
         "table_rows": table_rows(flights, whole),
         "sections": [_section(*each) for each in zip(flights, drawn, strict=False)],
         "total_section": None,
-        "made_from": _made_from(made_from),
+        "made_from": [
+            ("orthonav" if name == "version" else name.removesuffix("_name"), text)
+            for name, text in vars(made_from or MadeFrom()).items()
+        ],
     }
     if several:
         figures = {"name": "all flights", "figures": drawn[-1].general}
         values["total_section"] = {**figures, **_trust(whole)}
     page = render("orthonav.ground.evaluate", "report.html", values)
-    return page, [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    shown = [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    return write_page(out_dir, page, shown)
 
 
 def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     of_confident, of_all = metrics.of_confident, metrics.standard
     low, high = (100 * each for each in metrics.availability_95)
-    bound = f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
     return (
         (
             percent_text(metrics.availability),
@@ -124,7 +129,8 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
         ),
         (
             f"{metrics.n_confident_wrong} of {metrics.n_confident}",
-            "false fixes among confident fixes" + f" ({bound})" * (metrics.n_confident > 0),
+            "false fixes among confident fixes"
+            + f" ({wrong_bound_text(metrics)})" * (metrics.n_confident > 0),
             "bad" if metrics.n_confident_wrong else "",
         ),
         (
@@ -195,17 +201,40 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
 
 def _trust(metrics: Metrics) -> dict[str, Any]:
     """Standard figures, criteria and calibration, for one flight or all."""
-    standard, more = standard_rows(metrics)
     return {
-        "standard": standard,
-        "standard_more": more,
+        "standard": standard_rows(metrics),
+        "standard_more": [
+            ("ECE", plain_text(metrics.calibration.ece)),
+            ("NEES (mean, 2 expected)", plain_text(metrics.consistency.nees_mean)),
+            ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
+        ],
         "criteria_header": criteria_header(metrics),
         "criteria": criteria_rows(metrics, plots.LABELS),
         "confidence": confidence_text(metrics),
-        "bins": bins_rows(metrics.calibration),
+        "bins": bins_rows(metrics),
         "covariance": covariance_text(metrics.consistency),
         "levels": levels_rows(metrics.consistency),
     }
+
+
+def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
+    wrong = comparison.confident_wrong(metrics.wrong_above_m)
+    for i in worst_views(comparison, _N_WORST, metrics.wrong_above_m):
+        east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
+        confidence = plain_text(comparison.criteria["confidence"][i])
+        rows.append(
+            (
+                comparison.frames[i],
+                f"{comparison.time_ns[i] / 1e9:.2f}",
+                measure_text(comparison.errors_m[i]) + (" ✗" if wrong[i] else ""),
+                f"{east_m:+.1f}",
+                f"{north_m:+.1f}",
+                confidence + ("" if comparison.confident[i] else ", low confidence"),
+                plain_text(comparison.criteria["peak_ratio"][i]),
+            )
+        )
+    return rows
 
 
 def _drawn(flight: FlightReport) -> _Drawn:
@@ -227,8 +256,8 @@ def _drawn(flight: FlightReport) -> _Drawn:
         ),
         *_figures(comparison, metrics),
     )
-    of_track = track_figures(comparison, track, radius_m, background) if track else []
-    of_gnss = [gnss_figure(flight.gnss)] if flight.gnss else []
+    of_track = plots.track_figures(comparison, track, radius_m, background) if track else []
+    of_gnss = [plots.gnss_figure(flight.gnss)] if flight.gnss else []
     return _Drawn(general, (*of_track, *of_gnss), _contact_sheet(flight))
 
 
@@ -261,52 +290,18 @@ def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
             "are correct, with thresholds; the ring marks a confidence of 0.9.",
             plots.criteria_picture(metrics),
         ),
-        *calibration_figures(metrics),
+        Figure(
+            "reliability",
+            f"Reliability diagram of confidence: {confidence_text(metrics)}",
+            "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); "
+            "dashed: ideal; orange: the difference. Below: fixes per bin.",
+            plots.reliability_picture(metrics.calibration),
+        ),
+        Figure(
+            "covariance",
+            f"Errors of correct fixes against covariance: {covariance_text(metrics.consistency)}",
+            "Errors of correct fixes in units of their covariance C; dashed: ideal; shaded: where "
+            "95 % of samples of this size stay.",
+            plots.nees_picture(metrics.consistency),
+        ),
     )
-
-
-def _named(drawn: _Drawn, name: str, file_name: str) -> _Drawn:
-    """The same with the flight's name in texts and, if given, in file names.
-
-    Two dashes separate it: neither `file_names` nor the names of figures contain any.
-    """
-    start = f"{file_name}--" if file_name else ""
-
-    def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
-        return tuple(
-            replace(each, name=f"{start}{each.name}", alt=f"{name}: {each.alt}") for each in figures
-        )
-
-    return _Drawn(named(drawn.general), named(drawn.track), named(drawn.worst))
-
-
-def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    wrong = comparison.confident_wrong(metrics.wrong_above_m)
-    for i in worst_views(comparison, _N_WORST, metrics.wrong_above_m):
-        east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
-        rows.append(
-            (
-                comparison.frames[i],
-                f"{comparison.time_ns[i] / 1e9:.2f}",
-                measure_text(comparison.errors_m[i]) + (" ✗" if wrong[i] else ""),
-                f"{east_m:+.1f}",
-                f"{north_m:+.1f}",
-                plain_text(comparison.criteria["confidence"][i])
-                + ("" if comparison.confident[i] else ", low confidence"),
-                plain_text(comparison.criteria["peak_ratio"][i]),
-            )
-        )
-    return rows
-
-
-def _made_from(made_from: MadeFrom) -> list[tuple[str, str]]:
-    return [
-        ("map", made_from.map_name),
-        ("recipe", made_from.recipe),
-        ("imagery", made_from.imagery),
-        ("flight", made_from.flight),
-        ("command", made_from.command),
-        ("orthonav", made_from.version),
-        ("date", made_from.date),
-    ]

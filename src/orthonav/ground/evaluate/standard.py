@@ -8,13 +8,13 @@ https://github.com/MichaelGrupp/evo/wiki/Metrics (translation part). ECE and NEE
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.evaluate.figures import FloatArray, or_none, percentile
+from orthonav.ground.evaluate.figures import FloatArray, percentile
 
 RPE_FRAMES = 1
 """evo's default delta: from each pose to the next."""
@@ -121,22 +121,3 @@ def _marks(truth_en_m: FloatArray, distance_m: float) -> NDArray[np.intp]:
             marks.append(i)
             path_m = 0.0
     return np.array(marks, dtype=np.intp)
-
-
-def standard_to_json(figures: StandardFigures) -> dict[str, object]:
-    """`figures` as values for strict JSON; undefined ones become None."""
-
-    def plain(statistics: ErrorStatistics) -> dict[str, object]:
-        values = asdict(statistics)
-        return {"n": values.pop("n"), **{name: or_none(each) for name, each in values.items()}}
-
-    return {
-        "rmse_m": or_none(figures.ape.rmse_m),
-        "cep50_m": or_none(figures.cep50_m),
-        "cep95_m": or_none(figures.cep95_m),
-        "ape": plain(figures.ape),
-        "rpe": [
-            {"delta": RPE_FRAMES, "unit": "frames", **plain(figures.rpe_frames)},
-            {"delta": figures.distance_m, "unit": "m", **plain(figures.rpe_distance)},
-        ],
-    }

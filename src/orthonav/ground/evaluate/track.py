@@ -8,12 +8,14 @@ figures in seconds are undefined: NaN, and null in JSON.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.flight.fixes import STATES
+from orthonav.core.flight.gnss import biases_of, fault_of, gnss_of
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     is_covariance,
@@ -23,20 +25,21 @@ from orthonav.ground.evaluate.calibration import (
 )
 from orthonav.ground.evaluate.figures import (
     FloatArray,
-    frozen,
-    mean,
-    percentile,
-    runs,
-    share,
-)
-from orthonav.ground.evaluate.gaps import (
     Longest,
+    frozen,
     longest,
     longest_stretch,
+    mean,
     path_so_far_m,
+    percentile,
+    runs,
     seconds_since_first,
+    share_of,
 )
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison
+
+if TYPE_CHECKING:
+    pass
 
 RADII_M = (25.0, 60.0)
 """Radii of accuracy: a usual and a large error of a track."""
@@ -173,7 +176,7 @@ def measure_track(
     rows = np.array([number[frame] for frame in comparison.frames], dtype=np.intp)
     states = np.array([result.state or "" for result in results])
     seconds_s = seconds_since_first([result.time_ns for result in results])
-    path_m = _path_m(comparison.truth_en_m, rows, len(results))
+    path_m = np.interp(np.arange(len(results)), rows, path_so_far_m(comparison.truth_en_m))
     confident = np.array([result.is_confident for result in results])
     tracking = states == "tracking"
     confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
@@ -184,15 +187,23 @@ def measure_track(
     )
     low_confidence = ~(tracking & confident)
     found = first < len(results)
+    after_m = comparison.errors_m[rows >= first]
     series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
     return TrackMetrics(
         n_views=len(results),
         n_compared=len(rows),
         first_view=first + 1 if found else math.nan,
         first_s=float(seconds_s[first]) if found else math.nan,
-        after=_after(comparison.errors_m[rows >= first], radius_m),
+        after=After(
+            n_views=after_m.size,
+            n_fixes=int(np.isfinite(after_m).sum()),
+            error_median_m=percentile(after_m, 50.0),
+            error_p95_m=percentile(after_m, 95.0),
+            error_max_m=percentile(after_m, 100.0),
+            acc_at_m={r: share_of(after_m <= r) for r in sorted({float(radius_m), *RADII_M})},
+        ),
         share_of_views=_shares(states, np.ones(len(states))),
-        share_of_time=_shares(states, _until_next(seconds_s)),
+        share_of_time=_shares(states, np.append(np.diff(seconds_s), 0.0)),
         n_lost=len(runs(states == "lost")),
         low_confidence=longest(low_confidence, seconds_s, path_m),
         low_confidence_after=longest(low_confidence[first:], seconds_s[first:], path_m[first:]),
@@ -251,7 +262,7 @@ def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> TrackCo
         n_views=nees.size,
         n_left_out=int(np.count_nonzero(~usable)),
         nees_mean=found,
-        nees_within_95=share(int(np.count_nonzero(nees <= nees_bound(0.95))), nees.size),
+        nees_within_95=share_of(nees <= nees_bound(0.95)),
         independent_low=independent[0],
         independent_high=independent[1],
         n_effective=n_effective,
@@ -296,37 +307,11 @@ def _autocorrelation_time(part: FloatArray) -> float:
     return 1.0 + 2.0 * float(weights @ correlation[:stop] ** 2)
 
 
-def _path_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:
-    """(n,) metres flown until each result, by the true positions of the results `rows`."""
-    return np.asarray(np.interp(np.arange(n), rows, path_so_far_m(truth_en_m)))
-
-
-def _until_next(values: FloatArray) -> FloatArray:
-    """Difference from each value to the next; 0 for the last."""
-    return np.append(np.diff(values), 0.0)
-
-
 def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float]:
     whole = float(weights.sum())
     found = {name: float(weights[states == name].sum()) for name in STATES}
     known = whole > 0.0  # not NaN
-    return MappingProxyType({k: part / whole if known else math.nan for k, part in found.items()})
-
-
-def _after(errors_m: FloatArray, radius_m: float) -> After:
-    of_fixes_m = errors_m[np.isfinite(errors_m)]
-    within = {
-        r: share(int(np.count_nonzero(of_fixes_m <= r)), errors_m.size)
-        for r in sorted({float(radius_m), *RADII_M})
-    }
-    return After(
-        n_views=errors_m.size,
-        n_fixes=of_fixes_m.size,
-        error_median_m=percentile(of_fixes_m, 50.0),
-        error_p95_m=percentile(of_fixes_m, 95.0),
-        error_max_m=float(of_fixes_m.max()) if of_fixes_m.size else math.nan,
-        acc_at_m=MappingProxyType(within),
-    )
+    return {name: part / whole if known else math.nan for name, part in found.items()}
 
 
 def _spread(errors_m: FloatArray) -> Spread:
@@ -363,5 +348,51 @@ def _series(
         bound_95_m=frozen(sigma_m * math.sqrt(nees_bound(0.95))),
         along_m=frozen((errors_en_m * course).sum(axis=1)),
         across_m=frozen((errors_en_m * right).sum(axis=1)),
-        biases=MappingProxyType(biases),
+        biases=biases,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class GnssMetrics:
+    """GNSS and map against ground truth, over the compared views (N,).
+
+    `seconds_s`: time since the first view. `errors_m`: of GNSS. `map_errors_m`: of the fixes.
+    `differences_m`: distance between both; NaN where one of them is missing, as above.
+    `faults`: reason of the monitor, "" without one.
+    `learnt`: biases of GNSS minus map at the last view that has them, each with its standard
+    deviation, by their keys in evidence; empty where nothing was learnt.
+    """
+
+    seconds_s: FloatArray
+    errors_m: FloatArray
+    map_errors_m: FloatArray
+    differences_m: FloatArray
+    faults: tuple[str, ...]
+    learnt: Mapping[str, float]
+
+    @property
+    def alarms(self) -> tuple[tuple[int, int], ...]:
+        """First view of each stretch with a fault, and the first one after it."""
+        return tuple(runs(np.array([bool(each) for each in self.faults], dtype=bool)))
+
+
+def measure_gnss(comparison: Comparison, results: Sequence[ViewResult]) -> GnssMetrics | None:
+    """Figures of GNSS; None where no result has a GNSS position."""
+    by_frame = {result.frame: result.outcome.evidence for result in results}
+    evidence = [by_frame[frame] for frame in comparison.frames]
+    places = [gnss_of(each) for each in evidence]
+    if not any(places):
+        return None
+    frame = LocalFrame(comparison.lat_deg, comparison.lon_deg)
+    en_m = np.full((len(places), 2), np.nan)
+    for i, place in enumerate(places):
+        if place is not None:
+            en_m[i] = frame.en_from_latlon(*place)
+    return GnssMetrics(
+        seconds_since_first(comparison.time_ns),
+        frozen(np.hypot(*(en_m - comparison.truth_en_m).T)),
+        comparison.errors_m,
+        frozen(np.hypot(*(en_m - comparison.fix_en_m).T)),
+        tuple(fault_of(each) for each in evidence),
+        next((found for each in reversed(evidence) if (found := biases_of(each))), {}),
     )

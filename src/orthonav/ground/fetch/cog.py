@@ -33,8 +33,8 @@ from orthonav.ground.fetch.service import (
 )
 from orthonav.ground.fetch.urls import checked_url, shown
 from orthonav.ground.fetch.web import Web
-from orthonav.ground.imagery.quiet import quiet
-from orthonav.ground.imagery.raster import WHOLLY_VALID
+from orthonav.ground.imagery.mosaic import WHOLLY_VALID
+from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 
 CELL_PX = 512

@@ -29,8 +29,7 @@ try:
     from rasterio.windows import Window
 
     from orthonav.ground.imagery.datum import VerticalDatum, geoid, horizontal_and_vertical
-    from orthonav.ground.imagery.quiet import quiet
-    from orthonav.ground.imagery.source import unwarped
+    from orthonav.ground.imagery.source import quiet, unwarped
 except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 

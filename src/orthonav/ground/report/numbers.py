@@ -1,17 +1,56 @@
-"""Numbers as text; an undefined one is a dash."""
+"""Numbers and records as text and as values for JSON; an undefined number is a dash, or None."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+BY_UNIT = -1
+"""Decimals that the last word of a field's name asks for: a centimetre, say."""
+_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}
+_FRACTION_DIGITS = 3
+
+
+def to_plain(value: Any, digits: int | None = None) -> Any:
+    """`value` for strict JSON: records become dictionaries, arrays lists, NaN and infinity None.
+
+    Numbers are rounded to `digits` decimals (`BY_UNIT`: by the names of their fields; None: not).
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        return to_plain(value.tolist(), digits)
+    if is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: to_plain(each, _digits(name, digits)) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_plain(each, digits) for each in value]
+    if isinstance(value, Enum):
+        return value.value
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        return None
+    return value if digits is None else round(value, digits)
+
+
+def _digits(name: str, digits: int | None) -> int | None:
+    if digits != BY_UNIT:
+        return digits
+    return _DIGITS.get(name.rpartition("_")[2], _FRACTION_DIGITS)
 
 
 def percent_text(value: float) -> str:
-    """A share as `12.3 %`, and `-` where it is not defined."""
+    """A share as `12.3 %`."""
     return f"{100 * value:.1f} %" if math.isfinite(value) else "-"
 
 
 def metres_text(value: float) -> str:
-    """A length, in kilometres from 10 km on, and `-` where it is not defined.
+    """A length, in kilometres from 10 km on; below 100 m with one decimal unless that is 0.
 
-    Below 100 m it has one decimal unless that is 0. `metres` in `format.js` is the same for pages.
+    `metres` in `format.js` is the same for pages.
     """
     if not math.isfinite(value):
         return "-"
@@ -22,15 +61,12 @@ def metres_text(value: float) -> str:
 
 
 def plain_text(value: float) -> str:
-    """A number without unit, with three decimals, and `-` where it is not defined."""
+    """A number without unit, with three decimals."""
     return f"{value:.3f}" if math.isfinite(value) else "-"
 
 
 def measure_text(value: float, unit: str = "") -> str:
-    """A length or time with its significant decimals, and `-` where it is not defined.
-
-    `unit` is appended, so it begins with a space.
-    """
+    """A length or time with its significant decimals; `unit` begins with a space."""
     if not math.isfinite(value):
         return "-"
     return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}") + unit

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError, CameraError, FlightError
 from orthonav.core.files import replacing_folder, with_paths
+from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.flight.gnss import FILE as GNSS_FILE
 from orthonav.core.flight.gnss import GnssSample, write_gnss
-from orthonav.core.flight.writer import FlightWriter
 from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.geo.swapped import swapped_hint

@@ -1,35 +1,74 @@
-"""A displayed run: its results, truth, health and images."""
+"""A displayed run: its results as columns of short numbers, truth, health and images.
 
+Columns let many thousand views fit into one response: lengths and positions are rounded to what a
+screen can show; unknown values are None.
+"""
+
+import logging
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.errors import FlightError, OrthonavError
-from orthonav.core.flight.fixes import STATES
-from orthonav.core.flight.mount import Mount
-from orthonav.core.records import Fix, Telemetry, ViewResult
-from orthonav.ground.evaluate.contact_sheet import as_fixed
-from orthonav.ground.recordings.pixel import locate_pixel
-from orthonav.ground.view.columns import columns_of
-from orthonav.ground.view.feed import Batch, Feed
-from orthonav.ground.view.images import Shot, ViewImages
-from orthonav.ground.view.logs import LogReader
-from orthonav.ground.view.sheet import (
+from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
+from orthonav.core.files import with_paths
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight.fixes import STATES, Identity, flight_digest, read_identity
+from orthonav.core.flight.gnss import fault_of, gnss_of
+from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.signature import map_digest
+from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.ground.evaluate.calibration import is_covariance
+from orthonav.ground.evaluate.metrics import FAR_M, check_truth
+from orthonav.ground.recordings.flightlog import is_flight_log
+from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
+from orthonav.ground.report.imagery import (
     GroundWindow,
     SheetImagery,
+    as_fixed,
     image_px,
-    small_jpeg,
-    view_png,
+    jpeg,
+    png,
+    rectified,
+    shrunk,
     window_of,
 )
-from orthonav.onboard.messages.estimate import ellipse_95
+from orthonav.ground.report.numbers import to_plain
+from orthonav.ground.view.feed import Batch, Feed, LineFeed
+from orthonav.ground.view.images import FolderImages, NoImages, Shot, ViewImages
+from orthonav.ground.view.logs import LogReader
 
-AT = ("fix", "truth")
+Array = NDArray[np.float64]
+LatLon = tuple[float, float]
+FAR_AWAY_PX = 1e9
+"""Positions farther away are not drawn."""
+RAW_PX = 640
+"""The longer side of a view as recorded."""
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """What to show: see the arguments of `orthonav view`."""
+
+    run: Path
+    map_path: Path
+    second: Path | None = None
+    flight: Path | None = None
+    truth: Path | None = None
+    mount: Path | None = None
+    radius_m: float = 15.0
+    live: bool = False
+
+    def __post_init__(self) -> None:
+        with_paths(self, "run", "map_path", "second", "flight", "truth", "mount")
 
 
 @dataclass(frozen=True)
@@ -56,7 +95,11 @@ class _Placed:
 
 
 class Run:
-    """Everything that the page requests. Safe to share between threads."""
+    """Everything that the page requests. Safe to share between threads.
+
+    Methods that take the index of a view raise `IndexError` for others, and `FlightError` where
+    there is no image or position.
+    """
 
     def __init__(
         self,
@@ -64,7 +107,7 @@ class Run:
         feed: Feed,
         images: ViewImages,
         sheet: SheetImagery,
-        truth: Mapping[str, tuple[float, float]],
+        truth: Mapping[str, LatLon],
         radius_m: float,
         mount: Mount | None = None,
         second: Mapping[str, ViewResult] | None = None,
@@ -83,22 +126,17 @@ class Run:
         self._results: list[ViewResult] = []
         self._health: list[dict[str, Any]] = []
         self._columns: dict[str, list[Any]] = {}
-        self._problems: list[str] = []
+        self.problems: list[str] = []
         self._trouble = ""
         self._take(feed.poll())
         if not self._results and not labels.live:
-            reason = f": {self._problems[0]}" if self._problems else ""
+            reason = f": {self.problems[0]}" if self.problems else ""
             raise FlightError(f"run has no views{reason}: {labels.name}")
 
     @property
     def count(self) -> int:
         """Number of views so far."""
         return len(self._results)
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """Messages about what was read."""
-        return tuple(self._problems)
 
     def any_known(self, column: str) -> bool:
         """Whether any view has a value in a column."""
@@ -129,72 +167,71 @@ class Run:
             self._refresh()
             if generation != self._generation:
                 views, health = 0, 0
-            views, health = max(views, 0), max(health, 0)
             return {
                 "generation": self._generation,
                 "first": views,
                 "count": len(self._results),
                 "columns": {name: each[views:] for name, each in self._columns.items()},
                 "health": self._health[health:],
-                "problems": [*self._problems, *([self._trouble] if self._trouble else [])],
+                "problems": [*self.problems, *([self._trouble] if self._trouble else [])],
             }
 
     def detail(self, index: int) -> dict[str, Any]:
-        """Everything known about one view. Raises `IndexError`."""
+        """Everything known about one view."""
         result = self._result(index)
         outcome = result.outcome
-        plain: dict[str, Any] = {
+        found: dict[str, Any] = {
             "index": index,
             "frame": result.frame,
             "time_s": _seconds(result.time_ns),
             "state": result.state,
-            "evidence": {str(name): _known(value) for name, value in outcome.evidence.items()},
+            "evidence": {str(name): value for name, value in outcome.evidence.items()},
         }
-        if isinstance(outcome, Fix):
-            plain |= {"lat_deg": outcome.lat_deg, "lon_deg": outcome.lon_deg}
-        else:
-            plain |= {"reason": outcome.reason, "detail": outcome.detail}
+        if isinstance(outcome, NoFix):
+            found |= {"reason": outcome.reason, "detail": outcome.detail}
         other = (self._second or {}).get(result.frame)
-        if other is not None and isinstance(other.outcome, Fix):
-            plain |= {"second_lat_deg": other.outcome.lat_deg}
-            plain |= {"second_lon_deg": other.outcome.lon_deg}
-        truth = self._truth.get(result.frame)
-        if truth is not None:
-            plain |= {"true_lat_deg": truth[0], "true_lon_deg": truth[1]}
+        places = {
+            "": _place(outcome),
+            "second_": None if other is None else _place(other.outcome),
+            "true_": self._truth.get(result.frame),
+        }
+        for name, place in places.items():
+            if place is not None:
+                found |= {f"{name}lat_deg": place[0], f"{name}lon_deg": place[1]}
         try:
             shot = self._images.shot(result.frame)
-            plain["telemetry"] = _plain(shot.telemetry)
-            placed = self._placed(result, shot)
-            plain["window"] = asdict(placed.window)
+            names = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
+            found["telemetry"] = {name: getattr(shot.telemetry, name) for name in names}
+            found["window"] = self._placed(result, shot).window
         except FlightError as error:
-            plain["why_no_window"] = str(error)
+            found["why_no_window"] = str(error)
+        plain: dict[str, Any] = to_plain(found)
         return plain
 
     def view_png(self, index: int) -> bytes:
-        """The view rectified to nadir. Raises `IndexError` or `FlightError`."""
+        """The view rectified to nadir, transparent outside."""
         result = self._result(index)
         placed = self._placed(result, self._images.shot(result.frame))
-        return view_png(placed.shot.load(), placed.telemetry, placed.shot.camera, placed.window)
+        made = rectified(placed.shot.load(), placed.telemetry, placed.shot.camera, placed.window)
+        return png(*made)
 
     def raw_jpeg(self, index: int) -> bytes:
-        """The view as recorded, reduced. Raises `IndexError` or `FlightError`."""
-        return small_jpeg(self._images.shot(self._result(index).frame).load())
+        """The view as recorded, reduced."""
+        return jpeg(shrunk(self._images.shot(self._result(index).frame).load(), RAW_PX))
 
     def map_png(self, index: int, at: str) -> bytes:
-        """The map at the fix or the true position. Raises `IndexError` or `FlightError`."""
+        """The map at the fix or the true position, transparent where there is no imagery."""
         result = self._result(index)
-        place = self._truth.get(result.frame) if at == "truth" else None
-        if at == "fix" and isinstance(result.outcome, Fix):
-            place = result.outcome.lat_deg, result.outcome.lon_deg
+        place = self._truth.get(result.frame) if at == "truth" else _place(result.outcome)
         if place is None:
             raise FlightError(f"view {result.frame} has no such position: {at}")
         window = self._placed(result, self._images.shot(result.frame)).window
-        east, north = np.asarray(self.sheet.frame.en_from_latlon(*place)) + window.offset_en_m
-        return self.sheet.crop_png((float(east), float(north)), window)
+        box = window.box_at(np.asarray(self.sheet.frame.en_from_latlon(*place)))
+        return png(*self.sheet.crop(box, (window.size_px, window.size_px)))
 
     def ground(self, index: int, x: float, y: float) -> dict[str, Any]:
         """The ground at a point of the rectified view, shares of its window from the left and the
-        top, with its 95 % ellipse. Raises `IndexError` or `FlightError`."""
+        top, with its 95 % ellipse."""
         result = self._result(index)
         fix = result.outcome
         if not isinstance(fix, Fix):
@@ -206,7 +243,7 @@ class Run:
         return {
             "lat_deg": found.lat_deg,
             "lon_deg": found.lon_deg,
-            "height_m": _known(found.height_m),
+            "height_m": to_plain(found.height_m),
             "ellipse_95": ellipse_95(found.cov_en_m2),
             "confident": result.is_confident,
         }
@@ -242,7 +279,7 @@ class Run:
         if batch.restarted:
             self._generation += 1
             self._results, self._health, self._columns = [], [], {}
-        self._problems += batch.problems
+        self.problems += batch.problems
         self._health += [{"view": before, **plain} for before, plain in batch.health]
         if not batch.results:
             return
@@ -255,8 +292,117 @@ class Run:
             self._columns.setdefault(name, []).extend(values)
 
 
-def _known(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+def columns_of(
+    results: Sequence[ViewResult],
+    first_ns: int,
+    truth: Mapping[str, LatLon],
+    sheet: SheetImagery,
+    radius_m: float,
+    second: Mapping[str, ViewResult] | None = None,
+) -> dict[str, list[Any]]:
+    """The columns of `results`, in order; times count from `first_ns`.
+
+    `frame`: name; `t`: time in seconds; `ms`: processing time.
+    `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
+    `gx`, `gy`, `gerr`, `gdiff`: GNSS in pixels of the sheet, its error, and its distance from the
+    fix in metres; `gfault`: reason of the GNSS monitor, "" without one.
+    `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states.
+    `a`, `b`, `turn`: axes of one standard deviation (m), and the angle of the longer one in degrees
+    counter-clockwise from east.
+    `head`, `agl`: heading (deg) and height (m).
+    `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
+    `confident`: 1 if confident, 0 for a best guess or no fix.
+    `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
+    `x2`, `y2`, `err2`, `confident2`: the same of the results of a second run, by frame, if given.
+    """
+    fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
+    fix_en_m = _places([_place(r.outcome) for r in results], sheet)
+    truth_en_m = _places([truth.get(r.frame) for r in results], sheet)
+    gnss_en_m = _places([gnss_of(r.outcome.evidence) for r in results], sheet)
+    error_m = np.hypot(*(fix_en_m - truth_en_m).T)
+    radii_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
+    trusted = [
+        f is not None and (r.is_confident or r.state == "tracking")
+        for f, r in zip(fixes, results, strict=True)
+    ]
+    wrong = np.array(trusted, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), radii_m))
+    axes_m, turn_deg = _ellipses(fixes)
+
+    def stated(name: str) -> list[float]:
+        return [math.nan if fix is None else getattr(fix, name) for fix in fixes]
+
+    columns: dict[str, list[Any]] = {
+        "frame": [r.frame for r in results],
+        "t": to_plain([(r.time_ns - first_ns) / 1e9 for r in results], 3),
+        **_drawn(("x", "y"), fix_en_m, sheet),
+        **_drawn(("tx", "ty"), truth_en_m, sheet),
+        **_drawn(("gx", "gy"), gnss_en_m, sheet),
+        "gerr": to_plain(np.hypot(*(gnss_en_m - truth_en_m).T), 2),
+        "gdiff": to_plain(np.hypot(*(gnss_en_m - fix_en_m).T), 2),
+        "gfault": [fault_of(r.outcome.evidence) for r in results],
+        "err": to_plain(error_m, 4),
+        "conf": to_plain(stated("confidence"), 4),
+        "radius": to_plain(radii_m, 1),
+        "a": to_plain(axes_m[:, 1], 2),
+        "b": to_plain(axes_m[:, 0], 2),
+        "turn": to_plain(turn_deg, 1),
+        "head": to_plain(stated("heading_deg"), 1),
+        "agl": to_plain(stated("agl_m"), 1),
+        "ms": to_plain([float(r.latency_ms) for r in results], 1),
+        "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
+        "reason": ["" if _place(r.outcome) else _reason(r.outcome) for r in results],
+        "confident": [int(r.is_confident) for r in results],
+        "wrong": wrong.astype(int).tolist(),
+    }
+    if second is not None:
+        found = [second.get(r.frame) for r in results]
+        second_en_m = _places([None if r is None else _place(r.outcome) for r in found], sheet)
+        columns |= {
+            **_drawn(("x2", "y2"), second_en_m, sheet),
+            "err2": to_plain(np.hypot(*(second_en_m - truth_en_m).T), 4),
+            "confident2": [int(r is not None and r.is_confident) for r in found],
+        }
+    return columns
+
+
+def _place(outcome: Fix | NoFix) -> LatLon | None:
+    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else None
+
+
+def _reason(outcome: Fix | NoFix) -> str:
+    return (isinstance(outcome, NoFix) and outcome.reason) or "not_said"
+
+
+def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
+    """Positions (N, 2) in the plane of the sheet, NaN where there is none."""
+    en_m = np.full((len(latlon_deg), 2), math.nan)
+    known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
+    if known:
+        lat, lon = np.array([latlon_deg[i] for i in known], dtype=np.float64).T
+        en_m[known] = sheet.frame.en_from_latlon(lat, lon)
+    return en_m
+
+
+def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str, list[Any]]:
+    """Both columns of positions (N, 2), in pixels of the sheet."""
+    px = sheet.px_from_en(en_m)
+    px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
+    return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
+
+
+def _ellipses(fixes: Sequence[Fix | None]) -> tuple[Array, Array]:
+    """Standard deviations (N, 2) along both axes, shorter first, and the angle of the longer."""
+    cov = np.full((len(fixes), 2, 2), math.nan)
+    for i, fix in enumerate(fixes):
+        if fix is not None and np.shape(fix.cov_en_m2) == (2, 2):
+            cov[i] = fix.cov_en_m2
+    axes, turn = np.full((len(fixes), 2), math.nan), np.full(len(fixes), math.nan)
+    usable = is_covariance(cov)
+    if usable.any():
+        sizes, vectors = np.linalg.eigh(cov[usable])
+        axes[usable] = np.sqrt(np.maximum(sizes, 0.0))
+        turn[usable] = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])) % 180.0
+    return axes, turn
 
 
 def _seconds(time_ns: int) -> str:
@@ -265,6 +411,117 @@ def _seconds(time_ns: int) -> str:
     return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def _plain(telemetry: Telemetry) -> dict[str, float | None]:
-    names = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-    return {name: _known(getattr(telemetry, name)) for name in names}
+def open_run(request: ViewRequest) -> Run:
+    """The run, read as far as it exists; problems are logged.
+
+    Raises an `OrthonavError` where a given file is missing or damaged.
+    """
+    if not 0 < request.radius_m < 1e7:
+        raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
+    sheet = SheetImagery(open_map(request.map_path))
+    feed = _feed(request)
+    images = _images(request, feed)
+    truth, truth_name = _truth(request)
+    if truth:
+        centre = sheet.frame.lat_deg, sheet.frame.lon_deg
+        check_truth(truth, (), centre, Path(truth_name))
+    labels = RunLabels(
+        name=request.run.name or str(request.run),
+        map_name=request.map_path.name,
+        images="" if isinstance(images, NoImages) else (request.flight or request.run).name,
+        truth=truth_name,
+        live=request.live,
+        second=request.second.name if request.second else "",
+    )
+    mount = None if request.mount is None else read_mount(request.mount)
+    second = _second(request)
+    run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
+    for problem in run.problems:
+        log.warning("%s", problem)
+    _warn(request, run, feed, truth)
+    return run
+
+
+def is_log(path: Path) -> bool:
+    """Whether this names a flight log, which need not exist yet."""
+    return is_flight_log(path) if path.exists() else path.suffix == ".mcap"
+
+
+def _feed(request: ViewRequest) -> Feed:
+    path = request.run
+    if request.live and not path.exists() and not path.parent.is_dir():
+        raise MissingFileError(f"folder of the run does not exist: {path.parent}")
+    if is_log(path) or (request.live and path.is_dir()):
+        return LogReader(path, live=request.live)
+    if path.is_dir():
+        raise FlightError(f"expected fixes.jsonl or a flight log, got a folder without one: {path}")
+    return LineFeed(path, live=request.live)
+
+
+def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
+    """Results of the second run by frame, None without one; its health is not read."""
+    if request.second is None:
+        return None
+    batch = _feed(replace(request, run=request.second, live=False)).poll()
+    for problem in batch.problems:
+        log.warning("%s", problem)
+    if not batch.results:
+        raise FlightError(f"run has no views: {request.second}")
+    return {result.frame: result for result in batch.results}
+
+
+def _images(request: ViewRequest, feed: Feed) -> ViewImages:
+    path = request.flight
+    if path is None:
+        return feed if isinstance(feed, LogReader) else NoImages()
+    if not path.exists() and not request.live:
+        raise MissingFileError(f"flight does not exist: {path}")
+    if is_log(path):
+        reader = LogReader(path, live=request.live)
+        reader.poll()
+        return reader
+    if path.is_file():
+        raise FlightError(
+            f"expected a flight folder or a flight log; convert other sources with `orthonav "
+            f"import`: {path}"
+        )
+    return FolderImages(path)
+
+
+def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
+    """True positions and their source: the given file, or the flight folder."""
+    if request.truth is not None:
+        return read_truth(request.truth), request.truth.name
+    if request.flight is not None and (request.flight / "truth.csv").is_file():
+        path = request.flight / "truth.csv"
+        return read_truth(path), f"{request.flight.name}/{path.name}"
+    return {}, ""
+
+
+def _differences(request: ViewRequest, run: Path) -> str:
+    """Which other map or flight folder than the given ones a file of fixes states; else ""."""
+    if not run.is_file() or is_log(run):
+        return ""
+    flight = None
+    if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
+        flight = flight_digest(open_flight(request.flight, images_needed=False).views)
+    given = Identity(map_digest(request.map_path), flight)
+    return read_identity(run).differences(given, request.map_path, request.flight)
+
+
+def _warn(request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, LatLon]) -> None:
+    """Log probable mistakes."""
+    flown = feed.session.get("map") if isinstance(feed, LogReader) else None
+    if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
+        log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
+    for path in filter(None, (request.run, request.second)):
+        if other := _differences(request, path):
+            log.warning("the run is of %s: %s", other, path)
+    if not run.count:
+        return
+    if truth and not run.any_known("tx"):
+        log.warning("no view of the run has a true position in %s", run.labels.truth)
+    if request.second is not None and not run.any_known("x2"):
+        log.warning("no view has a position in the second run: %s", request.second)
+    if run.any_known("x") and not run.any_on_map():
+        log.warning("no position of the run lies on this map: %s", request.map_path)

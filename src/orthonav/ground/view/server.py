@@ -11,17 +11,38 @@ import logging
 import re
 import socket
 import socketserver
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import PurePath
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from orthonav.core.errors import FlightError, OrthonavError, OutputError
-from orthonav.ground.view.assets import StaticFile
-from orthonav.ground.view.run import AT, Run
+from orthonav.ground.report.page import leaflet_files
+from orthonav.ground.view.run import Run
+
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".png": "image/png",
+    ".svg": "image/svg+xml",
+}
+LEAFLET = (
+    "leaflet.css",
+    "leaflet-src.esm.js",
+    "images/layers.png",
+    "images/layers-2x.png",
+    "images/marker-icon.png",
+)
+"""Files of Leaflet that the page may request."""
+SHARED = ("chart.js", "format.js", "plane.js")
+"""Scripts of `orthonav.ground.report` that the page uses."""
+
 
 log = logging.getLogger(__name__)
 TIMEOUT_S = 60.0
@@ -49,23 +70,50 @@ class Response:
     cache: str = _NOT_CACHED
 
 
+def load_assets() -> dict[str, Response]:
+    """All files of the page by the path of their request, `/` for the page itself.
+
+    Only these can be requested: no path is derived from what a browser sends. Raises
+    `MissingExtraError` where Leaflet is not installed.
+    """
+    own: list[Any] = list(files("orthonav.ground.view").joinpath("static").iterdir())
+    own += [files("orthonav.ground.report").joinpath("static", name) for name in SHARED]
+    paths = {f"/static/{entry.name}": entry for entry in own}
+    for name, path in zip(LEAFLET, leaflet_files(*LEAFLET), strict=True):
+        paths[f"/leaflet/{name}"] = path
+    paths["/"] = paths.pop("/static/index.html")
+    return {
+        at: Response(HTTPStatus.OK, path.read_bytes(), _TYPES[PurePath(path.name).suffix])
+        for at, path in paths.items()
+        if PurePath(path.name).suffix in _TYPES
+    }
+
+
 class Pages:
     """Routes of the server. Safe to share between threads."""
 
-    def __init__(self, run: Run, assets: dict[str, StaticFile]) -> None:
+    def __init__(self, run: Run, assets: dict[str, Response]) -> None:
         self._run, self._assets = run, assets
+
+        def png(data: bytes) -> Response:
+            return Response(HTTPStatus.OK, data, "image/png")
+
+        def raw(data: bytes) -> Response:
+            return Response(HTTPStatus.OK, data, "image/jpeg")
+
         number = r"(\d{1,9})"
-        self._routes: list[tuple[re.Pattern[str], Callable[..., Response]]] = [
-            (re.compile(r"/api/run"), self._summary),
-            (re.compile(r"/api/news"), self._news),
-            (re.compile(rf"/api/views/{number}"), self._view),
-            (re.compile(rf"/api/views/{number}/ground"), self._ground),
-            (re.compile(rf"/api/views/{number}/view\.png"), self._view_png),
-            (re.compile(rf"/api/views/{number}/raw\.jpg"), self._raw_jpeg),
-            (re.compile(rf"/api/views/{number}/map-({'|'.join(AT)})\.png"), self._map_png),
-            (re.compile(rf"/tiles/{number}/{number}/{number}"), self._tile),
-            (re.compile(r"/preview\.jpg"), self._preview),
-        ]
+        view = rf"/api/views/{number}"
+        self._routes: dict[str, Callable[..., Response]] = {
+            r"/api/run": lambda query: _json(run.summary()),
+            r"/api/news": self._news,
+            view: lambda i, query: _json(run.detail(int(i))),
+            rf"{view}/ground": self._ground,
+            rf"{view}/view\.png": lambda i, query: png(run.view_png(int(i))),
+            rf"{view}/raw\.jpg": lambda i, query: raw(run.raw_jpeg(int(i))),
+            rf"{view}/map-(fix|truth)\.png": lambda i, at, query: png(run.map_png(int(i), at)),
+            rf"/tiles/{number}/{number}/{number}": self._tile,
+            r"/preview\.jpg": self._preview,
+        }
 
     def answer(self, target: str) -> Response:
         """The response to a request for `target`, a path with an optional query."""
@@ -73,11 +121,10 @@ class Pages:
             asked = urlsplit(target)
         except ValueError:
             return _error(HTTPStatus.BAD_REQUEST, "not an address")
-        asset = self._assets.get(asked.path)
-        if asset is not None:
-            return Response(HTTPStatus.OK, asset.data, asset.media_type)
-        for pattern, made in self._routes:
-            match = pattern.fullmatch(asked.path)
+        if asked.path in self._assets:
+            return self._assets[asked.path]
+        for pattern, made in self._routes.items():
+            match = re.fullmatch(pattern, asked.path)
             if match is not None:
                 return self._made(made, match.groups(), asked.query)
         return _error(HTTPStatus.NOT_FOUND, "not found")
@@ -92,34 +139,15 @@ class Pages:
         except ValueError as error:  # an invalid query
             return _error(HTTPStatus.BAD_REQUEST, str(error))
 
-    def _summary(self, query: str) -> Response:
-        return _json(self._run.summary())
-
     def _news(self, query: str) -> Response:
-        fields = parse_qs(query, max_num_fields=10)
-        asked = [fields.get(name, ["0"])[0] for name in ("generation", "views", "health")]
-        if not all(re.fullmatch(r"\d{1,9}", each) for each in asked):
-            return _error(HTTPStatus.BAD_REQUEST, "generation, views and health are numbers")
+        names = ("generation", "views", "health")
+        asked = _fields(query, names, r"\d{1,9}", "0", "generation, views and health are numbers")
         return _json(self._run.news(*map(int, asked)))
 
-    def _view(self, index: str, query: str) -> Response:
-        return _json(self._run.detail(int(index)))
-
     def _ground(self, index: str, query: str) -> Response:
-        fields = parse_qs(query, max_num_fields=10)
-        asked = [fields.get(name, [""])[0] for name in ("x", "y")]
-        if not all(re.fullmatch(r"0(\.\d{1,9})?|1(\.0{1,9})?", each) for each in asked):
-            return _error(HTTPStatus.BAD_REQUEST, "x and y must be fractions, 0 to 1")
+        share = r"0(\.\d{1,9})?|1(\.0{1,9})?"
+        asked = _fields(query, ("x", "y"), share, "", "x and y must be fractions, 0 to 1")
         return _json(self._run.ground(int(index), *map(float, asked)))
-
-    def _view_png(self, index: str, query: str) -> Response:
-        return Response(HTTPStatus.OK, self._run.view_png(int(index)), "image/png")
-
-    def _raw_jpeg(self, index: str, query: str) -> Response:
-        return Response(HTTPStatus.OK, self._run.raw_jpeg(int(index)), "image/jpeg")
-
-    def _map_png(self, index: str, at: str, query: str) -> Response:
-        return Response(HTTPStatus.OK, self._run.map_png(int(index), at), "image/png")
 
     def _tile(self, level: str, col: str, row: str, query: str) -> Response:
         found = self._run.sheet.tile(int(level), int(col), int(row))
@@ -131,6 +159,17 @@ class Pages:
         if not self._run.sheet.preview:
             return _error(HTTPStatus.NOT_FOUND, "the map has tiles")
         return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg", _CACHED)
+
+
+def _fields(
+    query: str, names: Sequence[str], pattern: str, default: str, expected: str
+) -> list[str]:
+    """Values of a query; raises `ValueError` for one that does not match `pattern`."""
+    fields = parse_qs(query, max_num_fields=10)
+    asked = [fields.get(name, [default])[0] for name in names]
+    if not all(re.fullmatch(pattern, each) for each in asked):
+        raise ValueError(expected)
+    return asked
 
 
 def _json(plain: Any) -> Response:

@@ -1,51 +1,57 @@
-"""Figures of a check: map, profile along the route, envelope of errors; and the imagery of the map,
-coarse enough for a page."""
+"""Figures of a check (map, profile along the route, envelope of errors), and its map's imagery."""
 
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.check.outcome import Along, BlindStretch, CheckResult, Envelope
-from orthonav.ground.check.write.plain import summarize
-from orthonav.ground.check.write.risk import EDGE_PX, RISKS, segments, shade
-from orthonav.ground.check.write.shapes import stretch_en_m
+from orthonav.ground.check.outcome import Along, BlindStretch, CheckResult, Envelope, summarize
+from orthonav.ground.check.write.plain import EDGE_PX, RISKS, segments, stretch_en_m
 from orthonav.ground.check.write.wording import probability_text, tolerance_sentence
-from orthonav.ground.report import Background, Figure, draw_axes, draw_figure, draw_map, map_size_in
-from orthonav.ground.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
+from orthonav.ground.report.drawing import (
+    BACKING,
+    GREY,
+    INK,
+    LEGEND_ABOVE,
+    OFFSET,
+    RIGHT,
+    SOFT,
+    WRONG,
+    Background,
+    draw_axes,
+    draw_figure,
+    draw_map,
+    map_size_in,
+)
+from orthonav.ground.report.imagery import Box, SheetImagery, jpeg, shrunk
+from orthonav.ground.report.page import Figure
 
 if TYPE_CHECKING:
     from matplotlib import figure as mpl
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 FIGURE_NAMES = ("map", "profile", "envelope")
 MAX_LOOKALIKES = 20
 """Shown on map and page, the most similar ones; the files hold all."""
 MAX_SIDE_PX, MAX_AREA_PX = 2000, 2_600_000
 """Limits of the image: its longer side, and its area."""
 MAX_BYTES = 1_300_000
+KNEE = 0.5, 0.2
+"""A probability and its place on the colour scale: most of the scale is for what is likely."""
 _MARGIN = 0.04
 _EMPTY = 226
 """Grey level without imagery, as light as a light page."""
 _QUALITIES = (72, 60, 45, 30, 15)
-
-Grey = NDArray[np.uint8]
-Box = tuple[float, float, float, float]
-_BACKGROUND_PX = 900
+_BACKGROUND_PX = 825
 _STEPS = 20
 _NUMBERED = 0.01
 """Recoverable stretches shorter than this fraction of the route get no number in the profile."""
-_LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
 
 
-def figures(result: CheckResult, image: Background) -> list[Figure]:
+def check_figures(result: CheckResult, image: Background) -> list[Figure]:
     """The figures of a check, in the order in which the page shows them."""
     found = [_map(result, image)]
     if result.along is not None and len(result.along.distance_m) > 1:
@@ -86,7 +92,8 @@ def _draw_cells(axes: "Axes", result: CheckResult) -> None:
     from matplotlib.colors import ListedColormap
 
     cells = result.cells
-    shades = shade((np.arange(_STEPS) + 0.5) / _STEPS)  # few colours: a PNG has a palette
+    steps = (np.arange(_STEPS) + 0.5) / _STEPS  # few colours: a PNG has a palette
+    shades = np.interp(steps, [0.0, KNEE[0], 1.0], [0.0, KNEE[1], 1.0])
     rows, cols = cells.probability.shape
     extent = (
         *(cells.west_m, cells.west_m + cols * cells.side_m),
@@ -130,7 +137,7 @@ def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
             bold: dict[str, Any] = {"weight": "bold", "bbox": BACKING}
             axes.annotate(str(number), middle, (7, 5), **OFFSET, **bold, zorder=7)
     if drawn:
-        axes.legend(ncols=5, title="probability along the route", **_LEGEND)
+        axes.legend(ncols=5, title="probability along the route", **LEGEND_ABOVE)
 
 
 def _draw_lookalikes(axes: "Axes", result: CheckResult) -> None:
@@ -200,12 +207,10 @@ def _envelope(envelope: Envelope) -> Figure:
             interpolation="none",
             origin="lower",
         )
-        for i in range(rows):
-            for j in range(cols):
-                share = envelope.share[i, j]
-                colour = "white" if share < 0.55 else "black"
-                text = f"{100 * share:.0f}" if np.isfinite(share) else "-"
-                axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=9)
+        for (row, col), share in np.ndenumerate(envelope.share):
+            looks: dict[str, Any] = {"color": "white" if share < 0.55 else "black", "fontsize": 9}
+            text = f"{100 * share:.0f}" if np.isfinite(share) else "-"
+            axes.text(col, row, text, ha="center", va="center", **looks)
         axes.set_xticks(range(cols), [f"{100 * value:+.3g}" for value in envelope.agl_off])
         axes.set_yticks(range(rows), [f"{value:+.3g}" for value in envelope.yaw_off_deg])
         axes.set(xlabel="error of reported height (%)", ylabel="error of reported heading (deg)")
@@ -223,13 +228,13 @@ def _envelope(envelope: Envelope) -> Figure:
     )
 
 
-def jpeg(grey: Grey) -> bytes:
-    """An image (rows, cols) as JPEG of the best quality within `MAX_BYTES`."""
+def page_jpeg(image: Background) -> bytes:
+    """An image as JPEG of the best quality within `MAX_BYTES`."""
     for quality in _QUALITIES:
-        data = cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1]
-        if data.size <= MAX_BYTES:
+        data = jpeg(image.grey, quality)
+        if len(data) <= MAX_BYTES:
             break
-    return bytes(data.tobytes())
+    return data
 
 
 def visible_box(result: CheckResult) -> Box:
@@ -259,32 +264,17 @@ def map_image(opened: MapFile, box: Box) -> Background:
 
     Raises `MapFileError` where these are damaged.
     """
-    grid = opened.manifest.sheets[0].grid
-    layer = GreyLayer.of(opened)
-    west, south, east, north = box
-    longest_px, level = max(east - west, north - south) / grid.gsd_m, 0
-    while layer and level + 1 < layer.levels and longest_px >= 2 ** (level + 1) * MAX_SIDE_PX:
-        level += 1
-    if layer is None or longest_px > 2 ** (level + 2) * MAX_SIDE_PX:  # too few levels
-        return Background(preview(opened), *grid.extent_en_m)
-    gsd_m = grid.gsd_m * 2**level
-    rows, cols = layer.shape(level)
-    left = int(np.clip(math.floor((west - grid.west_m) / gsd_m), 0, cols - 1))
-    right = int(np.clip(math.ceil((east - grid.west_m) / gsd_m), left + 1, cols))
-    top = int(np.clip(math.floor((grid.north_m - north) / gsd_m), 0, rows - 1))
-    bottom = int(np.clip(math.ceil((grid.north_m - south) / gsd_m), top + 1, rows))
-    grey, valid = layer.read(level, top, left, bottom - top, right - left)
+    sheet = SheetImagery(opened)
+    limits = np.array(sheet.grid.extent_en_m)
+    low, high = np.tile(limits[:2], 2), np.tile(limits[2:], 2)
+    west, south, east, north = (float(edge) for edge in np.clip(box, low, high))
+    width_m, height_m = east - west, north - south
+    gsd_m = max(
+        sheet.grid.gsd_m,
+        max(width_m, height_m) / MAX_SIDE_PX,
+        math.sqrt(width_m * height_m / MAX_AREA_PX),
+    )
+    size = max(1, round(width_m / gsd_m)), max(1, round(height_m / gsd_m))
+    grey, valid = sheet.crop((west, south, east, north), size)
     grey[~valid] = _EMPTY
-    west_m, north_m = grid.west_m + left * gsd_m, grid.north_m - top * gsd_m
-    east_m, south_m = grid.west_m + right * gsd_m, grid.north_m - bottom * gsd_m
-    return Background(shrunk(grey, MAX_SIDE_PX), west_m, south_m, east_m, north_m)
-
-
-def shrunk(grey: Grey, max_px: int) -> Grey:
-    """An image no larger than `max_px` on its longer side and `MAX_AREA_PX`."""
-    rows, cols = grey.shape
-    share = min(1.0, max_px / max(rows, cols), math.sqrt(MAX_AREA_PX / (rows * cols)))
-    if share == 1:
-        return grey
-    size = (max(1, round(share * cols)), max(1, round(share * rows)))
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return Background(grey, (west, south, east, north))

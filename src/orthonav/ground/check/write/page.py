@@ -6,11 +6,16 @@ from typing import Any
 import numpy as np
 
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.check.outcome import CELL_VALUES, CheckResult
-from orthonav.ground.check.write.figures import MAX_LOOKALIKES, jpeg, visible_box
-from orthonav.ground.check.write.plain import Plain, plain, summarize, to_plain
-from orthonav.ground.check.write.risk import EDGE_PX, KNEE, RISKS, segments
-from orthonav.ground.check.write.shapes import stretch_en_m
+from orthonav.ground.check.outcome import CELL_VALUES, CheckResult, summarize
+from orthonav.ground.check.write.figures import KNEE, MAX_LOOKALIKES, page_jpeg, visible_box
+from orthonav.ground.check.write.plain import (
+    EDGE_PX,
+    RISKS,
+    Plain,
+    check_to_plain,
+    segments,
+    stretch_en_m,
+)
 from orthonav.ground.check.write.wording import (
     SIMULATED,
     SYMBOLS,
@@ -26,9 +31,9 @@ from orthonav.ground.check.write.wording import (
     tolerance_sentence,
     verdict_sentence,
 )
-from orthonav.ground.report import Background, Figure, metres_text, render
-from orthonav.ground.report.leaflet import Leaflet
-from orthonav.ground.report.page import data_url, joined_scripts, static_text
+from orthonav.ground.report.drawing import Background
+from orthonav.ground.report.numbers import metres_text, to_plain
+from orthonav.ground.report.page import Figure, data_url, joined_scripts, render, static_text
 
 PACKAGE = "orthonav.ground.check.write"
 _SHARED = ("format.js", "plane.js", "chart.js")
@@ -66,7 +71,7 @@ def page_of(
     result: CheckResult,
     image: Background,
     figures: list[Figure],
-    leaflet: Leaflet,
+    leaflet: tuple[str, str],
     json_sha256: str,
 ) -> str:
     """The page as HTML; `json_sha256` is the digest of the `check.json` beside it.
@@ -74,7 +79,8 @@ def page_of(
     Raises `MissingExtraError` without Jinja2.
     """
     about = result.about
-    scripts = (leaflet.script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
+    script, style = leaflet
+    scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
     conditions = conditions_text(result.conditions, result.band_m)
     values = {
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
@@ -103,9 +109,9 @@ def page_of(
         "downloads": DOWNLOADS,
         "checked": _checked(result, json_sha256),
         "data": _page_data(result, image),
-        "image": data_url(jpeg(image.grey), "image/jpeg"),
+        "image": data_url(page_jpeg(image), "image/jpeg"),
     }
-    style = leaflet.style + static_text("check.css", PACKAGE)
+    style += static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
 
 
@@ -208,7 +214,7 @@ def _page_data(result: CheckResult, image: Background) -> str:
     ]
     drawn = {
         "box": visible_box(result),
-        "image": (image.west_m, image.south_m, image.east_m, image.north_m),
+        "image": image.box,
         "values": list(CELL_VALUES),
         "colours": _colours(),
         "confident": CONFIDENT,
@@ -233,7 +239,7 @@ def _page_data(result: CheckResult, image: Background) -> str:
             for each in enumerate(result.lookalikes[:MAX_LOOKALIKES], start=1)
         ],
     }
-    values = {**to_plain(result), "drawn": plain(drawn, 2)}
+    values = {**check_to_plain(result), "drawn": to_plain(drawn, 2)}
     values["cells"] = _known_cells(values["cells"])
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")

@@ -1,12 +1,12 @@
-"""A check as plain values for JSON: latitude and longitude, None for unknown.
+"""A check as JSON, GeoJSON and GeoTIFF; `docs/check.md` describes every field.
 
-Format "orthonav-check", version 1; every field is described in `docs/check.md`.
+Positions are latitude and longitude; unknown values are None, NaN in the raster.
 """
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,192 +14,323 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.check.outcome import CELL_VALUES, Cells, CheckResult
+from orthonav.ground.changes.record import lonlat
+from orthonav.ground.check.outcome import CELL_VALUES, Along, Cells, CheckResult, summarize
+from orthonav.ground.report.numbers import BY_UNIT, to_plain
 
 FORMAT, VERSION = "orthonav-check", 1
-_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}
-"""Decimals by the last word of a name: a centimetre; fractions and others have `_FRACTION`."""
-_FRACTION, _EXACT = 3, 6
+EDGE_PX = 3.0
+"""How much wider the edge of a line of risk is than the line."""
+_LATLON_DIGITS = 7
+_STEP_M = 1000.0
+"""Legs get a vertex at least this often: they are straight in the plane, not in degrees."""
 
 Array = NDArray[np.float64]
 Plain = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Risk:
+    """A class of places along the route; classes differ in colour, width and dash.
+
+    `least`: lowest probability of the class; NaN where the probability is unknown.
+    `colour`: that of the middle of its range on the scale of the cells (cividis: light is likely);
+    `edge`: behind it, so that it stands out on the cells.
+    `width`: of the line in pixels; `dash`: lengths drawn and skipped, empty for a solid line.
+    `range_text`: its range of probabilities.
+    """
+
+    name: str
+    least: float
+    colour: str
+    edge: str
+    width: float
+    dash: tuple[int, ...]
+    range_text: str
+
+
+_DARK, _LIGHT = "#1a1a1a", "#ffffff"
+RISKS = (
+    Risk("confident", CONFIDENT, "#ead34c", _DARK, 4.0, (), "0.9 or more"),
+    Risk("likely", 0.7, "#a99f73", _DARK, 2.5, (), "0.7 to 0.9"),
+    Risk("doubtful", 0.5, "#5e626e", _LIGHT, 5.0, (9, 4), "0.5 to 0.7"),
+    Risk("unlikely", 0.0, "#083370", _LIGHT, 6.5, (), "below 0.5"),
+    Risk("unknown", float("nan"), "#ffffff", _DARK, 4.0, (4, 6), "unknown"),
+)
+
+
+def risk_of(probability: float) -> int:
+    """The index in `RISKS` of a probability."""
+    found = (i for i, risk in enumerate(RISKS) if probability >= risk.least)
+    return next(found, len(RISKS) - 1)
+
+
+def segments(probability: Array) -> list[tuple[int, int, int]]:
+    """The route of points (N,) in segments of one class: (class, first point, last point).
+
+    Between two points the worse class counts; segments share their ends.
+    """
+    classes = [risk_of(value) for value in probability]
+    found: list[tuple[int, int, int]] = []
+    for i in range(len(classes) - 1):
+        here = max(classes[i], classes[i + 1])
+        if found and found[-1][0] == here:
+            found[-1] = (here, found[-1][1], i + 1)
+        else:
+            found.append((here, i, i + 1))
+    return found
+
+
+def stretch_en_m(along: Along, start_m: float, end_m: float) -> Array:
+    """The route (N, 2) between two distances from its start; empty where they are equal."""
+    distance = along.distance_m
+    start_m, end_m = np.clip([start_m, end_m], distance[0], distance[-1])
+    if not end_m > start_m:
+        return np.empty((0, 2))
+    inside = (distance > start_m) & (distance < end_m)
+    at = np.concatenate([[start_m], distance[inside], [end_m]])
+    return np.stack([np.interp(at, distance, axis) for axis in along.points_en_m.T], axis=1)
 
 
 def to_json(result: CheckResult) -> str:
     """A check as strict JSON, one line per top-level field."""
     lines = ",\n".join(
         f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False, allow_nan=False)}"
-        for name, value in to_plain(result).items()
+        for name, value in check_to_plain(result).items()
     )
     return f"{{\n{lines}\n}}\n"
 
 
-def to_plain(result: CheckResult) -> Plain:
+def check_to_plain(result: CheckResult) -> Plain:
     """A check as dictionaries, lists, text and finite numbers."""
-    verdict = result.verdict
+    verdict, frame = result.verdict, result.frame
     return {
         "format": FORMAT,
         "version": VERSION,
-        "about": plain(asdict(result.about)),
-        "verdict": {
-            "word": verdict.word.value,
-            "exit_code": verdict.word.exit_code,
-            "reasons": [
-                {"code": each.code, "text": each.text, "word": each.word.value}
-                for each in verdict.reasons
-            ],
-        },
-        "conditions": plain(asdict(result.conditions), _EXACT),
-        "summary": plain(summarize(result)),
+        "about": to_plain(result.about),
+        "verdict": {**to_plain(verdict), "exit_code": verdict.word.exit_code},
+        "conditions": to_plain(result.conditions, 6),
+        "summary": to_plain(summarize(result), BY_UNIT),
         "plane": {
-            "origin_lat_deg": float(result.frame.lat_deg),
-            "origin_lon_deg": float(result.frame.lon_deg),
-            "proj4": result.frame.proj4,
+            "origin_lat_deg": float(frame.lat_deg),
+            "origin_lon_deg": float(frame.lon_deg),
+            "proj4": frame.proj4,
         },
-        "cells": _cells(result.frame, result.cells),
-        "route": _route(result),
-        "stretches": stretches_to_plain(result),
-        "lookalikes": lookalikes_to_plain(result),
-        "envelope": None if result.envelope is None else plain(asdict(result.envelope)),
-        "alternatives": [plain(asdict(each)) for each in result.alternatives],
+        "cells": _cells_to_plain(frame, result.cells),
+        "route": _route_to_plain(result),
+        "stretches": _stretches(result),
+        "lookalikes": _lookalikes(result),
+        "envelope": to_plain(result.envelope, BY_UNIT),
+        "alternatives": to_plain(result.alternatives, BY_UNIT),
     }
 
 
-def stretches_to_plain(result: CheckResult) -> list[Plain]:
+def _stretches(result: CheckResult) -> list[Plain]:
     """The gaps, numbered from 1."""
     return [
         {
             "number": number,
-            **plain(asdict(each)),
-            "length_m": plain(each.length_m, _DIGITS["m"]),
-            "recoverable": bool(each.recoverable),
+            **to_plain(each, BY_UNIT),
+            **to_plain({"length_m": each.length_m}, BY_UNIT),
+            "recoverable": each.recoverable,
         }
         for number, each in enumerate(result.stretches, start=1)
     ]
 
 
-def lookalikes_to_plain(result: CheckResult) -> list[Plain]:
+def _lookalikes(result: CheckResult) -> list[Plain]:
     """The pairs of ambiguous places, numbered from 1."""
     return [
-        {"number": number, **plain(asdict(each))}
+        {"number": number, **to_plain(each, BY_UNIT)}
         for number, each in enumerate(result.lookalikes, start=1)
     ]
 
 
-def summarize(result: CheckResult) -> Plain:
-    """The key figures of a check, which the page, the terminal and `check.json` share.
-
-    `route_share_from_0_9`: fraction of the length with a probability of `CONFIDENT` or more.
-    `error_m`: expected error of a correct fix (root mean square), along the route or over the map.
-    `longest_stretch`: number of the longest gap, from 1. Without a route its figures are
-    NaN, 0 or None.
-    """
-    along, cells, stretches = result.along, result.cells, result.stretches
-    route_m = likely = math.nan
-    if along is None or not len(along.distance_m):
-        error_m = _rms(cells.error_m.ravel(), cells.probability.ravel())
-    else:
-        route_m = float(along.distance_m[-1] - along.distance_m[0])
-        weights = _length_per_point_m(along.distance_m)
-        known = np.isfinite(along.probability)
-        confident = np.where(known, along.probability, 0.0) >= CONFIDENT
-        likely = float(weights[confident].sum() / weights.sum()) if known.any() else math.nan
-        error_m = _rms(along.error_m, weights * np.nan_to_num(along.probability))
-    longest = max(stretches, key=lambda each: each.length_m, default=None)
+def _cells_to_plain(frame: LocalFrame, cells: Cells) -> Plain:
+    grid = cells.grid
+    west, north = grid.west_m, grid.north_m
+    east, south = west + grid.cols * grid.side_m, north - grid.rows * grid.side_m
+    corners = np.array([(west, north), (east, north), (east, south), (west, south)])
     return {
-        "area_km2": result.area_km2,
-        "second_date": result.second_date,
-        "mean_probability": result.mean,
-        "error_m": error_m,
-        "route_m": route_m,
-        "route_s": route_m / result.conditions.speed_mps,
-        "route_share_from_0_9": likely,
-        "blind_stretches": len(stretches),
-        "unrecoverable_stretches": sum(not each.recoverable for each in stretches),
-        "longest_stretch": None if longest is None else stretches.index(longest) + 1,
+        **to_plain(grid, 4),
+        "corners_latlon_deg": _latlon_deg(frame, corners),
+        **to_plain({name: getattr(cells, name) for name in CELL_VALUES}, BY_UNIT),
     }
 
 
-def _length_per_point_m(distance_m: Array) -> Array:
-    """Length of the route (N,) that each of its points represents."""
-    if len(distance_m) < 2:
-        return np.ones(len(distance_m))
-    steps = np.diff(distance_m)
-    return np.asarray(np.concatenate([steps[:1], steps[1:] + steps[:-1], steps[-1:]]) / 2)
-
-
-def _rms(values: Array, weights: Array) -> float:
-    """Weighted root mean square of the known values; NaN for none."""
-    known = np.isfinite(values) & np.isfinite(weights) & (weights > 0)
-    if not known.any():
-        return math.nan
-    return float(np.sqrt(np.average(values[known] ** 2, weights=weights[known])))
-
-
-def _cells(frame: LocalFrame, cells: Cells) -> Plain:
-    rows, cols = cells.probability.shape
-    east_m, south_m = cells.west_m + cols * cells.side_m, cells.north_m - rows * cells.side_m
-    corners = [
-        (cells.west_m, cells.north_m),
-        (east_m, cells.north_m),
-        (east_m, south_m),
-        (cells.west_m, south_m),
-    ]
-    geometry = {name: plain(getattr(cells, name), 4) for name in ("side_m", "west_m", "north_m")}
-    return {
-        "rows": rows,
-        "cols": cols,
-        **geometry,
-        "corners_latlon_deg": latlon_deg(frame, np.array(corners)),
-        **plain({name: getattr(cells, name) for name in CELL_VALUES}),
-    }
-
-
-def _route(result: CheckResult) -> Plain | None:
+def _route_to_plain(result: CheckResult) -> Plain | None:
     along = result.along
     if along is None and result.route_en_m is None:
         return None
-    found: Plain = {"name": result.about.route_name, "band_m": plain(result.band_m, _DIGITS["m"])}
+    found: Plain = to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT)
     if result.route_en_m is not None:
-        found["waypoints_latlon_deg"] = latlon_deg(result.frame, result.route_en_m)
+        found["waypoints_latlon_deg"] = _latlon_deg(result.frame, result.route_en_m)
     if along is not None:
         lat, lon = result.frame.latlon_from_en(along.points_en_m)
         names = ("probability", "low", "high", "across_low", "error_m", "drift_m")
-        found["points"] = plain(
-            {
-                "distance_m": along.distance_m,
-                "time_s": along.distance_m / result.conditions.speed_mps,
-                "lat_deg": lat,
-                "lon_deg": lon,
-                **{name: getattr(along, name) for name in names},
-            }
-        )
+        points = {
+            "distance_m": along.distance_m,
+            "time_s": along.distance_m / result.conditions.speed_mps,
+            "lat_deg": lat,
+            "lon_deg": lon,
+            **{name: getattr(along, name) for name in names},
+        }
+        found["points"] = to_plain(points, BY_UNIT)
     return found
 
 
-def latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
+def _latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
     """Latitude and longitude of points (N, 2), rounded to a centimetre."""
-    lat, lon = frame.latlon_from_en(points_en_m)
-    rounded: list[list[float]] = np.round(np.stack([lat, lon], axis=1), _DIGITS["deg"]).tolist()
-    return rounded
+    found: list[list[float]] = to_plain(
+        np.stack(frame.latlon_from_en(points_en_m), axis=1), _LATLON_DIGITS
+    )
+    return found
 
 
-def plain(value: Any, digits: int | None = None) -> Any:
-    """`value` for strict JSON: NaN and infinity become None, numbers are rounded.
+def to_geojson(result: CheckResult) -> str:
+    """A FeatureCollection (RFC 7946), one feature per line; `layer` names the kind of each."""
+    lines = ",\n".join(
+        json.dumps(each, ensure_ascii=False, allow_nan=False) for each in features(result)
+    )
+    return f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n'
 
-    Numbers have `digits` decimals, or as many as the name of their field asks for.
-    """
-    if isinstance(value, Mapping):
-        return {
-            name: plain(
-                each, _DIGITS.get(name.rpartition("_")[2], _FRACTION) if digits is None else digits
-            )
-            for name, each in value.items()
+
+def features(result: CheckResult) -> Iterator[Plain]:
+    """Features of all layers: cells, lookalikes, and with a route route, blind, legs, waypoints."""
+    frame, along = result.frame, result.along
+    yield from _cell_features(result)
+    if along is not None:
+        yield from _route_features(result, along)
+        for each, properties in zip(result.stretches, _stretches(result), strict=True):
+            line = stretch_en_m(along, each.start_m, each.end_m)
+            yield _feature(frame, "blind", "LineString", line, properties)
+    for properties in _lookalikes(result):
+        ends = [properties.pop(name) for name in ("place_latlon_deg", "other_latlon_deg")]
+        geometry = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in ends]}
+        yield _as_feature("lookalikes", geometry, properties)
+    if result.route_en_m is not None:
+        yield from _plan_features(frame, result.route_en_m)
+
+
+def _cell_features(result: CheckResult) -> Iterator[Plain]:
+    """A square for every cell of which something is known."""
+    cells = result.cells
+    known = np.isfinite(cells.probability) | (cells.trials > 0) | np.isfinite(cells.persistence)
+    for row, col in np.argwhere(known).tolist():
+        ring = cells.grid.ring_en_m(row, col)
+        values = to_plain({name: getattr(cells, name)[row, col] for name in CELL_VALUES}, BY_UNIT)
+        yield _feature(result.frame, "cells", "Polygon", ring, {"row": row, "col": col, **values})
+
+
+def _route_features(result: CheckResult, along: Along) -> Iterator[Plain]:
+    """A line from each point to the next, with the worse values of the two."""
+    for i in range(len(along.distance_m) - 1):
+        pair = slice(i, i + 2)
+        start_m, end_m = (float(value) for value in along.distance_m[pair])
+        probability = float(along.probability[pair].min())
+        properties = {
+            "number": i + 1,
+            "distance_m": start_m,
+            "end_m": end_m,
+            "time_s": start_m / result.conditions.speed_mps,
+            "probability": probability,
+            "across_low": float(along.across_low[pair].min()),
+            "error_m": float(along.error_m[pair].max()),
+            "drift_m": float(along.drift_m[pair].max()),
+            "risk": RISKS[risk_of(probability)].name,
         }
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist(), digits)
-    if isinstance(value, list | tuple):
-        return [plain(each, digits) for each in value]
-    if isinstance(value, float):
-        return round(float(value), digits or 0) if math.isfinite(value) else None
-    return value
+        line = along.points_en_m[pair]
+        yield _feature(result.frame, "route", "LineString", line, to_plain(properties, BY_UNIT))
+
+
+def _plan_features(frame: LocalFrame, waypoints: Array) -> Iterator[Plain]:
+    """Legs and waypoints of the route as planned."""
+    steps = np.diff(waypoints, axis=0)
+    lengths_m = np.hypot(*steps.T)
+    for i, (start, step, length_m) in enumerate(zip(waypoints, steps, lengths_m, strict=False)):
+        at = np.linspace(0, 1, max(2, int(np.ceil(length_m / _STEP_M)) + 1))
+        bearing_deg = float(np.degrees(np.arctan2(*step)) % 360)
+        properties = {
+            "number": i + 1,
+            "length_m": round(float(length_m), 2),
+            "bearing_deg": round(bearing_deg, 1),
+        }
+        yield _feature(frame, "legs", "LineString", start + at[:, None] * step, properties)
+    for i, point in enumerate(waypoints):
+        properties = {"number": i + 1, "distance_m": round(float(lengths_m[:i].sum()), 2)}
+        yield _feature(frame, "waypoints", "Point", point[None], properties)
+
+
+def _feature(
+    frame: LocalFrame, layer: str, kind: str, points_en_m: Array, properties: Plain
+) -> Plain:
+    """A feature from points (N, 2); without points its geometry is null."""
+    if not len(points_en_m):
+        return _as_feature(layer, None, properties)
+    points = lonlat(frame, points_en_m)
+    coordinates = {"Point": points[0], "Polygon": [points]}.get(kind, points)
+    return _as_feature(layer, {"type": kind, "coordinates": coordinates}, properties)
+
+
+def _as_feature(layer: str, geometry: Plain | None, properties: Plain) -> Plain:
+    named = {"layer": layer, **properties}
+    return {"type": "Feature", "properties": named, "geometry": geometry}
+
+
+def tif_bytes(result: CheckResult) -> bytes:
+    """The raster: float32, NaN where unknown, north up, conditions as tags.
+
+    Made in memory (28 bytes per cell before compression), because GDAL does not report a full disk.
+    """
+    from rasterio import Affine
+    from rasterio.io import MemoryFile
+
+    cells = result.cells
+    rows, cols = cells.probability.shape
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "width": cols,
+        "height": rows,
+        "count": len(CELL_VALUES),
+        "dtype": "float32",
+        "nodata": math.nan,
+        "crs": result.frame.proj4,
+        "transform": Affine(cells.side_m, 0.0, cells.west_m, 0.0, -cells.side_m, cells.north_m),
+        "compress": "deflate",
+        "predictor": 3,
+        "interleave": "band",
+    }
+    with MemoryFile() as memory:
+        with memory.open(**profile) as target:
+            for number, (name, meaning) in enumerate(CELL_VALUES.items(), start=1):
+                target.write(np.asarray(getattr(cells, name), dtype=np.float32), number)
+                target.set_band_description(number, name)
+                target.update_tags(number, meaning=meaning)
+            target.update_tags(**_tags(result))
+        return bytes(memory.read())
+
+
+def _tags(result: CheckResult) -> dict[str, str]:
+    """What was checked under which conditions; unknown values are left out."""
+    values = {
+        "map": result.about.map_name,
+        "imagery": result.about.imagery,
+        "route": result.about.route_name,
+        "verdict": result.verdict.word.value,
+        **vars(result.conditions),
+    }
+    return {
+        "TIFFTAG_SOFTWARE": f"orthonav {result.about.version}".strip(),
+        **{
+            f"ORTHONAV_{name.upper()}": (
+                writable(value) if isinstance(value, str) else f"{value:.9g}"
+            )
+            for name, value in values.items()
+            if value not in (None, "")
+        },
+    }
+
+
+def writable(text: str) -> str:
+    """Text without lone surrogates, which come from file names that are not UTF-8."""
+    return text.encode("utf-8", "replace").decode("utf-8")

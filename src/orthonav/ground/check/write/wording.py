@@ -12,8 +12,8 @@ from orthonav.ground.check.outcome import (
     Envelope,
     Lookalike,
     Word,
+    summarize,
 )
-from orthonav.ground.check.write.plain import summarize
 from orthonav.ground.report.numbers import metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}

@@ -1,5 +1,6 @@
-// From pixels of the sheet to latitude and longitude: the inverse of `orthonav.core.geo.frames.LocalFrame`,
-// an azimuthal-equidistant plane on WGS84 in closed form (Bomford, Geodesy, 2.1; Bowring 1976).
+// The map of all pages, in the plane of a sheet, so that nothing is projected; and the inverse of
+// `orthonav.core.geo.frames.LocalFrame`, an azimuthal-equidistant plane on WGS84 in closed form
+// (Bomford, Geodesy, 2.1; Bowring 1976).
 
 const A_M = 6378137;
 const F = 1 / 298.257223563;
@@ -50,4 +51,14 @@ function latLonFromEcef(x, y, z) {
     axis - E2 * A_M * Math.cos(reduced) ** 3,
   );
   return [(lat * 180) / Math.PI, (Math.atan2(y, x) * 180) / Math.PI];
+}
+
+/** A Leaflet map (`L`) of a plane whose unit is `unitM` metres long, showing `bounds`. */
+export function planeMap(L, id, unitM, bounds, options) {
+  const distance = (p, q) => Math.hypot(p.lat - q.lat, p.lng - q.lng) * unitM; // a true scale bar
+  const crs = L.extend({}, L.CRS.Simple, { distance });
+  const map = L.map(id, { crs, zoomDelta: 1, attributionControl: false, ...options });
+  L.control.scale({ imperial: false, maxWidth: 150 }).addTo(map);
+  map.fitBounds(bounds);
+  return map;
 }

@@ -2,7 +2,7 @@
 // projected. A Leaflet "latitude" is minus the row, a "longitude" the column.
 
 import * as L from "../leaflet/leaflet-src.esm.js";
-import { enFromPx, latLonFromEn } from "./plane.js";
+import { enFromPx, latLonFromEn, planeMap } from "./plane.js";
 import { metres } from "./format.js";
 
 export { L };
@@ -10,13 +10,6 @@ export const at = (col, row) => L.latLng(-row, col);
 export const pixel = (latLng) => [latLng.lng, -latLng.lat];
 const FINEST_ZOOM = 6;
 const MIN_M = 300; // visible width, however short the run
-
-/** Leaflet's pixel plane, with distances in metres so that the scale bar is true. */
-function planeOf(sheet) {
-  return L.extend({}, L.CRS.Simple, {
-    distance: (p, q) => Math.hypot(p.lat - q.lat, p.lng - q.lng) * sheet.gsd_m,
-  });
-}
 
 /** Chunks of the registration layer as stored: a tile of zoom -L is a chunk of level L. Those at
     the south and east borders may be smaller than a tile, so each lies in a box of the full size. */
@@ -47,14 +40,8 @@ const Chunks = L.GridLayer.extend({
 export function makeMap(id, sheet) {
   const bounds = L.latLngBounds(at(0, 0), at(sheet.width_px, sheet.height_px));
   const coarsest = sheet.tiles ? sheet.tiles.levels.length - 1 : Math.log2(sheet.width_px / 256);
-  const map = L.map(id, {
-    crs: planeOf(sheet),
-    minZoom: -Math.ceil(Math.max(coarsest, 1)) - 1,
-    maxZoom: FINEST_ZOOM,
-    zoomSnap: 0.5,
-    zoomDelta: 1,
-    attributionControl: false,
-    preferCanvas: false,
+  const map = planeMap(L, id, sheet.gsd_m, bounds, {
+    minZoom: -Math.ceil(Math.max(coarsest, 1)) - 1, maxZoom: FINEST_ZOOM, zoomSnap: 0.5,
   });
   if (sheet.tiles) {
     new Chunks({
@@ -70,8 +57,6 @@ export function makeMap(id, sheet) {
   } else {
     L.imageOverlay(`preview.jpg?v=${sheet.id}`, bounds, { alt: "" }).addTo(map);
   }
-  L.control.scale({ imperial: false, maxWidth: 140 }).addTo(map);
-  map.fitBounds(bounds);
   return map;
 }
 

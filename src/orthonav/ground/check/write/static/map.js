@@ -8,22 +8,16 @@ function boundsOf([west, south, east, north]) {
   return L.latLngBounds(at([west, south]), at([east, north]));
 }
 
-/** A plane with distances in metres, so that the scale bar is true. */
-const PLANE = L.extend({}, L.CRS.Simple, { distance: (p, q) => Math.hypot(p.lat - q.lat, p.lng - q.lng) });
-
 function makeMap() {
-  const map = L.map("map", {
-    crs: PLANE, maxZoom: FINEST, minZoom: -12, zoomSnap: 0.25, zoomDelta: 1, attributionControl: false,
-    scrollWheelZoom: false, keyboardPanDelta: 60,
-  });
   const whole = boundsOf(drawn.box);
-  map.fitBounds(whole);
+  const map = planeMap(L, "map", 1, whole, {
+    maxZoom: FINEST, minZoom: -12, zoomSnap: 0.25, scrollWheelZoom: false, keyboardPanDelta: 60,
+  });
   map.setMinZoom(Math.floor(map.getZoom()) - 1);
   map.setMaxBounds(whole.pad(0.6));
   for (const [name, order] of [["image", 200], ["cells", 250]]) map.createPane(name).style.zIndex = order;
   const image = document.getElementById("check-image");
   L.imageOverlay(image.src, boundsOf(drawn.image), { pane: "image", alt: "" }).addTo(map);
-  L.control.scale({ imperial: false, maxWidth: 150 }).addTo(map);
   const north = L.control({ position: "topright" });
   north.onAdd = () => {
     const arrow = make("div", "N");
@@ -177,12 +171,13 @@ function selectFromMap(map) {
 
 function showSelected(map) {
   const side = cells.side_m;
-  const square = L.rectangle(boundsOf([0, 0, side, side]), { color: "#fff", weight: 3, fill: false, interactive: false });
-  const inner = L.rectangle(boundsOf([0, 0, side, side]), { color: "#000", weight: 1.2, fill: false, interactive: false });
+  const edges = [["#fff", 3], ["#000", 1.2]].map(([color, weight]) => L.rectangle(
+    boundsOf([0, 0, side, side]), { color, weight, fill: false, interactive: false },
+  ));
   const dot = L.circleMarker([0, 0], { radius: 7, color: "#fff", weight: 3, fillColor: "#1a1a1a", fillOpacity: 1, interactive: false });
   listeners.push(({ east, north, index }) => {
     const cell = cellAt(east, north);
-    for (const each of [square, inner]) {
+    for (const each of edges) {
       if (cell < 0) each.remove();
       else {
         const west = cells.west_m + (cell % cells.cols) * side;

@@ -1,0 +1,265 @@
+"""Tolerated errors of heading and height, and the best height to fly at."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.check.estimate import Prediction
+from orthonav.ground.check.outcome import (
+    Along,
+    Alternative,
+    BlindStretch,
+    Conditions,
+    Envelope,
+    Lookalike,
+)
+from orthonav.ground.check.trials import Trial, TrialPlan, Work
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import along_polyline_en_m
+
+Array = NDArray[np.float64]
+YAW_OFF_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
+AGL_OFF = (-0.2, -0.1, 0.0, 0.1, 0.2)
+"""Errors tried: about one to four default standard deviations."""
+TOLERATED = 0.85
+"""An error is tolerated while the rate of fixes stays above this part of that without error."""
+HEIGHTS = (0.5, 0.7, 1.4, 2.0)
+"""Other heights tried, as parts of the planned one: steps of about the square root of two."""
+
+
+def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
+    """Trials at the same places for every error of heading and height."""
+    return [
+        (replace(plan, yaw_off_deg=yaw, agl_off=agl), places_en_m)
+        for yaw in YAW_OFF_DEG
+        for agl in AGL_OFF
+    ]
+
+
+def envelope_of(trials: Sequence[Sequence[Trial]]) -> Envelope:
+    """The envelope from the trials of `envelope_work`."""
+    shares = [right_share(each) for each in trials]
+    share = np.array(shares, np.float64).reshape(len(YAW_OFF_DEG), len(AGL_OFF))
+    middle = AGL_OFF.index(0.0)
+    tolerated = (share >= TOLERATED * share[0, middle]) & (share > 0)
+    yaw = YAW_OFF_DEG[_last_without_gap(tolerated[:, middle])]
+    low = AGL_OFF[middle - _last_without_gap(tolerated[0, middle::-1])]
+    high = AGL_OFF[middle + _last_without_gap(tolerated[0, middle:])]
+    return Envelope(np.array(YAW_OFF_DEG), np.array(AGL_OFF), share, yaw, low, high)
+
+
+def _last_without_gap(tolerated: NDArray[np.bool_]) -> int:
+    gaps = np.flatnonzero(~tolerated)
+    return max(int(gaps[0]) - 1, 0) if len(gaps) else len(tolerated) - 1
+
+
+def heights_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
+    """Trials at the same places from other heights."""
+    return [(replace(plan, agl_m=plan.agl_m * part), places_en_m) for part in HEIGHTS]
+
+
+def heights_of(
+    plan: TrialPlan, planned: Sequence[Trial], others: Sequence[Sequence[Trial]]
+) -> tuple[Alternative, ...]:
+    """Alternatives from `planned` trials at `plan.agl_m` and those of `heights_work`, by height."""
+    tried = sorted({1.0: planned, **dict(zip(HEIGHTS, others, strict=True))}.items())
+    return tuple(
+        Alternative("agl_m", plan.agl_m * part, right_share(each), part == 1.0)
+        for part, each in tried
+    )
+
+
+def right_share(trials: Sequence[Trial]) -> float:
+    """Fraction of trials that were confident and correct; NaN without trials."""
+    return float(np.mean([each.right for each in trials])) if trials else float("nan")
+
+
+SIMILAR = 0.8
+"""A rival place is ambiguous if it reaches this fraction of the best score."""
+MAX_PAIRS = 40
+_WRONG_CONFIDENCE = 0.5
+"""One wrong trial of this confidence is enough; otherwise a second trial must agree."""
+
+
+@dataclass(frozen=True)
+class _Pair:
+    place: tuple[float, float]
+    other: tuple[float, float]
+    similarity: float
+    confident: bool
+
+
+def found_lookalikes(
+    trials: Sequence[Trial],
+    frame: LocalFrame,
+    *,
+    view_side_m: float,
+    radius_m: float,
+    prior_std_m: float | None,
+) -> tuple[Lookalike, ...]:
+    """Pairs of places, most similar first; pairs whose ends lie within half a view are merged.
+
+    A misplaced view pairs its true place with where it was placed; a correctly placed view pairs
+    it with its best rival, if that scores high enough.
+    """
+    # Within a quarter of a view it is the same place, only located badly.
+    far_m = max(radius_m, view_side_m / 4)
+    pairs = [pair for each in trials if (pair := _pair(each, far_m)) is not None]
+    pairs.sort(key=lambda pair: -pair.similarity)
+    groups: list[list[_Pair]] = []
+    for pair in pairs:
+        group = next((g for g in groups if _same(g[0], pair, view_side_m / 2)), None)
+        if group is None:
+            groups.append([pair])
+        else:
+            group.append(pair)
+    groups = [group for group in groups if len(group) > 1 or group[0].confident]
+    groups.sort(key=lambda group: (-min(len(group), 3), -group[0].similarity))
+    return tuple(_lookalike(group, frame, prior_std_m) for group in groups[:MAX_PAIRS])
+
+
+def _pair(trial: Trial, far_m: float) -> _Pair | None:
+    if not math.isfinite(trial.error_m):
+        return None
+    if trial.error_m > far_m:
+        return _Pair(trial.en_m, trial.found_en_m, 1.0, trial.confidence >= _WRONG_CONFIDENCE)
+    if math.isfinite(trial.rival_share) and trial.rival_share >= SIMILAR:
+        return _Pair(trial.en_m, trial.rival_en_m, min(trial.rival_share, 1.0), False)
+    return None
+
+
+def _same(one: _Pair, two: _Pair, within_m: float) -> bool:
+    """Whether both ends of two pairs, in either order, lie near each other."""
+    straight = max(math.dist(one.place, two.place), math.dist(one.other, two.other))
+    swapped = max(math.dist(one.place, two.other), math.dist(one.other, two.place))
+    return min(straight, swapped) <= within_m
+
+
+def _lookalike(group: Sequence[_Pair], frame: LocalFrame, prior_std_m: float | None) -> Lookalike:
+    first = group[0]
+    apart_m = math.dist(first.place, first.other)
+    lat, lon = frame.latlon_from_en(np.array([first.place, first.other]))
+    return Lookalike(
+        place_latlon_deg=(float(lat[0]), float(lon[0])),
+        other_latlon_deg=(float(lat[1]), float(lon[1])),
+        apart_m=apart_m,
+        similarity=float(np.mean([pair.similarity for pair in group])),
+        trials=len(group),
+        within_prior=prior_std_m is None or apart_m <= 3 * prior_std_m,
+    )
+
+
+BLIND = 0.5
+"""A gap lies below this probability: more likely no fix than a fix."""
+POINTS_PER_VIEW = 4.0
+"""Points along the route per side of a view, as many as cells."""
+MAX_POINTS = 4000
+_REACHED = 1e-6
+"""A shorter rest of the route, as a fraction of the distance between points, is none."""
+ACROSS = 5
+"""Points across the band at every point along it."""
+NEGLIGIBLE = 1e-9
+"""Chances below this no longer change the expected drift."""
+
+
+def predicted_along(
+    area: Area,
+    bands_m: Sequence[float],
+    view_side_m: float,
+    conditions: Conditions,
+    predict: Callable[[Array], Prediction],
+) -> Along:
+    """Predictions along the route of an area.
+
+    `bands_m` is the width of the band of every leg; `predict` takes places (N, 2) and returns a
+    probability of 0 and an error of NaN beyond the map.
+    """
+    assert area.route is not None
+    line = area.route.points_en_m(area.frame)
+    ends_m = np.cumsum(np.hypot(*np.diff(line, axis=0).T))
+    length_m = float(ends_m[-1]) if len(ends_m) else 0.0
+    step_m = max(view_side_m / POINTS_PER_VIEW, length_m / MAX_POINTS)
+    points, course_deg = along_polyline_en_m(line, max(step_m, 1e-6))
+    distance_m = np.minimum(np.arange(len(points)) * step_m, length_m)
+    if length_m - distance_m[-1] > _REACHED * step_m:  # the last waypoint
+        points, distance_m = np.vstack([points, line[-1]]), np.append(distance_m, length_m)
+        course_deg = np.append(course_deg, np.degrees(np.arctan2(*(line[-1] - points[-2]))) % 360)
+    middle = predict(points)
+    course = np.radians(course_deg)
+    across = np.stack([np.cos(course), -np.sin(course)], axis=1)
+    leg = np.minimum(np.searchsorted(ends_m, distance_m), len(bands_m) - 1)
+    across *= np.asarray(bands_m, np.float64)[leg, None]
+    shares = np.linspace(-0.5, 0.5, ACROSS)
+    lowest = np.min([predict(points + share * across).probability for share in shares], axis=0)
+    return Along(
+        distance_m=distance_m,
+        points_en_m=points,
+        probability=middle.probability,
+        low=middle.low,
+        high=middle.high,
+        across_low=np.minimum(lowest, middle.probability),
+        error_m=middle.error_m,
+        drift_m=expected_drift(
+            distance_m, middle.probability, middle.error_m, conditions.drift, view_side_m
+        ),
+    )
+
+
+def expected_drift(
+    distance_m: Array, probability: Array, error_m: Array, drift: float, view_side_m: float
+) -> Array:
+    """Expected position error (N,), root mean square, when fixes arrive as predicted.
+
+    An independent view every `view_side_m` gives a fix with its probability; between fixes the
+    error grows by `drift` per metre. The position is known before the first view.
+    """
+    length_m = float(distance_m[-1])
+    stops = np.arange(0.0, length_m + view_side_m, view_side_m)
+    chance = np.interp(stops, distance_m, probability)
+    error = np.interp(stops, distance_m, np.nan_to_num(error_m, nan=0.0))
+    expected = np.zeros(len(stops))
+    # Chance that the last fix was k views ago, and the square of the error that has grown since.
+    since: Array = np.array([1.0])
+    grown: Array = np.array([error[0] ** 2])
+    for i in range(len(stops)):
+        if i:
+            grown = (np.sqrt(grown) + drift * view_side_m) ** 2
+        since = np.concatenate([[since.sum() * chance[i]], since * (1 - chance[i])])
+        grown = np.concatenate([[error[i] ** 2], grown])
+        counts = since > NEGLIGIBLE
+        counts[-1] = True
+        since, grown = since[counts], grown[counts]
+        expected[i] = math.sqrt(float((since * grown).sum() / since.sum()))
+    return np.interp(distance_m, stops, expected)
+
+
+def blind_stretches(
+    along: Along, conditions: Conditions, view_side_m: float
+) -> tuple[BlindStretch, ...]:
+    """Gaps: stretches of at least one side of a view with a probability below `BLIND`, in order."""
+    blind = along.probability < BLIND
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], blind.astype(int), [0]])))
+    last = len(blind) - 1
+    allowed_m = math.inf if conditions.prior_std_m is None else conditions.prior_std_m
+    found = []
+    for first, end in edges.reshape(-1, 2):
+        start_m = float(along.distance_m[first])
+        end_m = float(along.distance_m[min(end, last)])
+        if end_m - start_m < view_side_m:
+            continue
+        stretch = BlindStretch(
+            start_m=start_m,
+            end_m=end_m,
+            start_s=start_m / conditions.speed_mps,
+            end_s=end_m / conditions.speed_mps,
+            probability=float(along.probability[first:end].mean()),
+            drift_m=conditions.drift * (end_m - start_m),
+            allowed_m=allowed_m,
+            ends_lost=bool(end > last),
+        )
+        found.append(stretch)
+    return tuple(found)

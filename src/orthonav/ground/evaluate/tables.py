@@ -1,0 +1,595 @@
+"""Figures of evaluated flights as JSON values, as text for a terminal, and as rows for the page."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from orthonav.core.flight.fixes import STATES
+from orthonav.core.flight.gnss import BIASES as GNSS_BIASES
+from orthonav.ground.evaluate.calibration import (
+    NEES_LEVELS,
+    CovarianceConsistency,
+    nees_bound,
+    nees_mean_bounds,
+)
+from orthonav.ground.evaluate.contact_sheet import Row
+from orthonav.ground.evaluate.figures import FloatArray, Longest, percentile
+from orthonav.ground.evaluate.metrics import (
+    Comparison,
+    CriterionRow,
+    Metrics,
+    measure,
+    pool,
+    radius_key,
+    wrong_key,
+)
+from orthonav.ground.evaluate.standard import RPE_FRAMES, ErrorStatistics, StandardFigures
+from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
+from orthonav.ground.report.drawing import Background
+from orthonav.ground.report.numbers import measure_text, percent_text, plain_text, to_plain
+
+Plain = dict[str, Any]
+_COLUMNS = (
+    *("flight", "views", "confident", "wrong", "low confidence", "coverage", "right", "of fixes"),
+    *("median m", "95 % m", "max m", "latency ms"),
+)
+_EAST, _NORTH, _PITCH, _ROLL, _LATENCY = GNSS_BIASES
+_LEARNT = {
+    "learnt displacement of the map": ((_EAST, 1, "m east"), (_NORTH, 1, "m north")),
+    "learnt error of the mount": ((_PITCH, 2, "deg pitch"), (_ROLL, 2, "deg roll")),
+    "learnt latency": ((_LATENCY, 0, "ms"),),
+}
+"""Learnt biases as they are shown: keys, digits and units."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlightReport:
+    """One evaluated flight.
+
+    `comparison`: results with their true positions; `metrics`: figures of these.
+    `background`: image in the plane of `comparison`; optional.
+    `track`: metrics of the track; None where views were localized one by one.
+    `worst`: rows of the contact sheet; empty where images were not requested.
+    `gnss`: GNSS beside the map; None where it was not recorded.
+    `view_command`: command that shows single views; empty without a map.
+    """
+
+    name: str
+    comparison: Comparison
+    metrics: Metrics
+    background: Background | None = None
+    track: TrackMetrics | None = None
+    worst: tuple[Row, ...] = ()
+    gnss: GnssMetrics | None = None
+    view_command: str = ""
+
+
+def total(flights: Sequence[FlightReport]) -> Metrics:
+    """Metrics of all views of all flights together.
+
+    Raises `ValueError` for no flight, and where flights were measured at different radii.
+    """
+    if len({flight.metrics.radius_m for flight in flights}) != 1:
+        raise ValueError("a total needs at least one flight, and one radius for all of them")
+    first = flights[0].metrics
+    if len(flights) == 1:
+        return first
+    pooled = pool([flight.comparison for flight in flights])
+    distance_m = first.standard.distance_m
+    return measure(pooled, first.radius_m, list(first.acc_at_m), rpe_distance_m=distance_m)
+
+
+# JSON.
+
+
+def metrics_to_json(metrics: Metrics) -> Plain:
+    """`metrics` as values for strict JSON; undefined ones become None."""
+    same = (
+        *("n_views", "n_fixes", "n_confident", "n_confident_wrong", "wrong_above_m"),
+        *("wrong_upper_95", "availability", "availability_95", "n_without_truth"),
+        *("n_without_result", "radius_m", "coverage", "latency_median_ms", "latency_p95_ms"),
+    )
+    confident, standard = metrics.of_confident, metrics.standard
+    found = metrics.consistency
+    plain: Plain = to_plain(
+        {
+            **{name: getattr(metrics, name) for name in same},
+            "n_low_confidence": metrics.n_fixes - metrics.n_confident,
+            "longest_gap_s": metrics.gap.seconds_s,
+            "longest_gap_m": metrics.gap.path_m,
+            "confident_error_median_m": confident.cep50_m,
+            "confident_error_p95_m": confident.cep95_m,
+            "confident_error_max_m": confident.ape.max_m,
+            **{radius_key(r): share for r, share in metrics.acc_at_m.items()},
+            **{f"fixes_{radius_key(r)}": share for r, share in metrics.acc_fixes_at_m.items()},
+            "error_median_m": standard.cep50_m,
+            "error_p95_m": standard.cep95_m,
+            "error_mean_m": standard.ape.mean_m,
+            "error_max_m": standard.ape.max_m,
+            "reasons": metrics.reasons,
+            "criteria": [_criterion_to_json(row) for row in metrics.criteria],
+            "standard": _standard_to_json(standard),
+            "standard_of_confident": _standard_to_json(confident),
+            "curves": {
+                curve.name: {
+                    "threshold": curve.thresholds,
+                    "share_accepted": curve.share_accepted,
+                    "accuracy": curve.accuracy,
+                }
+                for curve in metrics.curves
+            },
+            "calibration": metrics.calibration,
+            "covariance": {
+                "n_right": found.n_right,
+                "n_nees": found.nees.size,
+                "n_without_covariance": found.n_without,
+                "n_unusable_covariance": found.n_unusable,
+                "nees_mean": found.nees_mean,
+                "nees_median": found.nees_median,
+                **{f"nees_within_{100 * p:g}": share for p, share in found.within.items()},
+            },
+        }
+    )
+    return plain
+
+
+def _criterion_to_json(row: CriterionRow) -> Plain:
+    plain = asdict(row)
+    far = wrong_key(plain.pop("far_m"))
+    plain["share_of_right_accepted"] = plain.pop("recall")
+    plain[f"n_{far}"], plain[far] = plain.pop("n_far"), plain.pop("share_far")
+    return plain
+
+
+def _standard_to_json(standard: StandardFigures) -> Plain:
+    return {
+        "rmse_m": standard.ape.rmse_m,
+        "cep50_m": standard.cep50_m,
+        "cep95_m": standard.cep95_m,
+        "ape": standard.ape,
+        "rpe": [
+            {"delta": RPE_FRAMES, "unit": "frames", **asdict(standard.rpe_frames)},
+            {"delta": standard.distance_m, "unit": "m", **asdict(standard.rpe_distance)},
+        ],
+    }
+
+
+def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> Plain:
+    """The figures of all flights together, and of several also of each, for strict JSON.
+
+    `whole`: what `total` gives. Of several tracks only sums and maxima are given.
+    """
+    plain = metrics_to_json(whole)
+    if len(flights) == 1:
+        track, gnss = flights[0].track, flights[0].gnss
+        plain |= {} if track is None else {"track": track_to_json(track)}
+        return plain | ({} if gnss is None else {"gnss": gnss_to_json(gnss)})
+    tracks = [flight.track for flight in flights if flight.track is not None]
+    if tracks:
+        plain["track"] = tracks_to_json(tracks)
+    plain["flights"] = {each.name: flights_to_json([each], each.metrics) for each in flights}
+    return plain
+
+
+def track_to_json(track: TrackMetrics) -> Plain:
+    """`track` as values for strict JSON, units in the names; undefined ones become None.
+
+    `over_time` has one value per compared view, rounded to milliseconds and millimetres.
+    """
+    plain: Plain = to_plain({name: each for name, each in vars(track).items() if name != "series"})
+    plain["first_view"] = plain["first_view"] and int(plain["first_view"])
+    plain["consistency"]["verdict"] = plain["consistency"]["verdict"] or None
+    after = plain["after"]
+    after |= {radius_key(r): share for r, share in after.pop("acc_at_m").items()}
+    names = ("seconds_s", "sigma_m", "bound_95_m", "along_m", "across_m")
+    plain["over_time"] = to_plain({name: getattr(track.series, name) for name in names}, 3)
+    return plain
+
+
+def tracks_to_json(tracks: Sequence[TrackMetrics]) -> Plain:
+    """Sums, shares of views and maxima over several tracks.
+
+    Medians, biases and consistency are given per flight only.
+    """
+
+    def most(values: Iterable[float]) -> float | None:
+        return max((value for value in values if math.isfinite(value)), default=None)
+
+    n_after = sum(track.after.n_views for track in tracks)
+    known = [track.after for track in tracks if track.after.n_views]
+    within = {
+        radius_key(r): sum(a.acc_at_m[r] * a.n_views for a in known) / n_after if known else None
+        for r in tracks[0].after.acc_at_m
+    }
+    n_views = sum(track.n_views for track in tracks)
+    errors_m = most(track.after.error_max_m for track in tracks)
+    return {
+        "n_tracks": len(tracks),
+        "n_found": sum(math.isfinite(track.first_view) for track in tracks),
+        "n_views": n_views,
+        "first_s_max": most(track.first_s for track in tracks),
+        "after": {"n_views": n_after, "error_max_m": errors_m, **within},
+        "share_of_views": {
+            state: sum(t.share_of_views[state] * t.n_views for t in tracks) / n_views
+            for state in tracks[0].share_of_views
+        },
+        "n_lost": sum(track.n_lost for track in tracks),
+        "low_confidence_seconds_s_max": most(track.low_confidence.seconds_s for track in tracks),
+        "low_confidence_path_m_max": most(track.low_confidence.path_m for track in tracks),
+        "n_confident_wrong": sum(track.n_confident_wrong for track in tracks),
+        "n_false_locks": sum(track.n_false_locks for track in tracks),
+        "false_lock_longest_s": most(track.false_lock_longest_s for track in tracks),
+    }
+
+
+def gnss_to_json(found: GnssMetrics) -> Plain:
+    """The figures of GNSS as values for strict JSON."""
+    values = {
+        f"{name}_{label}_m": percentile(each, percent)
+        for name, each in (("error", found.errors_m), ("difference", found.differences_m))
+        for label, percent in (("median", 50), ("p95", 95), ("max", 100))
+    }
+    alarms = [
+        {"fault": found.faults[i], "first_s": found.seconds_s[i], "views": end - i}
+        for i, end in found.alarms
+    ]
+    plain: Plain = to_plain({**values, "alarms": alarms, "learnt": found.learnt})
+    return plain
+
+
+# Text for a terminal.
+
+
+def verdict(metrics: Metrics) -> str:
+    """A sentence that answers whether any confident fix was wrong."""
+    confident, wrong = metrics.n_confident, metrics.n_confident_wrong
+    above = f"{metrics.wrong_above_m:g} m and the stated radius"
+    if not confident:
+        guesses = metrics.n_fixes
+        return f"No fix is confident: rely on no position ({guesses} are best guesses)."
+    errors = (
+        f"({wrong_bound_text(metrics)}); "
+        f"median error {measure_text(metrics.of_confident.cep50_m, ' m')}, largest "
+        f"{measure_text(metrics.of_confident.ape.max_m, ' m')}."
+    )
+    if not wrong:
+        none = f"none of {confident} has an error above {above}"
+        return f"No confident fix is wrong: {none} {errors}"
+    verb = "is" if wrong == 1 else "are"
+    return f"{wrong} of {confident} confident fixes {verb} WRONG, by more than {above} {errors}"
+
+
+def wrong_bound_text(metrics: Metrics) -> str:
+    """The upper bound of the rate of false fixes."""
+    return f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
+
+
+def table(flights: Sequence[FlightReport], whole: Metrics) -> str:
+    """The figures in aligned columns for a terminal: a row per flight, and a total of several.
+
+    `whole`: what `total` gives.
+    """
+    rows = [table_header(whole), *table_rows(flights, whole)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        first, *others = zip(row, widths, strict=True)
+        cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]
+        lines.append("  ".join(cells).rstrip())
+    if len(flights) > 1:
+        lines.insert(-1, "-" * max(map(len, lines)))
+    return "\n".join(lines)
+
+
+def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
+    """Standard figures, confidence and covariance of all flights, and metrics of each track.
+
+    `whole`: what `total` gives.
+    """
+    standard, of_confident = whole.standard, whole.of_confident
+    low, high = map(percent_text, whole.availability_95)
+    lines = [
+        f"availability: {percent_text(whole.availability)} of views have a confident fix (95 % "
+        f"interval {low} to {high}); longest gap {_longest_text(whole.gap)}",
+        *(
+            f"{name}: {measure_text(confident, ' m')} of confident fixes, "
+            f"{measure_text(of_all, ' m')} of all"
+            for name, confident, of_all in (
+                ("CEP50", of_confident.cep50_m, standard.cep50_m),
+                ("CEP95", of_confident.cep95_m, standard.cep95_m),
+            )
+        ),
+        f"APE: {_statistics_text(standard.ape)}",
+        f"RPE over {RPE_FRAMES} frame: {_statistics_text(standard.rpe_frames)}",
+        f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
+        f"confidence: {confidence_text(whole)}",
+        *(_criterion_line(row, whole.radius_m) for row in _stated(whole)),
+        f"covariance: {covariance_text(whole.consistency)}",
+    ]
+    for flight in flights:
+        rows: list[tuple[str, str]] = []
+        if flight.track is not None:
+            of = f" of {' '.join(flight.name.split())}" if len(flights) > 1 else ""
+            lines.append(f"track{of}:")
+            rows += track_rows(flight.track)
+        if flight.gnss is not None:
+            rows += gnss_rows(flight.gnss)
+        lines += [f"  {name}: {text}" for name, text in rows]
+    return "\n".join(lines)
+
+
+def _stated(metrics: Metrics) -> list[CriterionRow]:
+    """Rows of confidence, where any fix states one."""
+    found = [row for row in metrics.criteria if row.name == "confidence"]
+    return found if metrics.calibration.n_fixes else []
+
+
+def _criterion_line(row: CriterionRow, radius_m: float) -> str:
+    return (
+        f"  >= {row.threshold:g}: {percent_text(row.share_accepted)} of views accepted, precision "
+        f"within {radius_m:g} m {percent_text(row.accuracy)}, recall {percent_text(row.recall)}; "
+        f"{row.n_far} of {row.n_accepted} wrong by more than {row.far_m:g} m "
+        f"({percent_text(row.share_far)})"
+    )
+
+
+def _statistics_text(found: ErrorStatistics) -> str:
+    if not found.n:
+        return "not defined"
+    return (
+        f"RMSE {measure_text(found.rmse_m)}, mean {measure_text(found.mean_m)}, "
+        f"median {measure_text(found.median_m)}, std {measure_text(found.std_m)}, "
+        f"max {measure_text(found.max_m)} m ({found.n} values)"
+    )
+
+
+def confidence_text(metrics: Metrics) -> str:
+    """A sentence that compares stated confidence with the share of right fixes."""
+    calibration = metrics.calibration
+    if not calibration.n_fixes:
+        return "unknown, no fix states one"
+    n_default = calibration.n_fixes - calibration.n_own_radius
+    default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
+    stated = "1 fix states" if calibration.n_fixes == 1 else f"{calibration.n_fixes} fixes state"
+    return (
+        f"{stated} a mean confidence of {calibration.mean_confidence:.3f}; the fraction within the "
+        f"stated radius is {calibration.share_right:.3f}{default}; "
+        f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
+    )
+
+
+def covariance_verdict(consistency: CovarianceConsistency) -> str:
+    """A sentence that answers whether the stated covariances can be used."""
+    if not consistency.nees.size:
+        return "Whether covariances are right is unknown: no correct fix states one."
+    return f"Covariances are {_judged(consistency)}."
+
+
+def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str, str]:
+    """A word on the stated covariances, its explanation, and "bad" where they are too small."""
+    if not consistency.nees.size:
+        return "-", "covariance: no correct fix states one", ""
+    word, _, times = _judged(consistency).partition(": ")
+    label = f"{times}; NEES {consistency.nees_mean:.3g}, 2 expected".removeprefix("; ")
+    return word if times else "right", f"covariance: {label}", "bad" * (word == "too small")
+
+
+def covariance_text(consistency: CovarianceConsistency) -> str:
+    """Consistency of the covariance in a sentence."""
+    if not consistency.n_right:
+        return "unknown, no fix is correct"
+    counts = ((consistency.n_without, "without one"), (consistency.n_unusable, "unusable"))
+    left_out = ", ".join(f"{count} {kind}" for count, kind in counts if count)
+    if not consistency.nees.size:
+        return f"unknown; of {consistency.n_right} correct fixes {left_out}"
+    return (
+        f"{_judged(consistency)}; "
+        f"NEES of {consistency.nees.size} correct fixes has mean {consistency.nees_mean:.3g} "
+        f"(2 expected), median {consistency.nees_median:.3g} ({nees_bound(0.5):.2f} expected); "
+        f"{within_text(consistency)}" + (f"; {left_out}" if left_out else "")
+    )
+
+
+def within_text(consistency: CovarianceConsistency) -> str:
+    """Percentages of NEES within the bounds of chi-square."""
+    levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
+    found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
+    return f"{found} % within the bounds of {levels} %"
+
+
+def _judged(consistency: CovarianceConsistency) -> str:
+    return nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
+
+
+def nees_text(nees: float, low: float, high: float) -> str:
+    """What a mean NEES says, given the 95 % interval of that of a consistent covariance."""
+    times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
+    if nees > high:
+        return f"too small: {times}"
+    return f"conservative: {times}" if nees < low else "consistent with the errors"
+
+
+# Rows for the page.
+
+
+def table_header(whole: Metrics) -> list[str]:
+    """Names of the columns of `table_rows`."""
+    return [f"acc@{whole.radius_m:g} m" if name == "right" else name for name in _COLUMNS]
+
+
+def table_rows(flights: Sequence[FlightReport], whole: Metrics) -> list[list[str]]:
+    """A row per flight, and the total `whole` of several."""
+    named = [(" ".join(flight.name.split()), flight.metrics) for flight in flights]
+    return [
+        [
+            name,
+            str(metrics.n_views),
+            str(metrics.n_confident),
+            str(metrics.n_confident_wrong),
+            str(metrics.n_fixes - metrics.n_confident),
+            percent_text(metrics.coverage),
+            percent_text(metrics.accuracy),
+            percent_text(metrics.accuracy_of_fixes),
+            measure_text(metrics.standard.cep50_m),
+            measure_text(metrics.standard.cep95_m),
+            measure_text(metrics.standard.ape.max_m),
+            measure_text(metrics.latency_median_ms),
+        ]
+        for name, metrics in [*named, *[("total", whole)] * (len(flights) > 1)]
+    ]
+
+
+def standard_rows(metrics: Metrics) -> list[tuple[str, ...]]:
+    """APE and RPE of confident and of all fixes."""
+    return [
+        (name, kind, *map(measure_text, list(vars(found).values())[1:]), str(found.n))
+        for kind, standard in (("confident", metrics.of_confident), ("all", metrics.standard))
+        for name, found in (
+            ("APE", standard.ape),
+            (f"RPE over {RPE_FRAMES} frame", standard.rpe_frames),
+            (f"RPE over {standard.distance_m:g} m", standard.rpe_distance),
+        )
+    ]
+
+
+def criteria_header(metrics: Metrics) -> tuple[str, ...]:
+    """Column names of `criteria_rows`."""
+    far = f"{metrics.criteria[0].far_m:g} m" if metrics.criteria else ""
+    within = f"precision within {metrics.radius_m:g} m"
+    names = ("criterion", "at least", "accepted", "of all views")
+    return (*names, within, "recall", f"wrong by > {far}")
+
+
+def criteria_rows(metrics: Metrics, labels: dict[str, str]) -> list[tuple[str, ...]]:
+    """What each threshold of each criterion accepts; `labels` are names to show."""
+    return [
+        (
+            labels[row.name],
+            f"{row.threshold:g}",
+            str(row.n_accepted),
+            percent_text(row.share_accepted),
+            percent_text(row.accuracy),
+            percent_text(row.recall),
+            percent_text(row.share_far) + (f" ({row.n_far})" if row.n_accepted else ""),
+        )
+        for row in metrics.criteria
+    ]
+
+
+def bins_rows(metrics: Metrics) -> list[tuple[str, ...]]:
+    """Rows of the reliability diagram; empty where no fix states a confidence."""
+    return [
+        (
+            f"{b.lower:g} to {b.upper:g}",
+            str(b.n_fixes),
+            *map(plain_text, (b.mean_confidence, b.share_right, b.right_low, b.right_high)),
+        )
+        for b in metrics.calibration.bins
+        if metrics.calibration.n_fixes
+    ]
+
+
+def levels_rows(consistency: CovarianceConsistency) -> list[tuple[str, ...]]:
+    """Rows of the bounds of chi-square; empty where no covariance is usable."""
+    return [
+        (f"{100 * level:g} %", f"{nees_bound(level):.2f}", percent_text(level), percent_text(share))
+        for level, share in consistency.within.items()
+        if consistency.nees.size
+    ]
+
+
+def track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
+    """The metrics of a track as names and texts."""
+    after, errors, found = track.after, "unknown", "never"
+    if math.isfinite(track.first_view):
+        first = f"view {track.first_view:.0f} of {track.n_views}"
+        found = f"{first}, {_unit(track.first_s, 's')} after the first"
+    if after.n_views:
+        within = ", ".join(f"{percent_text(s)} within {r:g} m" for r, s in after.acc_at_m.items())
+        errors = (
+            f"median {_unit(after.error_median_m, 'm')}, 95 % {_unit(after.error_p95_m, 'm')}, "
+            f"largest {_unit(after.error_max_m, 'm')}; of {after.n_views} views {within}"
+        )
+    by_view = ", ".join(f"{name} {percent_text(track.share_of_views[name])}" for name in STATES)
+    by_time = ", ".join(percent_text(track.share_of_time[name]) for name in STATES)
+    lost = f"lost {track.n_lost} time{'s' * (track.n_lost != 1)}"
+    without, after_first = (
+        f"{_unit(each.seconds_s, 's')}, {_unit(each.path_m, 'm')}"
+        for each in (track.low_confidence, track.low_confidence_after)
+    )
+    return [
+        ("first confirmed fix", found),
+        ("errors from then on", errors),
+        ("states", f"{by_view} of views; {by_time} of the time; {lost}"),
+        (
+            "longest without a confident fix",
+            f"{without}; from the first confirmed fix on {after_first}",
+        ),
+        (
+            "false locks",
+            f"{track.n_false_locks}, the longest {_unit(track.false_lock_longest_s, 's')}; "
+            f"{track.n_confident_wrong} confident or tracking views wrong by more than "
+            f"{track.far_m:g} m and their own radius",
+        ),
+        ("ahead of the ground truth", spread_text(track.along)),
+        ("right of the ground truth", spread_text(track.across)),
+        ("covariance", track_consistency_text(track.consistency)),
+    ]
+
+
+def track_consistency_text(found: TrackConsistency) -> str:
+    """Consistency of a track in a sentence."""
+    if not found.n_views:
+        return "unknown, no tracking view has a usable one and a true position"
+    left_out = f"; {found.n_left_out} without a usable one" if found.n_left_out else ""
+    return (
+        f"{nees_text(found.nees_mean, found.effective_low, found.effective_high)}; "
+        f"NEES of {found.n_views} tracking views has mean {found.nees_mean:.3g} "
+        f"(2 expected; 95 % interval {found.effective_low:.2f} to {found.effective_high:.2f} for "
+        f"{found.n_effective:.0f} effective views, as errors are correlated; for independent views "
+        f"{found.independent_low:.2f} to {found.independent_high:.2f}); "
+        f"{percent_text(found.nees_within_95)} below {nees_bound(0.95):.2f} (95 % expected)"
+        f"{left_out}"
+    )
+
+
+def spread_text(spread: Spread) -> str:
+    """Bias and spread of signed errors in a sentence."""
+    if not spread.n_views:
+        return "unknown"
+    return (
+        f"mean {spread.mean_m:+.1f} m, standard deviation {spread.std_m:.1f} m, "
+        f"RMSE {spread.rmse_m:.1f} m of {spread.n_views} tracking views"
+    )
+
+
+def gnss_rows(found: GnssMetrics) -> list[tuple[str, str]]:
+    """The figures of GNSS as names and texts."""
+    named = [found.faults[first] for first, _ in found.alarms]
+    rows = [
+        ("error of GNSS", percentiles_text(found.errors_m)),
+        ("difference of GNSS and map", percentiles_text(found.differences_m)),
+        ("GNSS alarms", f"{len(named)}{': ' if named else ''}{', '.join(named)}"),
+    ]
+    for name, pairs in _LEARNT.items() if found.learnt else ():
+        texts = [
+            f"{found.learnt[key]:.{digits}f} +- {found.learnt[std_key]:.{digits}f} {unit}"
+            for (key, std_key), digits, unit in pairs
+        ]
+        rows.append((name, ", ".join(texts)))
+    return rows
+
+
+def percentiles_text(values: FloatArray) -> str:
+    """Median, 95 % and maximum of errors in metres."""
+    median, p95, most = (measure_text(percentile(values, q), " m") for q in (50, 95, 100))
+    return f"median {median}, 95 % {p95}, largest {most}"
+
+
+def _longest_text(longest: Longest) -> str:
+    return f"{measure_text(longest.seconds_s, ' s')}, {measure_text(longest.path_m, ' m')}"
+
+
+def _unit(value: float, unit: str) -> str:
+    return f"{value:.1f} {unit}" if math.isfinite(value) else f"- {unit}"

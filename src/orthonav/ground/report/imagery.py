@@ -1,0 +1,262 @@
+"""What pages show of a map and of a view: tiles, crops, and rectified views.
+
+Positions on a page are pixels of the sheet's finest level: fractional column and row from the
+north-west corner of its raster (pixel-is-area).
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.geo.camera import (
+    Camera,
+    axis_on_ground_en_m,
+    enu_from_camera,
+    footprint_en_m,
+    seen_px,
+)
+from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
+from orthonav.core.localize.view import check_telemetry
+from orthonav.core.mapfile.layer import GreyLayer, preview
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.records import Fix, Telemetry, View, ViewResult
+
+MIN_PX, MAX_PX = 256, 1024
+"""Limits of the pixels across a window: what a screen shows."""
+MARGIN = 1.02
+"""Width of a window relative to the footprint."""
+MAX_READ_PX = 4096
+"""Limit of a window of the map, about 16 MB."""
+Grey = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Box = tuple[float, float, float, float]
+"""West, south, east, north in metres, in the plane of a sheet."""
+_QUICK = [int(cv2.IMWRITE_PNG_COMPRESSION), 1]
+
+
+@dataclass(frozen=True)
+class GroundWindow:
+    """A square of ground, north up.
+
+    `side_m`: its width; `size_px`: pixels across.
+    `offset_en_m`: its middle, east and north of the point below the camera.
+    """
+
+    side_m: float
+    size_px: int
+    offset_en_m: tuple[float, float]
+
+    def box_at(self, position_en_m: NDArray[np.float64]) -> Box:
+        """Its edges where the camera is above a position (2,)."""
+        east, north = (float(value) for value in position_en_m + self.offset_en_m)
+        half_m = self.side_m / 2
+        return east - half_m, north - half_m, east + half_m, north + half_m
+
+
+def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
+    """`telemetry` with the heading, height and tilt that the fix states."""
+    fix = result.outcome
+    if not isinstance(fix, Fix):
+        return telemetry
+    pitch_deg, roll_deg = fix.tilt_deg(telemetry)
+    return replace(
+        telemetry,
+        yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else telemetry.yaw_deg,
+        agl_m=fix.agl_m if math.isfinite(fix.agl_m) else telemetry.agl_m,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
+    )
+
+
+def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindow:
+    """The square that holds the footprint of a view. Raises `FlightError` where it is unknown.
+
+    With a large tilt it is limited to `MAX_REACH` times the half side of a vertical view around the
+    optical axis.
+    """
+    refused = check_telemetry(telemetry, camera, None, heading_known=True)
+    if refused is not None:
+        raise FlightError(refused.detail)
+    attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    axis = axis_on_ground_en_m(*attitude)
+    reach_m = MAX_REACH * math.hypot(*camera.extent) / 2 * telemetry.agl_m
+    try:
+        corners = footprint_en_m(camera, *attitude)
+        reach_m = min(reach_m, float(np.abs(corners - np.array(axis)).max()))
+    except CameraError:
+        pass  # the horizon is visible: keep the limit
+    side_m = 2 * MARGIN * reach_m
+    if not side_m < 1e6:
+        raise FlightError(f"the view is too wide to show: {side_m:.3g} m")
+    size_px = min(max(math.ceil(side_m / gsd_m), MIN_PX), MAX_PX)
+    return GroundWindow(side_m, size_px, axis)
+
+
+def image_px(
+    telemetry: Telemetry, camera: Camera, window: GroundWindow, place: tuple[float, float]
+) -> tuple[float, float]:
+    """The image point of a place in the window of a view, shares from the left and the top; the
+    inverse of `rectified`. Raises `FlightError` where the view does not show it."""
+    east = window.offset_en_m[0] + (place[0] - 0.5) * window.side_m
+    north = window.offset_en_m[1] + (0.5 - place[1]) * window.side_m
+    down = enu_from_camera(telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg)
+    x, y = seen_px(camera, np.array([east, north, -telemetry.agl_m]) @ down).tolist()
+    if not (0 <= x <= camera.width_px and 0 <= y <= camera.height_px):  # also where it is NaN
+        raise FlightError("the view does not show this place")
+    return x, y
+
+
+def rectified(
+    grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow
+) -> tuple[Grey, Mask]:
+    """Grey and valid (size_px, size_px) of a view rectified to nadir in its window."""
+    height, width = grey.shape
+    if abs(height * camera.width_px - width * camera.height_px) > max(height, width) * 4:
+        raise FlightError("the image does not have the proportions of the calibration")
+    gsd_m = window.side_m / window.size_px
+    view = downsampled(View(grey, camera.resized(width, height), telemetry), gsd_m)
+    made = rectify(view, gsd_m=gsd_m, size_px=window.size_px)
+    return made.grey, made.valid
+
+
+def png(grey: Grey, valid: Mask) -> bytes:
+    """Grey levels as PNG, transparent where not valid."""
+    picture = grey
+    if not valid.all():
+        picture = np.dstack([grey, grey, grey, valid.astype(np.uint8) * 255])
+    return bytes(cv2.imencode(".png", picture, _QUICK)[1].tobytes())
+
+
+def jpeg(grey: Grey, quality: int = 95) -> bytes:
+    """Grey levels as JPEG."""
+    return bytes(cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1].tobytes())
+
+
+def shrunk(grey: Grey, max_px: int, max_area_px: float = math.inf) -> Grey:
+    """An image no larger than `max_px` on its longer side and `max_area_px`."""
+    rows, cols = grey.shape
+    share = min(1.0, max_px / max(rows, cols), math.sqrt(max_area_px / (rows * cols)))
+    if share == 1:
+        return grey
+    size = (max(1, round(share * cols)), max(1, round(share * rows)))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+class SheetImagery:
+    """The first sheet of a map: its grey layer, or its preview where it has none."""
+
+    def __init__(self, opened: MapFile) -> None:
+        """Raises `MapFileError` where layer or preview are damaged."""
+        self.sheet = opened.manifest.sheets[0]
+        self.frame, self.grid = self.sheet.frame, self.sheet.grid
+        self.terrain = TerrainLayer.of(opened)
+        self._layer = GreyLayer.of(opened)
+        self.preview = b""
+        drawn = "preview_jpeg" if self._layer is None else "grey/bytes"
+        self._drawn_id = str(opened.manifest.parts[f"sheet0/{drawn}"].get("sha256"))[:12]
+        self._small = np.zeros((0, 0), np.uint8)
+        if self._layer is None:
+            self._small = preview(opened)
+            self.preview = opened.array("sheet0/preview_jpeg", np.uint8, 1).tobytes()
+
+    def plain(self) -> dict[str, Any]:
+        """Geometry of the sheet and its tiles, for the page."""
+        grid, grey = self.grid, self.sheet.grey
+        tiles = None
+        if self._layer is not None and grey is not None:
+            shapes = [self._layer.shape(level) for level in range(self._layer.levels)]
+            tiles = {"side_px": grey.chunk_px, "levels": [list(shape) for shape in shapes]}
+        return {
+            "origin_lat_deg": self.frame.lat_deg,
+            "origin_lon_deg": self.frame.lon_deg,
+            "west_m": grid.west_m,
+            "north_m": grid.north_m,
+            "gsd_m": grid.gsd_m,
+            "width_px": grid.width_px,
+            "height_px": grid.height_px,
+            "tiles": tiles,
+            "id": self._drawn_id,
+        }
+
+    def px_from_en(self, en_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Columns and rows (..., 2) of positions (..., 2) in the plane of the sheet."""
+        grid = self.grid
+        east, north = en_m[..., 0], en_m[..., 1]
+        return np.stack([east - grid.west_m, grid.north_m - north], axis=-1) / grid.gsd_m
+
+    def tile(self, level: int, col: int, row: int) -> tuple[bytes, str] | None:
+        """A chunk of the layer and its media type; None where it has no imagery.
+
+        Raises `IndexError` where there is no such tile and `MapFileError` where it is damaged.
+        """
+        if self._layer is None or self.sheet.grey is None:
+            raise IndexError("the map has no layer")
+        stored = self._layer.jpeg(level, row, col)
+        if stored is not None:
+            return stored, "image/jpeg"
+        side = self.sheet.grey.chunk_px
+        rows, cols = self._layer.shape(level)
+        size = min(side, rows - row * side), min(side, cols - col * side)
+        grey, valid = self._layer.read(level, row * side, col * side, *size)
+        return (png(grey, valid), "image/png") if valid.any() else None
+
+    def crop(self, box: Box, size_px: tuple[int, int]) -> tuple[Grey, Mask]:
+        """Grey and valid (rows, cols) of a box, north up; `size_px`: columns and rows."""
+        west, north = box[0] - self.grid.west_m, self.grid.north_m - box[3]  # from the corner
+        width_m, height_m = box[2] - box[0], box[3] - box[1]
+        level = self._level(min(width_m / size_px[0], height_m / size_px[1]))
+        col_m, row_m = self._steps_m(level)
+        first_col, first_row = math.floor(west / col_m) - 1, math.floor(north / row_m) - 1
+        cols, rows = math.ceil(width_m / col_m) + 4, math.ceil(height_m / row_m) + 4
+        if max(cols, rows) > MAX_READ_PX:
+            nothing = np.zeros(size_px[::-1], np.uint8)
+            return nothing, nothing > 0
+        grey, valid = self._read(level, first_row, first_col, rows, cols)
+        scale_x, scale_y = width_m / size_px[0] / col_m, height_m / size_px[1] / row_m
+        # OpenCV counts from the centres of pixels, we from the corner of the first one.
+        from_window = np.array(
+            [
+                [scale_x, 0, west / col_m - first_col + scale_x / 2 - 0.5],
+                [0, scale_y, north / row_m - first_row + scale_y / 2 - 0.5],
+            ]
+        )
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        drawn = cv2.warpAffine(grey, from_window, size_px, flags=flags)
+        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpAffine(valid.astype(np.uint8), from_window, size_px, flags=flags)
+        return np.asarray(drawn, dtype=np.uint8), np.asarray(seen > 0, dtype=np.bool_)
+
+    def _level(self, step_m: float) -> int:
+        """The coarsest level that is at least as fine as `step_m`."""
+        if self._layer is None:
+            return 0
+        fine = math.floor(math.log2(max(step_m / self.grid.gsd_m, 1.0)) + 1e-6)
+        return min(fine, self._layer.levels - 1)
+
+    def _steps_m(self, level: int) -> tuple[float, float]:
+        """Size in metres of a pixel of a level, east and north."""
+        grid = self.grid
+        if self._layer is not None:
+            return grid.gsd_m * 2**level, grid.gsd_m * 2**level
+        rows, cols = self._small.shape
+        return grid.width_px * grid.gsd_m / cols, grid.height_px * grid.gsd_m / rows
+
+    def _read(self, level: int, row: int, col: int, height: int, width: int) -> tuple[Grey, Mask]:
+        if self._layer is not None:
+            return self._layer.read(level, row, col, height, width)
+        grey = np.zeros((height, width), np.uint8)
+        valid = np.zeros((height, width), np.bool_)
+        rows, cols = self._small.shape
+        top, bottom = max(row, 0), min(row + height, rows)
+        left, right = max(col, 0), min(col + width, cols)
+        if top < bottom and left < right:
+            inside = np.s_[top - row : bottom - row, left - col : right - col]
+            grey[inside] = self._small[top:bottom, left:right]
+            valid[inside] = True
+        return grey, valid

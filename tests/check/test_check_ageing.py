@@ -1,0 +1,172 @@
+"""Persistence from year to year, predicted from one picture."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from helpers import textured
+from orthonav.ground.check import ageing
+from orthonav.ground.check.ageing import (
+    MARGIN_PX,
+    MAX_PERSISTENCE,
+    MIN_PERSISTENCE,
+    another_year,
+    displaced,
+    features,
+)
+from orthonav.ground.check.estimate import LEARNT, Recalibration
+from orthonav.ground.check.trials import reported_persistence
+
+SIZE = 256
+
+
+def crops(seed=1):
+    """Fine persistence without direction."""
+    noise = np.random.default_rng(seed).normal(size=(SIZE, SIZE)).astype(np.float32)
+    blots = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    return np.clip(120 + 12 * blots / blots.std(), 0, 255).astype(np.uint8)
+
+
+def roads_and_houses(seed=1):
+    """Long borders and rectangles of strong contrast."""
+    rng = np.random.default_rng(seed)
+    picture = np.full((SIZE, SIZE), 105, np.uint8)
+    for at in range(20, SIZE, 70):
+        cv2.line(picture, (0, at), (SIZE, at + 25), 190, 6)
+        cv2.line(picture, (at, 0), (at - 15, SIZE), 60, 5)
+    for row, col in rng.integers(10, SIZE - 30, (25, 2)):
+        picture[row : row + 14, col : col + 18] = 215
+    noise = rng.normal(0, 2, picture.shape)
+    return np.clip(cv2.GaussianBlur(picture, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("gsd_m", [0.5, 1.0, 2.0])
+def test_roads_and_houses_last_longer_than_crops(gsd_m):
+    roads, fields = (reported_persistence(each, gsd_m)[0] for each in (roads_and_houses(), crops()))
+    assert roads.mean() > 1.5 * fields.mean() and roads.mean() > 0.1
+
+
+def test_what_lasts_is_told_where_it_is():
+    both = np.where(np.arange(SIZE) < SIZE // 2, roads_and_houses(), crops()).astype(np.uint8)
+    predicted = reported_persistence(both, 1.0)[0]
+    reach = MARGIN_PX
+    assert predicted[:, : SIZE // 2 - reach].mean() > 1.5 * predicted[:, SIZE // 2 + reach :].mean()
+
+
+def test_far_pixels_change_nothing():
+    one = crops()
+    other = one.copy()
+    other[:, 160:] = roads_and_houses()[:, 160:]
+    before, after = (features(each, 1.0) for each in (one, other))
+    same = (160 - MARGIN_PX) // 8 - 1
+    np.testing.assert_allclose(before[:, :same], after[:, :same], rtol=1e-3, atol=1e-3)
+    assert np.abs(before[:, 22:] - after[:, 22:]).max() > 0.1
+
+
+@pytest.mark.parametrize("grey", [0, 128, 255])
+def test_blank_ground_has_finite_persistence(grey):
+    for predicted in reported_persistence(np.full((120, 130), grey, np.uint8), 1.0):
+        assert predicted.shape == (120, 130) and predicted.dtype == np.float32
+        assert (
+            np.isfinite(predicted).all()
+            and predicted.min() >= MIN_PERSISTENCE
+            and predicted.max() <= MAX_PERSISTENCE
+        )
+
+
+SIDE = 192
+
+
+@pytest.fixture(autouse=True)
+def mild(monkeypatch):
+    """No deviation from the expected persistence."""
+    monkeypatch.setattr(ageing, "FIELD", 0.0)
+    monkeypatch.setattr(ageing, "VIEW", 0.0)
+
+
+def kept(one, other):
+    """Correlation of gradients whatever their sign: of squared complex numbers."""
+    squares = []
+    for picture in (one, other):
+        south, east = np.gradient(picture.astype(float))
+        squares.append(((east + 1j * south) ** 2)[8:-8, 8:-8])
+    first, second = (each / np.maximum(np.abs(each), 1.0) for each in squares)
+    return float((first * second.conj()).real.mean())
+
+
+def changed(lasting, seed=1, grey=None, donor=None):
+    grey = textured((SIDE, SIDE), 5) if grey is None else grey
+    donor = textured((SIDE, SIDE), 6) if donor is None else donor
+    persistence = [np.full((SIDE, SIDE), lasting, np.float32)] * 3
+    return another_year(np.random.default_rng(seed), grey, donor, persistence)
+
+
+def test_the_more_lasts_the_more_is_kept():
+    grey = textured((SIDE, SIDE), 5)
+    correlation = [
+        np.mean([kept(grey, changed(each, seed)) for seed in range(3)]) for each in LASTING
+    ]
+    assert correlation[0] < 0.1 and correlation[-1] > 0.5
+    assert all(np.diff(correlation) > 0)
+
+
+LASTING = (0.01, 0.3, 0.6, 0.95)
+
+
+def test_what_lasts_is_kept_where_it_does():
+    grey = textured((SIDE, SIDE), 5)
+    lasting = np.where(np.arange(SIDE) < SIDE // 2, 0.9, 0.02).astype(np.float32)
+    persistence = [np.broadcast_to(lasting, (SIDE, SIDE))] * 3
+    donor = textured((SIDE, SIDE), 6)
+    made = another_year(np.random.default_rng(2), grey, donor, persistence)
+    west, east = np.s_[:, : SIDE // 2], np.s_[:, SIDE // 2 :]
+    assert kept(grey[west], made[west]) > 0.3 > 0.15 > kept(grey[east], made[east])
+
+
+def test_what_comes_instead_stays_mirrored():
+    """It is turned, never flipped again: then it would be found where it is from."""
+    ground = textured((SIDE, SIDE), 7)
+    made = changed(0.005, donor=ground[:, ::-1])
+    turned = [np.rot90(ground, times) for times in range(4)]
+    mirrored = [np.rot90(ground[:, ::-1], times) for times in range(4)]
+    assert max(kept(each, made) for each in turned) < 0.1
+    assert max(kept(each, made) for each in mirrored) > 0.4
+
+
+def test_what_stands_tilts_away_from_the_middle():
+    grey = textured((SIDE, SIDE), 5)
+    upright = displaced(np.random.default_rng(1), grey, 0.0, 15.0)
+    assert_array_equal(upright, grey)
+    leant = displaced(np.random.default_rng(1), grey, 4.0, 15.0)
+    off = np.abs(leant.astype(int) - grey)
+    middle, rim = np.s_[SIDE // 2 - 8 : SIDE // 2 + 8], np.s_[:24]
+    assert off[middle, middle].mean() < 0.3 * off[rim, rim].mean()
+
+
+SHARES = np.linspace(0.02, 0.98, 25)
+
+
+@pytest.mark.parametrize("view_px", [60.0, 256.0, 500.0])
+@pytest.mark.parametrize("has_prior", [True, False])
+def test_more_trials_that_succeed_predict_more(view_px, has_prior):
+    predicted = LEARNT(SHARES, view_px, has_prior)
+    assert (np.diff(predicted) > 0).all()
+    assert predicted.min() > 0 and predicted.max() < 1
+
+
+def test_corrections_apply_where_they_should():
+    by = Recalibration(0.0, 1.0, narrow=-0.5, no_prior=-0.3, std=0.5)
+    wide, half = by(SHARES, 256.0, True), by(SHARES, 128.0, True)
+    np.testing.assert_allclose(wide, SHARES)
+    np.testing.assert_allclose(by(SHARES, 512.0, True), SHARES)
+    odds = (half / (1 - half)) / (SHARES / (1 - SHARES))
+    np.testing.assert_allclose(odds[1:-1], np.exp(-0.5), rtol=1e-6)
+    assert (by(SHARES, 256.0, False) <= SHARES).all()
+
+
+def test_another_sensor_is_placed_less_often_and_less_surely():
+    other = LEARNT.other_sensor()
+    assert (other(SHARES, 256.0, True) <= LEARNT(SHARES, 256.0, True)).all()
+    assert other(np.array([0.5]), 256.0, True) < LEARNT(np.array([0.5]), 256.0, True) - 0.1
+    assert other.std > LEARNT.std
