@@ -33,7 +33,7 @@ GDAL_OPTIONS = {
     "GDAL_ERROR_ON_LIBJPEG_WARNING": True,  # half a JPEG would be grey in its lower half
     "GDAL_CACHEMAX": 64 * 2**20,
 }
-TIMEOUT_S = 60
+TIMEOUT_S = 120
 MIN_EMPTY_PX = 4096
 """Smallest patch of the empty colour that is masked, 64 x 64 px: larger than a roof or shadow."""
 _EMPTY_COLOURS = {"black": 0, "white": 255}
@@ -127,7 +127,7 @@ def service_source(
 
         def read(row: int, col: int) -> CellPixels:
             window = Window((col - col0) * width, (row - row0) * height, width, height)
-            where = f"{shown(address)} (row {row}, column {col})"
+            where = f"{shown(address.replace('$', ''))} (row {row}, column {col})"
             pixels = _read(web, description, window, where)
             return _heights(pixels) if heights else _imagery(pixels, spec.options.empty)
 
@@ -166,7 +166,9 @@ def reason_of(error: BaseException) -> tuple[str, bool]:
     while cause := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(cause)
     text = " ".join(" ".join(map(str, chain)).split())
-    if found := re.search(r"CURL error: (.{,200})|HTTP status code: 0, error: (.*?)\. ?Add", text):
+    if found := re.search(
+        r"CURL error: (.{,200}?)(?: CURL|$)|HTTP status code: 0, error: (.*?)\. ?Add", text
+    ):
         return found.group(1) or found.group(2), True
     if found := re.search(r"HTTP (?:status|response) code: (\d+)", text):
         status = int(found.group(1))
