@@ -57,7 +57,7 @@ AGAIN_PX = 1.0
 """A window that moved by more (pixels of the level, at its rim) is orthorectified again."""
 ROUNDS = 3
 """At most so many times at the final level."""
-SETTLED = 6
+AROUND = 6
 """Places whose surroundings are searched on the terrain, where no place stands out."""
 NEAR_REACH = 0.2
 """They are searched so far, as a share of the view's side,"""
@@ -73,7 +73,7 @@ class Place:
 
     - `judged`: its fit at the judged level. `level_score`: the score there on level ground, where
       `judged` is on the terrain; `terrain`: the view orthorectified there.
-    - `twin`: the same place on the terrain, `settled`: the best place around it there; None where
+    - `twin`: the same place on the terrain, `around`: the best place around it there; None where
       it was not asked for or level ground is as good. `tried`, `searched`: whether they were.
     - `final`: its fit at the final level, by `templates`. With its covariance where it is the best.
     - `total`: its scores at both levels added up. `again`: that at the judged level once it was
@@ -90,7 +90,7 @@ class Place:
     level_score: float | None = None
     terrain: ViewTemplates | None = None
     twin: "Place | None" = None
-    settled: "Place | None" = None
+    around: "Place | None" = None
     tried: bool = False
     searched: bool = False
     final: Fit | None = None
@@ -235,7 +235,7 @@ class Placer:
         """The best judged places that lie apart, at most `at_most`, on the terrain at the judged
         level where they are better there, and the others as they were.
 
-        The surroundings of the first `SETTLED` are searched: where relief displaces much, the right
+        The surroundings of the first `AROUND` are searched: where relief displaces much, the right
         one may be far down the list of those on level ground, and off by more than refinement
         follows.
         """
@@ -243,9 +243,9 @@ class Placer:
             return list(places)
         chosen = self._best_apart(places, at_most)
         moved = [self._twin(places[number]) or places[number] for number in chosen]
-        for number in self._best_apart(moved, SETTLED):
+        for number in self._best_apart(moved, AROUND):
             before = places[chosen[number]]
-            moved[number] = self._settled(before) or before
+            moved[number] = self._best_around(before) or before
         found = list(places)
         for number, after in zip(chosen, moved, strict=True):
             if after.judged.score > places[number].judged.score:
@@ -276,12 +276,12 @@ class Placer:
         refiner = self.refiner(self.levels.judged, templates)
         return refiner.place(pose, FULL_STEPS, ROUGH_STEP_PX)
 
-    def _settled(self, place: Place) -> Place | None:
+    def _best_around(self, place: Place) -> Place | None:
         """`_twin`, or a better place by a search around it at the coarse level: far off nadir,
         relief displaces a view by more than refinement follows."""
         twin = self._twin(place)
         if twin is None or place.searched:
-            return place.settled
+            return place.around
         assert self._ground is not None and twin.terrain is not None
         place.searched = True
         pose, level, side_px = place.judged.pose, self.levels.coarse, self._ground.view.side_px
@@ -299,10 +299,10 @@ class Placer:
         for near in search(template, window, poses, 1, self.prior.scale_map):
             found = self._rejudged(near.pose, twin.terrain)
             best = max(best, found, key=lambda each: each.score)
-        place.settled = twin
+        place.around = twin
         if best is not twin.judged:
-            place.settled = Place(best, place.judged.score, twin.terrain)
-        return place.settled
+            place.around = Place(best, place.judged.score, twin.terrain)
+        return place.around
 
     # Finishing
 
@@ -356,7 +356,7 @@ class Placer:
         first = None
         if not self.is_level:
             is_twin = place.level_score is not None
-            first = self._twin(place) if is_twin else self._settled(place)
+            first = self._twin(place) if is_twin else self._best_around(place)
         if first is None or first.judged.score < RIVAL_SHARE * self._best_on_terrain:
             self._finish_on_level(place)
         else:
