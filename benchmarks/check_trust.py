@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.placing import views_in
-from benchmarks.record import Section, Table, resumed, run, say
+from benchmarks.record import Section, Table, resumed, rows_path, run, say
 from benchmarks.scenes import (
     WIDE,
     Pair,
@@ -118,7 +118,7 @@ def measure(options: argparse.Namespace) -> Section:
             tasks[name] = (pair, width_px, prior, views, options)
     found = []
     for each in resumed(
-        options.work / f"conditions-{options.seed}.jsonl",
+        rows_path(options.work, f"conditions-{options.seed}"),
         _measured,
         dict(list(tasks.items())[: options.conditions]),
     ):

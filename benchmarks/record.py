@@ -138,6 +138,11 @@ def side_by_side(
         yield from pool.map(function, tasks)
 
 
+def rows_path(work: Path, name: str) -> Path:
+    """The file of `resumed`: rows of another commit are not taken for those of this one."""
+    return work / f"{name}-{git('rev-parse', '--short=10', 'HEAD') or 'unknown'}.jsonl"
+
+
 def resumed(
     path: Path, function: Callable[[Any], Any], tasks: dict[str, Any], workers: int = 1
 ) -> Iterator[Any]:

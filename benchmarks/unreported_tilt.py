@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.placing import views_in
-from benchmarks.record import Section, Table, number, quantiles, resumed, run, say
+from benchmarks.record import Section, Table, number, quantiles, resumed, rows_path, run, say
 from benchmarks.scenes import (
     FAR_M,
     Pair,
@@ -166,7 +166,7 @@ def measure(options: argparse.Namespace) -> Section:
         for width_px in options.width
         for tilt in options.tilt
     }
-    stored = options.work / f"rows-{views}-{options.seed}.jsonl"
+    stored = rows_path(options.work, f"rows-{views}-{options.seed}")
     rows = []
     for row in resumed(stored, measured, tasks, options.workers):
         rows.append(row)
