@@ -209,6 +209,3 @@ def _widened(middle: Array, end: Array, by_logit: float) -> Array:
 
     off = np.hypot(logit(end) - logit(middle), by_logit)
     return expit(logit(middle) + np.sign(by_logit) * off)
-
-
-Array = NDArray[np.float64]
