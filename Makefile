@@ -1,11 +1,12 @@
 # make demo    install into .venv and run all steps on a generated area
 # make test    install and run the tests; `make test EXTRAS=test` without PyTorch and Ray, whose tests
 #              are then skipped by name
-# make lint    style, types, import layers; rows of the paper's tables that are older than their code
+# make lint    style, types, import layers
 # make bench   measure speed, memory and accuracy, and compare with other methods
 # make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
 # make figures  renew the figures of the documentation by running a tutorial, minutes
+# make golden   renew the golden views of tests/golden; give the reason in the commit
 # make clean   remove .venv and what was made here
 
 PYTHON ?= python3
@@ -16,7 +17,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 EXTRAS ?= dev
 DEPENDS := pyproject.toml constraints.txt
 
-.PHONY: demo test test-long test-slow lint format bench paper docs figures clean
+.PHONY: demo test test-long test-slow lint format bench paper docs figures golden clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
@@ -38,7 +39,6 @@ lint: $(VENV)/.dev-installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/vulture
-	$(BIN)/python -m experiments.paper check
 
 format: $(VENV)/.dev-installed
 	$(BIN)/ruff check --fix .
@@ -57,6 +57,9 @@ docs: $(VENV)/.docs-installed
 
 figures: $(VENV)/.docs-installed
 	$(BIN)/python tools/docs/pictures.py
+
+golden: $(VENV)/.dev-installed
+	$(BIN)/python tests/golden/renew.py
 
 $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"

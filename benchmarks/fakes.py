@@ -1,30 +1,30 @@
 """Fake parts of a flight in simulated time: clocks, a port, an autopilot, a camera, turbulence.
 
 The tests of flights use them too. What arrives at the autopilot is decoded by the reader of the
-tests; what it says is encoded by pymavlink.
+tests; what it says is encoded by pymavlink (`examples/simulated_autopilot.py`).
 """
 
-import importlib
 import math
 import runpy
 from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from examples.simulated_autopilot import Encoder as Autopilot
 from numpy.typing import NDArray
 
-from benchmarks.fake_autopilot import READER
 from orthonav.onboard.telemetry import Clocks
 
-MS, S = 10**6, 10**9
+READER = Path(__file__).resolve().parents[1] / "tests" / "wire.py"
+S = 10**9
 BEGIN_NS, UTC_NS = 100 * S, 1_789_000_000 * S
 """Our clock at the start, and UTC minus our clock."""
 SAMPLE_S = 0.02
 """Time step of turbulence."""
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
-Velocity = tuple[float, float, float]
 
 
 class Time:
@@ -40,14 +40,20 @@ class Time:
 
 
 class Port:
-    """A port whose other end has `coming` and `gone`, the frames to read and those written."""
+    """A port whose other end has `coming` and `gone`, the frames to read and those written. It can
+    `refuse` to open, and be `broken`."""
 
     def __init__(self) -> None:
         self.coming: list[bytes] = []
         self.gone: list[bytes] = []
+        self.broken: OSError | None = None
+        self.opened, self.refuse = 0, False
 
     def open(self) -> "Port":
         """Open it."""
+        if self.refuse:
+            raise ConnectionRefusedError("nobody there")
+        self.opened += 1
         return self
 
     def fileno(self) -> int:
@@ -56,10 +62,14 @@ class Port:
 
     def read(self) -> bytes:
         """The next frame."""
+        if self.broken:
+            raise self.broken
         return self.coming.pop(0) if self.coming else b""
 
     def write(self, data: bytes) -> None:
         """Take a frame."""
+        if self.broken:
+            raise self.broken
         self.gone.append(bytes(data))
 
     def heard(self) -> None:
@@ -83,52 +93,16 @@ def _reader() -> tuple[dict[int, Any], Callable[[bytes], dict[str, Any]]]:
     return made["TABLES"], made["decode"]
 
 
-class Autopilot:
-    """Encodes what an autopilot says."""
+def answers(
+    autopilot: Autopilot, requests: Sequence[dict[str, Any]], now_ns: int, ahead_ns: int
+) -> list[bytes]:
+    """Answers to requests of TIMESYNC, with equal delays in both directions.
 
-    def __init__(self, system: int = 1, component: int = 1) -> None:
-        self._mavlink: Any = importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
-        self.mav = self._mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-
-    def say(self, name: str, *values: Any, **named: Any) -> bytes:
-        """A frame."""
-        message = getattr(self._mavlink, f"MAVLink_{name}_message")(*values, **named)
-        frame = bytes(message.pack(self.mav))
-        self.mav.seq = (self.mav.seq + 1) % 256
-        return frame
-
-    def heartbeat(self, kind: int = 12) -> bytes:
-        """Of an autopilot that flies; `kind` 12 is PX4."""
-        return self.say("heartbeat", 1, kind, 0, 0, 4, 3)
-
-    def attitude(
-        self, boot_ns: int, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0
-    ) -> bytes:
-        """Yaw is sent within half a turn of north."""
-        yaw = math.remainder(math.radians(yaw_deg), math.tau)
-        pitch, roll = math.radians(pitch_deg), math.radians(roll_deg)
-        return self.say("attitude", boot_ns // MS, roll, pitch, yaw, 0, 0, 0)
-
-    def home(self, boot_ns: int, metres: float) -> bytes:
-        """Height above home."""
-        height_mm = round(metres * 1000)
-        return self.say("global_position_int", boot_ns // MS, 0, 0, 0, height_mm, 0, 0, 0, 0)
-
-    def local(self, boot_ns: int, velocity_ned: Velocity, down: float = 0.0) -> bytes:
-        """Velocity and distance below the origin."""
-        return self.say("local_position_ned", boot_ns // MS, 0, 0, down, *velocity_ned)
-
-    def answers(
-        self, requests: Sequence[dict[str, Any]], now_ns: int, ahead_ns: int
-    ) -> list[bytes]:
-        """Answers to requests of TIMESYNC, with equal delays in both directions.
-
-        `ahead_ns`: the autopilot's clock minus ours.
-        """
-        return [
-            self.say("timesync", (now_ns + each["ts1"]) // 2 + ahead_ns, each["ts1"])
-            for each in requests
-        ]
+    `ahead_ns`: the autopilot's clock minus ours.
+    """
+    return [
+        autopilot.timesync((now_ns + each["ts1"]) // 2 + ahead_ns, each["ts1"]) for each in requests
+    ]
 
 
 class Stream:

@@ -11,17 +11,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from examples.simulated_autopilot import Encoder as Autopilot
 
 from benchmarks.fakes import (
     BEGIN_NS,
     SAMPLE_S,
     Array,
-    Autopilot,
     Grey,
     Port,
     S,
     Stream,
     Time,
+    answers,
     wandering,
 )
 from orthonav.core.geo.camera import Camera
@@ -35,8 +36,8 @@ from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.outputs import MessageOptions, Messenger
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import MessageOptions, Messenger, Publisher
+from orthonav.onboard.run import Locator
 from orthonav.onboard.telemetry import TelemetryBuffer
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -254,8 +255,12 @@ class FaultFlight:
         lead_s: float,
         recovery_s: float,
         map_change: Callable[[], str | None] = lambda: None,
+        locator: Callable[["FaultFlight"], Locator] = lambda flight: Tracker(
+            flight.world.localizer
+        ),
     ) -> None:
-        self.world, self.fault = world, fault
+        self.world: World = world
+        self.fault = fault
         self.rng = np.random.default_rng([seed, 22])
         begin_s = 0.0 if fault.from_start else lead_s
         self.fault_s = begin_s, begin_s + fault.seconds
@@ -283,7 +288,7 @@ class FaultFlight:
         self.runner = Runner(
             self._newest,
             CAMERA,
-            Tracker(world.localizer),
+            locator(self),
             publisher,
             FlyOptions(map_change=map_change),
             clocks,
@@ -291,7 +296,7 @@ class FaultFlight:
             latency=LatencyMonitor(fault.stated_s),
         )
         self._inbox: dict[str, list[dict[str, Any]]] = {}
-        self._number, self._exposed_s = 0, 0.0
+        self._number, self.exposed_s = 0, 0.0
         self._views: list[float] = []
         self._sent: list[Sent] = []
         self._hear(self.autopilot.heartbeat())
@@ -352,7 +357,7 @@ class FaultFlight:
         asked = self._received("TIMESYNC")
         if state is not None:
             frames = telemetry_frames(self.autopilot, state, boot_ns)
-            frames += self.autopilot.answers(asked, self.time.now_ns, self.boot_ahead_ns)
+            frames += answers(self.autopilot, asked, self.time.now_ns, self.boot_ahead_ns)
         if t is not None and self.fault.others is not None:
             frames += self.fault.others(self, true, boot_ns)
         self._hear(*frames)
@@ -360,7 +365,7 @@ class FaultFlight:
     def _seen(self) -> Grey:
         """The image that arrives now."""
         t = self._fault_t()
-        grey = self.seen_at(self._exposed_s)
+        grey = self.seen_at(self.exposed_s)
         if t is not None and self.fault.picture is not None:
             grey = self.fault.picture(self, grey, t)
         return grey
@@ -381,7 +386,7 @@ class FaultFlight:
             return
         if t is not None and self.fault.delay_s is not None:
             delay_s = self.fault.delay_s(self._number, t)
-        self._exposed_s = BEGIN_S + self.since_s - delay_s
+        self.exposed_s = BEGIN_S + self.since_s - delay_s
         self._views.append(self.since_s)
         image = self._camera.read()
         assert image is not None

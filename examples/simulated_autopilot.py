@@ -8,7 +8,9 @@ beside
 
 It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP (and
 GPS_RAW_INT where the folder has a `gnss.csv`), and compares the positions that it receives with the
-truth of the folder, if there is one. Its clock is 0 at the start of the folder. Needs pymavlink.
+truth of the folder, if there is one. With --messages it prints every message that it receives as a
+line of JSON instead, after a first line with its start by the monotonic clock. Its clock is 0 at
+the start of the folder. Needs pymavlink.
 """
 
 import argparse
@@ -16,14 +18,18 @@ import contextlib
 import csv
 import json
 import math
+import select
+import signal
 import socket
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 EARTH_M = 6_371_000.0
+PX4, DOWNWARD = 12, 25
 
 
 def read(path, columns):
@@ -35,17 +41,64 @@ def read(path, columns):
     }
 
 
+class Encoder:
+    """Frames of what an autopilot says; those with a `key` (32 bytes) are signed."""
+
+    def __init__(self, system=1, component=1, key=None):
+        self.mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        if key is not None:
+            self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
+            self.mav.signing.timestamp = 2**47
+
+    def say(self, name, *values, **named):
+        """Frame of a message, by its name in lower case."""
+        message = getattr(mavlink, f"MAVLink_{name}_message")(*values, **named)
+        frame = bytes(message.pack(self.mav))
+        self.mav.seq = (self.mav.seq + 1) % 256
+        return frame
+
+    def heartbeat(self, kind=PX4):
+        """An autopilot that flies."""
+        return self.say("heartbeat", 1, kind, 0, 0, 4, 3)
+
+    def attitude(self, boot_ns, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0):
+        """Yaw is sent within half a turn of north."""
+        yaw = math.remainder(math.radians(yaw_deg), math.tau)
+        pitch, roll = math.radians(pitch_deg), math.radians(roll_deg)
+        return self.say("attitude", boot_ns // 10**6, roll, pitch, yaw, 0, 0, 0)
+
+    def distance(self, boot_ns, metres, orientation=DOWNWARD):
+        """Distance of a rangefinder along the body."""
+        distance = min(round(metres * 100), 65_534)
+        values = boot_ns // 10**6, 1, 65_535, distance, 0, 0, orientation, 255
+        return self.say("distance_sensor", *values)
+
+    def home(self, boot_ns, metres):
+        """Height above home."""
+        height_mm = round(metres * 1000)
+        return self.say("global_position_int", boot_ns // 10**6, 0, 0, 0, height_mm, 0, 0, 0, 0)
+
+    def local(self, boot_ns, velocity_ned, down=0.0):
+        """Velocity and distance below the origin."""
+        return self.say("local_position_ned", boot_ns // 10**6, 0, 0, down, *velocity_ned)
+
+    def timesync(self, boot_ns, request_ns):
+        """Answer to a request."""
+        return self.say("timesync", boot_ns, request_ns)
+
+
 class Autopilot:
     """Plays a flight folder over UDP."""
 
-    def __init__(self, folder, address, pace, rate_hz):
+    def __init__(self, folder, address, pace, rate_hz, messages=False):
         names = ("time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "vel_east_mps")
         self.telemetry = read(folder / "telemetry.csv", (*names, "vel_north_mps"))
         truth = folder / "truth.csv"
         self.truth = read(truth, ("lat_deg", "lon_deg")) if truth.is_file() else None
         self.yaw_rad = np.unwrap(np.radians(self.telemetry["yaw_deg"]))
         self.pace, self.interval_s = pace, 1 / rate_hz
-        self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        self.encoder, self.messages = Encoder(), messages
+        self.mav = mavlink.MAVLink(None)
         self.mav.robust_parsing = True
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
@@ -60,11 +113,10 @@ class Autopilot:
         """Seconds since boot."""
         return time.monotonic() - self.begin_s
 
-    def send(self, message):
-        """Send one message."""
+    def send(self, frame):
+        """Send one frame."""
         with contextlib.suppress(ConnectionRefusedError):  # orthonav is not up yet
-            self.socket.sendto(message.pack(self.mav), self.address)
-        self.mav.seq = (self.mav.seq + 1) % 256
+            self.socket.sendto(frame, self.address)
 
     def at(self, name, when_s):
         """Value of a column at a time of the folder."""
@@ -72,20 +124,17 @@ class Autopilot:
         return float(np.interp(when_s, self.telemetry["time_s"], column))
 
     def send_telemetry(self):
-        """Send the telemetry of the current time."""
-        boot_s = self.boot_s()
-        when_s, boot_ms = boot_s * self.pace, round(boot_s * 1000)
-        pitch, roll = (math.radians(self.at(n, when_s)) for n in ("pitch_deg", "roll_deg"))
-        yaw = math.remainder(self.at("yaw_rad", when_s), math.tau)
-        self.send(mavlink.MAVLink_attitude_message(boot_ms, roll, pitch, yaw, 0, 0, 0))
-        slant_m = self.at("agl_m", when_s) / (math.cos(pitch) * math.cos(roll))
-        distance = min(round(slant_m * 100), 65_534)
-        self.send(
-            mavlink.MAVLink_distance_sensor_message(boot_ms, 1, 65_535, distance, 0, 0, 25, 255)
-        )
+        """Send the telemetry of the current time, in whole milliseconds as messages have it."""
+        boot_ns = int(self.boot_s() * 1e3) * 10**6
+        when_s = boot_ns / 1e9 * self.pace
+        pitch, roll = self.at("pitch_deg", when_s), self.at("roll_deg", when_s)
+        yaw = math.degrees(self.at("yaw_rad", when_s))
+        self.send(self.encoder.attitude(boot_ns, yaw, pitch, roll))
+        tilt = math.cos(math.radians(pitch)) * math.cos(math.radians(roll))
+        self.send(self.encoder.distance(boot_ns, self.at("agl_m", when_s) / tilt))
         if "vel_east_mps" in self.telemetry:
             north, east = self.at("vel_north_mps", when_s), self.at("vel_east_mps", when_s)
-            self.send(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, north, east, 0))
+            self.send(self.encoder.local(boot_ns, (north, east, 0)))
 
     def send_gnss(self):
         """Send the solutions of gnss.csv that are due."""
@@ -93,7 +142,8 @@ class Autopilot:
             row = {name: float(value or "nan") for name, value in self.gnss.pop(0).items()}
             east, north = row["vel_east_mps"], row["vel_north_mps"]
             self.send(
-                mavlink.MAVLink_gps_raw_int_message(
+                self.encoder.say(
+                    "gps_raw_int",
                     time_usec=round(row["solved_s"] / self.pace * 1e6),
                     fix_type=int(row["fix_type"]),
                     lat=round(row["lat_deg"] * 1e7),
@@ -122,8 +172,10 @@ class Autopilot:
         """Handle one message of orthonav."""
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 == 0:
-            boot_ns = round(self.boot_s() * 1e9)
-            self.send(mavlink.MAVLink_timesync_message(boot_ns, message.ts1))
+            self.send(self.encoder.timesync(round(self.boot_s() * 1e9), message.ts1))
+        elif self.messages and kind not in ("HEARTBEAT", "BAD_DATA"):
+            plain = {"at_ns": time.monotonic_ns(), "name": kind, **message.to_dict()}
+            print(json.dumps(plain, default=str), flush=True)
         elif kind == "STATUSTEXT":
             # A long text comes in chunks; the last one is not full.
             self.text = self.text + message.text if message.chunk_seq else message.text
@@ -149,17 +201,19 @@ class Autopilot:
     def fly(self, tail_s):
         """Run until the folder ends."""
         self.begin_s, due_s, beat_s = time.monotonic(), 0.0, 0.0
+        if self.messages:
+            print(json.dumps({"begin_ns": round(self.begin_s * 1e9)}), flush=True)
         end_s = float(self.telemetry["time_s"][-1]) / self.pace + tail_s
         while self.boot_s() < end_s:
             if self.boot_s() >= beat_s:
                 beat_s += 1.0
-                self.send(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3))
+                self.send(self.encoder.heartbeat())
             if self.boot_s() >= due_s:
                 due_s += self.interval_s
                 self.send_telemetry()
             self.send_gnss()
             self.listen()
-            time.sleep(0.002)
+            select.select([self.socket], [], [], 0.002)
 
 
 def main():
@@ -173,9 +227,12 @@ def main():
         "--tail-s", type=float, default=2.0, help="time to continue after the end (s)"
     )
     parser.add_argument("--json", type=Path, help="write time, age and error of positions")
+    parser.add_argument("--messages", action="store_true", help="print messages as JSON")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     host, _, port = options.url.rpartition(":")
-    autopilot = Autopilot(options.flight, (host, int(port)), options.pace, options.rate_hz)
+    address = host, int(port)
+    autopilot = Autopilot(options.flight, address, options.pace, options.rate_hz, options.messages)
     autopilot.fly(options.tail_s)
     if autopilot.received:
         _, ages_s, errors_m = np.array(autopilot.received).T

@@ -14,9 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import FINE, evidence
+from orthonav.core.register.channels import FINE, channels_of
 from orthonav.ground.check.ageing import (
     MODEL,
     PATCH_PX,
@@ -24,7 +25,6 @@ from orthonav.ground.check.ageing import (
     features,
     terms,
 )
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
 Array = NDArray[Any]
 SEEDS = (901, 902, 903, 904)
@@ -32,7 +32,7 @@ GSD_M = (0.25, 0.5, 1.0, 2.0, 4.0)
 SIDE_PX = 1024
 LEVELS = 2
 RIDGE = 3e-3
-OUT = Path(__file__).parents[1] / "src" / "orthonav" / "check" / MODEL
+OUT = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "check" / MODEL
 
 
 def main() -> None:
@@ -78,7 +78,7 @@ def _samples(seed: int) -> tuple[Array, Array]:
                 pictures = [_halved(each) for each in pictures]
             kinds = [features(each, gsd_m * 2**level, PATCH_PX) for each in pictures]
             gradients = [
-                evidence(each, np.ones(each.shape, np.bool_), FINE)[..., :2] for each in pictures
+                channels_of(each, np.ones(each.shape, np.bool_), FINE)[..., :2] for each in pictures
             ]
             for one, other in permutations(range(len(pictures)), 2):
                 patches.append(kinds[one][1:-1, 1:-1].reshape(-1, kinds[one].shape[-1]))

@@ -109,7 +109,7 @@ def made_once(tmp_path_factory):
 def area(made_once):
     """Orthophotos of 1.2 x 1.0 km at 1 m, of two dates; not to be changed."""
 
-    from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
+    from lab.landscape import DEFAULT_DATES, generate_area
 
     def make(folder):
         generate_area(folder, size_m=(1200.0, 1000.0), dates=DEFAULT_DATES[:2], seed=SEED)

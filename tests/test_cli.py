@@ -63,7 +63,7 @@ def ortho(make_ortho, tmp_path_factory):
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture
@@ -237,7 +237,9 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
 
 @pytest.mark.long
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out, monkeypatch):
-    monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other configurations are not tried
+    monkeypatch.setattr(
+        "orthonav.ground.recordings.setups.FEW", 0.0
+    )  # other configurations are not tried
     mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
     shorten(shutil.copytree(flight_path, few), 10)
     gnss = ["--gnss-positions", few / "truth.csv", "--gnss-std-m", "2"]
@@ -362,13 +364,6 @@ def test_simulate(run, ortho, out, names_in):
     assert not [name for name in names_in(out) if name.startswith(".")]
 
 
-def test_landscape(run, out, names_in):
-    done = run("landscape", "--out", out, "--size-m", "120", "100", "--gsd-m", "2", "--json")
-    assert (done.code, done.err) == (0, "")
-    files = json.loads(done.out)["files"]
-    assert sorted(Path(path).name for path in files) == names_in(out) and len(files) == 3
-
-
 def test_the_program_is_installed():
     done = finished(process("--version"))
     assert done == Done(0, f"orthonav {__version__}\n", "")
@@ -408,7 +403,6 @@ def test_help(run, command):
         ["check", "a.onav", "--out", "b", "--heading", "maybe"],
         ["check", "a.onav", "--out", "b", "--heading", "unknown", "--yaw-std-deg", "3"],
         ["evaluate", "fixes.jsonl"],
-        ["landscape", "--out", "a", "--size-m", "5"],
     ],
     ids=" ".join,
 )
@@ -662,14 +656,6 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     assert names_in(out) == ["flight", "flight/mine"]
 
 
-def test_landscape_refuses(run, out, names_in):
-    refused(run("landscape", "--out", out / "l", "--size-m", "-5", "5"), "--size-m must be")
-    refused(run("landscape", "--out", out / "l", "--gsd-m", "500"), "--gsd-m must be")
-    (out / "file").write_text("in the way")
-    refused(run("landscape", "--out", out / "file", "--size-m", "50", "50"), "cannot write")
-    assert names_in(out) == ["file"]
-
-
 # Full disks and interrupts.
 
 
@@ -684,7 +670,6 @@ def commands(ortho, map_path, flight_path, fixes_path, truth_path, out):
         "localize": ["localize", map_path, flight_path, "--out", out / "fixes.jsonl"],
         "evaluate": ["evaluate", fixes_path, "--truth", truth_path, "--report", out / "report"],
         "metrics": ["evaluate", fixes_path, "--truth", truth_path, "--metrics", out / "m.json"],
-        "landscape": ["landscape", "--out", out / "land", *LANDSCAPE],
     }
 
 
@@ -699,8 +684,7 @@ def writing(ortho, map_path, short_flight, fixes_path, truth_path, out):
     return commands(ortho, map_path, short_flight, fixes_path, truth_path, out)
 
 
-LANDSCAPE = ["--size-m", "100", "100"]
-WRITERS = ["build", "simulate", "localize", "evaluate", "metrics", "landscape"]
+WRITERS = ["build", "simulate", "localize", "evaluate", "metrics"]
 
 
 def nothing_in(folder):
@@ -719,7 +703,7 @@ def largest_file(size_bytes):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "landscape"])
+@pytest.mark.parametrize("name", WRITERS)
 def test_no_room_for_the_whole_file(run, writing, out, name, undrawn):
     with largest_file(4096):
         done = run(*writing[name])
@@ -727,25 +711,7 @@ def test_no_room_for_the_whole_file(run, writing, out, name, undrawn):
     assert nothing_in(out)
 
 
-@pytest.fixture(scope="module")
-def orthophoto_bytes(tmp_path_factory):
-    """Size of the smallest orthophoto that `landscape` writes below."""
-    folder = tmp_path_factory.mktemp("land")
-    assert main(["landscape", "--out", str(folder), *LANDSCAPE, "-q"]) == 0
-    return min(path.stat().st_size for path in folder.iterdir())
-
-
-@pytest.mark.parametrize("share", [0.02, 0.999])
-def test_no_room_for_a_whole_orthophoto(run, writing, orthophoto_bytes, out, share):
-    """GDAL writes its last blocks while closing; its TIFF library has a line of its own to say."""
-    with largest_file(int(share * orthophoto_bytes)):
-        done = run(*writing["landscape"])
-    assert done.code == 1 and done.out == "" and "Traceback" not in done.err
-    assert done.err.splitlines()[-1].startswith("orthonav: error: cannot write")
-    assert nothing_in(out)
-
-
-@pytest.mark.parametrize("name", ["build", "localize", "evaluate", "metrics", "landscape"])
+@pytest.mark.parametrize("name", ["build", "localize", "evaluate", "metrics"])
 def test_a_full_disk(run, writing, out, name, monkeypatch, undrawn):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -806,7 +772,6 @@ INTERRUPTED = "orthonav: error: interrupted; nothing was written\n"
         ("build", "calibrate"),
         ("simulate", "simulate"),
         ("localize", "localize"),
-        ("landscape", "landscape"),
     ],
 )
 def test_an_interrupt_leaves_nothing(run, writing, out, monkeypatch, name, stage):

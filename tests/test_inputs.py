@@ -12,11 +12,10 @@ import pytest
 from orthonav.cli import main
 from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight import open_flight
-from orthonav.core.flight.fixes import read_results
-from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.camera import Camera
 from orthonav.core.grey import grey_levels
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Telemetry, View
 

@@ -28,7 +28,7 @@ def interrupted(*_, **__):
 def test_an_interrupt_of_the_search_for_another_set_up_skips_it(
     run, map_path, turned, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("orthonav.onboard.setups.try_setups", interrupted)
+    monkeypatch.setattr("orthonav.ground.recordings.setups.try_setups", interrupted)
     command = ["localize", map_path, turned, "--out", tmp_path / "fixes.jsonl"]
     done = run(*command)
     assert (done.code, done.err) == (0, "")

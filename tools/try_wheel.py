@@ -37,7 +37,6 @@ BUILD = f"build --ortho {ORTHO} --tile-px 128 --overlap 0.75 --calibration-views
 ATLAS = f"--ortho {ORTHO} --tile-px 128 --coarse-gsd-m 2 --coarse-tile-px 64"
 COMMANDS: dict[str, Sequence[str]] = {
     "geo": (
-        "landscape --out land --size-m 600 600 --gsd-m 1",
         f"{BUILD} --out {MAP}",
         "simulate --ortho land/2021-10.tif --random 5 --agl-m 150 --out flight",
     ),
@@ -93,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         work = folder / "work"
         work.mkdir()
+        shutil.copytree(ROOT / "src" / "orthonav" / "demo_data", work / "land")
         try_extra("geo", wheel, folder, work)
         try_core(wheel, folder, work)
         for extra in tried:  # in the order of the table

@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
@@ -27,8 +28,7 @@ from torch.nn import functional
 from experiments.paper.methods import BETWEEN_DATES
 from orthonav.core.extras import needed
 from orthonav.core.files import replacing, write_text
-from orthonav.core.tiles.canny import Canny
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.core.tiles.represent import Canny
 from orthonav.research.means import Means, mixed_precision
 
 AREAS = ((101, 1.0), (102, 1.0), (103, 1.5), (104, 2.0), (105, 3.0), (106, 5.0))

@@ -19,22 +19,22 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.child import peak_memory_mb
+from benchmarks.placing import memory_mb
 from benchmarks.posed import Picture
 from benchmarks.record import provenance
+from benchmarks.scenes import store
 from numpy.typing import NDArray
 
-from experiments.paper import matchers, views
+from experiments.paper import matchers
+from experiments.paper import scenes as views
 from experiments.paper.methods import Method, flown, methods
+from experiments.paper.results import FIELD
 from experiments.paper.runs import MB, Workplace, head, save
 from experiments.paper.scenes import Scene
-from experiments.paper.stored import code_of_field
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
-from orthonav.ground.imagery.mosaic import Mosaic
 
-KEY = "field"
 VIEWS = 20
 YAW_STD_DEG, AGL_STD, PRIOR_STD_PX = 5.0, 0.03, 40.0
 """Errors of the reported heading, height (share) and position (pixels of the map), all reported."""
@@ -73,17 +73,15 @@ def maps_of(place: Workplace, scene: Scene) -> list[Method]:
 def run(place: Workplace, scene: Scene) -> bool:
     """Place the views by every method; false where no map is, or all results are there.
 
-    Methods whose map has been built since are added to a result, and those run again whose code
-    has changed.
+    Methods whose map has been built since are added to a result.
     """
-    out, maps = place.result(scene, KEY), maps_of(place, scene)
+    out, maps = place.result(scene, FIELD), maps_of(place, scene)
     if not maps:
         return False
     start, made = time.perf_counter(), head(place, scene, provenance("paper"))
-    code = code_of_field(maps, scene.name)
     before: dict[str, Any] = json.loads(out.read_text(encoding="utf-8")) if out.is_file() else {}
     names = [*matchers.LOCAL, *(each.key for each in maps)]
-    found = _current(before, maps, scene.name)
+    found = before.get("field", {})
     missing = [name for name in names if name not in found]
     if not missing:
         return False
@@ -95,19 +93,8 @@ def run(place: Workplace, scene: Scene) -> bool:
     made["field"] = {name: found[name] for name in names}
     made["methods"] = [asdict(each) | {"edges": each.edges.partition(":")[0]} for each in maps]
     made["errors"] = {"yaw_std_deg": YAW_STD_DEG, "agl_std": AGL_STD, "prior_std_px": PRIOR_STD_PX}
-    save(out, made | {"code": code}, start)
+    save(out, made, start)
     return True
-
-
-def _current(before: dict[str, Any], maps: list[Method], scene: str) -> dict[str, Any]:
-    """What each method found in an earlier result, of those whose code has not changed."""
-    known = before.get("code", {})
-    flown = {each.key: [each] for each in maps}
-    return {
-        name: found
-        for name, found in before.get("field", {}).items()
-        if code_of_field(flown.get(name, []), scene).items() <= known.items()
-    }
 
 
 def seen(scene: Scene, localizer: Localizer, count: int) -> Iterator[Seen]:
@@ -117,7 +104,14 @@ def seen(scene: Scene, localizer: Localizer, count: int) -> Iterator[Seen]:
     camera = views.camera_of(agl_m, gsd_m)
     places = views.places_en_m(localizer.tiles.centres_en_m, count)
     telemetry = Telemetry(
-        0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=YAW_STD_DEG, agl_std_m=AGL_STD * agl_m
+        0,
+        0.0,
+        0.0,
+        0.0,
+        agl_m,
+        yaw_std_deg=YAW_STD_DEG,
+        agl_std_m=AGL_STD * agl_m,
+        tilt_std_deg=0.0,
     )
     for ground in views.grounds(scene, localizer.sheet.frame, localizer.grid, places):
         turned, lower, *off = np.clip(rng.normal(size=4), -CLIPPED, CLIPPED)
@@ -169,7 +163,7 @@ def _measured(place: Workplace, scene: Scene, any_map: str, name: str) -> dict[s
         ],
         "cpu_s": float(np.median(times_s[2:] or times_s)),  # the first view loads what is needed
         "prepare_cpu_s": prepared_s,
-        "peak_mb": peak_memory_mb(),
+        "peak_mb": memory_mb(),
         "carried_mb": carried / MB,
     }
 
@@ -179,7 +173,9 @@ def _method(
 ) -> tuple[Locate, float]:
     """Function that places a view, and bytes that an aircraft would carry."""
     if name in matchers.LOCAL:
-        features = matchers.FeatureMap(matchers.LOCAL[name](), picture(scene, localizer))
+        any_map, pixels = localizer.opened.path, place.work(scene, FIELD).with_suffix(".npz")
+        picture = Picture.read(any_map, store(scene.past, localizer, pixels), 1)
+        features = matchers.FeatureMap(matchers.LOCAL[name](), picture)
         std_m = PRIOR_STD_PX * localizer.grid.gsd_m
 
         def match(view: View, _: Prior, prior_en_m: NDArray[np.float64]) -> Answer | None:
@@ -206,13 +202,3 @@ def _method(
         return Answer(np.asarray(found), float(known.get(criterion, math.nan)))
 
     return place_by_map, path.stat().st_size
-
-
-def picture(scene: Scene, localizer: Localizer) -> Picture:
-    """The older orthophoto in the plane and pixels of a map."""
-    grid = localizer.grid
-    with Mosaic.open([scene.past]).grid_sheet(localizer.sheet.frame, grid) as raster:
-        pixels = raster.read(0, 0, grid.width_px, grid.height_px)
-    mean = round(float(pixels.grey[pixels.valid].mean()))
-    grey = np.where(pixels.valid, pixels.grey, mean).astype(np.uint8)
-    return Picture(grid, 1, grey, pixels.valid)

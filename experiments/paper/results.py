@@ -1,20 +1,25 @@
-"""Reads result files and computes the figures of tables and plots."""
+"""Result files: read, written and kept in the repository; their figures, and names of rows."""
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.paper.methods import PER_TILE
+from experiments.paper.methods import PER_TILE, SETTINGS, Method, tuned
+from orthonav.core.files import write_text
+
+ROWS = Path(__file__).resolve().parent / "rows"
+"""Results that the page shows, a folder for each setting."""
+BASELINES, FIELD = "baselines", "field"
+DIGITS = 5
+"""Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
 ACCURACY_M = 15.0
-NEAREST_STRIDES = math.sqrt(0.5)
-"""A position names the correct tile if it is within half a tile spacing on each axis."""
 ACCURACY = 0.95
 COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3, "confidence": 4}
 Array = NDArray[np.float64]
@@ -68,15 +73,56 @@ class Result:
         errors = self.column(placement, "error_m")
         return float((errors <= radius_m).mean()) if errors.size else math.nan
 
-    def right_tile(self, placement: str) -> float:
-        """Share of views whose tile is the nearest one, or as near."""
-        return self.accuracy(placement, NEAREST_STRIDES * self.stride_m + 1e-6)
-
 
 def read(folder: Path) -> list[Result]:
     """All results of a folder, by name of file."""
     paths = sorted(folder.glob("*.json"))
     return [Result(json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+
+
+def stored() -> list[Result]:
+    """All rows in the repository."""
+    return [row for name in SETTINGS for row in read(ROWS / name)]
+
+
+def keep(results: Path, setting: str) -> list[str]:
+    """Copy the results of a setting into the repository; the names of the rows that changed."""
+    changed = []
+    for path in sorted((results / setting).glob("*.json")):
+        target = ROWS / setting / path.name
+        text = path.read_text(encoding="utf-8")
+        if not target.is_file() or target.read_text(encoding="utf-8") != text:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_text(target, text)
+            changed.append(path.stem)
+    return changed
+
+
+def compact(made: dict[str, Any]) -> str:
+    """A result as text: one line per field, numbers rounded to five digits."""
+    lines = [
+        f"{json.dumps(name)}: {json.dumps(rounded(value), separators=(',', ':'))}"
+        for name, value in made.items()
+    ]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def rounded(value: Any) -> Any:
+    """The same with numbers of five digits, and None for those that are not finite."""
+    if isinstance(value, dict):
+        return {str(key): rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.{DIGITS}g}") if abs(value) < float("inf") else None
+
+
+def name_of(row: Result) -> str:
+    """Scene and method of a row, as its file is named."""
+    if not row.family:
+        return f"{row.scene}-{FIELD if FIELD in row.plain else BASELINES}"
+    return f"{row.scene}-{Method(**row.plain['method']).key}"
 
 
 def numbers(values: Sequence[float | None], missing: float) -> Array:
@@ -113,3 +159,75 @@ def ceiling(stride_m: float) -> float:
     square of `stride_m` that lies within the circle."""
     axis = (np.arange(400) + 0.5) / 400 * stride_m / 2
     return float((np.hypot(axis[:, None], axis) <= ACCURACY_M).mean())
+
+
+TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
+FAMILIES = {
+    "bovw": "Bag of Words",
+    "triplet": "Triplet",
+    "autoencoder": "Auto-Encoder",
+    "caevl": "CAEVL",
+    "gradient": "orthonav",
+}
+EDGES = {
+    "gray": "grey",
+    "canny": "Canny",
+    "segments": "segments",
+    "sam": "Segment Anything, sheet",
+    "sam-tile": "Segment Anything, tile",
+    "onnx": "learnt",
+    "gradient": "gradients",
+}
+
+
+def best_words(found: Sequence[Result]) -> list[Result]:
+    """All but the worse ones of several vocabularies: "the best performances will be displayed"."""
+    words = [each for each in found if each.family == "bovw"]
+    best = max(words, key=lambda each: each.accuracy("grid"), default=None)
+    shown = [each for each in found if each.family != "bovw" or each is best]
+    return sorted(shown, key=row_of)
+
+
+class Row(NamedTuple):
+    """A method and its input, as a row of a table; sorted as the tables list them."""
+
+    order: tuple[int, bool, int]
+    family: str
+    edges: str
+    registration: bool
+
+
+def row_of(each: Result) -> Row:
+    """The row of a result."""
+    order = (list(FAMILIES).index(each.family), each.registration, list(EDGES).index(each.edges))
+    return Row(order, each.family, each.edges, each.registration)
+
+
+def row_label(row: Row) -> str:
+    if row.family == "gradient":
+        return "orthonav, default" if row.registration else "orthonav, embedding only"
+    return f"{FAMILIES[row.family]}, {EDGES[row.edges]}"
+
+
+def named(each: Result) -> str:
+    """Name of a method and its input, with a star if it was tuned on its scene."""
+    return row_label(row_of(each)) + ("*" if is_tuned(each) else "")
+
+
+def is_tuned(each: Result) -> bool:
+    """Whether a row was tuned on its scene."""
+    return tuned(each.family, each.plain["method"]["recipe"], each.scene, each.edges)
+
+
+def label(method: Method) -> str:
+    """The same of a `Method`."""
+    edges = method.edges.partition(":")[0]
+    return row_label(Row((0, False, 0), method.family, edges, method.registration))
+
+
+def by_scene(results: Iterable[Result]) -> list[tuple[str, list[Result]]]:
+    """Results of each scene, by its name."""
+    scenes: dict[str, list[Result]] = {}
+    for each in results:
+        scenes.setdefault(each.scene, []).append(each)
+    return sorted(scenes.items())

@@ -1,249 +1,253 @@
-"""Tables 2 and 3 and further tables, from result files alone."""
+"""Tables 2 and 3 and further tables from result files alone, and `docs/paper-results.md`."""
 
+import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from benchmarks.record import Table, number
+from numpy.typing import NDArray
 
-from experiments.paper import published
-from experiments.paper.comparison import above_default, orders
-from experiments.paper.field_tables import field
-from experiments.paper.labels import EDGES, TUNED, best_words, by_scene, is_tuned, label, named
-from experiments.paper.methods import column
-from experiments.paper.results import Result, accepted_at, ceiling, confident, percent, read, share
-from experiments.paper.stored import name_of
-from experiments.paper.views import PLACEMENTS
+from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
+from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
+from experiments.paper.results import (
+    ACCURACY_M,
+    EDGES,
+    FAMILIES,
+    FIELD,
+    TUNED,
+    Result,
+    Row,
+    accepted_at,
+    best_words,
+    by_scene,
+    ceiling,
+    confident,
+    is_tuned,
+    label,
+    name_of,
+    named,
+    numbers,
+    percent,
+    read,
+    row_label,
+    row_of,
+    share,
+)
+from experiments.paper.scenes import PLACEMENTS
 from orthonav.core.records import CONFIDENT
+
+PROGRAM = "python -m experiments.paper"
+SHOWN_RULES = ("product best", "product weighted", "cosine best", "cosine neighbours")
+STEPS = (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m"))
+Cell = Callable[[Result], str]
+Published = Callable[[str, str, str], str]
+"""The paper's figure of a family, an input and a scene."""
 
 
 def report(out: Path, setting: str) -> Path | None:
-    """Write `tables.md` and the plots next to the result files; None without results."""
+    """Write `tables.md` and the plot beside the result files; None without results."""
     folder = out / setting
     results = read(folder)
     if not results:
         return None
-    made = [r for r in results if r.family]
-    try:
-        from experiments.paper.plots import draw
-    except ImportError:
-        notes = ["Plots need matplotlib: pip install 'orthonav[report]'"]
-    else:
-        notes = [f"![{path.stem}]({path.name})" for path in draw(made, folder)]
-    text = "\n".join([*(table.markdown() for table in tables(results)), *notes, ""])
+    text = [table.markdown() for table in tables(results)]
+    swept = [each for each in results if each.family and each.plain.get("sweep")]
+    if swept:
+        text.append(f"![sensitivity]({_plot(swept, folder / 'sensitivity.png').name})")
     path = folder / "tables.md"
-    path.write_text(text, encoding="utf-8")
+    path.write_text("\n".join([*text, ""]), encoding="utf-8")
     return path
+
+
+def _plot(results: Sequence[Result], out: Path) -> Path:
+    """Accuracy at 15 m against heading and height errors, a column per method."""
+    from matplotlib.figure import Figure
+
+    families = list(dict.fromkeys(each.family for each in results))
+    figure = Figure((3.5 * len(families), 6), layout="constrained")
+    grid = figure.subplots(2, len(families), sharey=True, squeeze=False)
+    for row, (step, title) in enumerate(STEPS):
+        for axis, family in zip(grid[row], families, strict=True):
+            for each in (each for each in results if each.family == family):
+                sweep = each.plain["sweep"][step]
+                values = [100 * share(errors) for errors in sweep.values()]
+                name = "default" if each.registration else EDGES[each.edges]
+                axis.plot([float(value) for value in sweep], values, "o-", ms=3, label=name)
+            axis.set(xlabel=title, ylim=(0, 102), title=FAMILIES[family])
+            axis.legend(fontsize=8)
+        grid[row, 0].set_ylabel("within 15 m, %")
+    figure.savefig(out, dpi=110)
+    return out
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
     """All tables of results of one setting."""
     made = [each for each in results if each.family]
     return [
-        *table_2(made),
-        *orders(made),
+        *scenes(made),
+        *accuracy(made),
+        *criterion(made),
+        *accepted(made),
         *above_default(made),
-        *table_3(made),
-        *choice(made),
         *rules(made),
         *sensitivity(made),
-        *resolutions(made),
         *baselines(results, made),
-        *field(results, label),
+        *field(results),
         *costs(made),
-        row_table(results),
+        provenance(results),
     ]
 
 
-def table_2(results: Sequence[Result]) -> list[Table]:
-    """Accuracy at 15 m by method and scene, views on the grid and anywhere."""
-    header = ("method", "input", "paper", "route", "on grid", "anywhere", "right tile", "of")
-    made = []
+def scenes(results: Sequence[Result]) -> list[Table]:
+    """Size, resolution and numbers of views of each scene."""
+    rows = []
     for scene, found in by_scene(results):
-        rows = [_table_2_row(each) for each in best_words(found)]
-        chance = found[0].plain["chance"]
-        guessed = (percent(chance.get(name)) for name in PLACEMENTS)
-        rows.append(["a guess", "", "-", *guessed, "", ""])
-        made.append(Table(f"Table 2, {scene}: accuracy at 15 m, %", header, rows, _area(found)))
+        first = found[0]
+        flown = first.plain["trajectory"]
+        views = "/".join(str(len(first.plain["views"][name])) for name in PLACEMENTS)
+        size = [f"{flown['length_m']:g} x {flown['band_m']:g}", f"{flown['agl_m']:g}"]
+        grid = [f"{flown['gsd_m']:g}", f"{first.plain['tiles']:,}", f"{first.stride_m:g}"]
+        rows.append([scene, *size, *grid, percent(ceiling(first.stride_m)), views])
+    header = (
+        *("scene", "area m", "height m", "m per pixel", "tiles", "tile step m"),
+        *("possible %", "views"),
+    )
+    notes = (
+        "possible: accuracy at 15 m, anywhere, of a method that always finds the correct tile; "
+        "views: along the route (one per tile step), on the grid of tiles, anywhere",
+    )
+    return [Table("Scenes", header, rows, notes)] if rows else []
+
+
+def accuracy(results: Sequence[Result]) -> list[Table]:
+    """Table 2: accuracy at 15 m by method and scene, for the three kinds of views."""
+
+    def cell(each: Result) -> str:
+        return _joined(each.accuracy(name) for name in PLACEMENTS)
+
+    def chance(each: Result) -> str:
+        return _joined(each.plain["chance"].get(name, math.nan) for name in PLACEMENTS)
+
+    notes = ("views along the route / on the grid / anywhere", TUNED)
+    title = "Table 2: accuracy at 15 m, %"
+    return _by_scene(title, results, cell, notes, published_accuracy, chance)
+
+
+def criterion(results: Sequence[Result]) -> list[Table]:
+    """Table 3: accuracy of the views that the confidence criterion accepts."""
+
+    def cell(each: Result) -> str:
+        name, threshold = ("confidence", CONFIDENT) if each.registration else ("lowe_ratio", LOWE)
+        return _joined(confident(each.right("grid"), each.column("grid", name), threshold))
+
+    notes = (
+        "accuracy at 15 m of the accepted views / fraction accepted; views on the grid, whose "
+        "accuracy without the criterion is in Table 2",
+        f"criterion: Lowe's ratio of {LOWE}; orthonav, default: confidence {CONFIDENT:g}",
+    )
+    found = [each for each in results if each.family != "bovw"]
+    return _by_scene("Table 3: with the criterion, %", found, cell, notes, published_criterion)
+
+
+def accepted(results: Sequence[Result]) -> list[Table]:
+    """Views that can be accepted at 95 % correct, by Lowe's ratio and with an exclusion radius."""
+
+    def cell(each: Result) -> str:
+        right = each.right("grid")
+        ratios = (each.column("grid", name) for name in ("lowe_ratio", "peak_ratio"))
+        return _joined(accepted_at(right, ratio) for ratio in ratios)
+
+    notes = (
+        "largest fraction of the views on the grid that a threshold accepts with at least 95 % "
+        "correct, chosen on the same views: Lowe's ratio / best score over the best one beyond "
+        "half a tile",
+    )
+    found = [
+        each
+        for each in results
+        if each.scene in TRAJECTORIES and each.family != "bovw" and not each.registration
+    ]
+    return _by_scene("Accepted at 95 % correct, %", found, cell, notes)
+
+
+def _by_scene(
+    title: str,
+    results: Sequence[Result],
+    cell: Cell,
+    notes: Sequence[str],
+    paper: Published | None = None,
+    chance: Cell | None = None,
+) -> list[Table]:
+    """A table of the paper's trajectories and one of other imagery: methods by scenes."""
+    made: list[Table] = []
+    for papers, what in ((True, "trajectories"), (False, "other imagery")):
+        found = [(s, f) for s, f in by_scene(results) if (s in TRAJECTORIES) == papers]
+        if found:
+            names = [scene for scene, _ in found]
+            rows = _rows(found, cell, paper if papers else None)
+            if chance:
+                rows.append(["a guess", *(chance(each[0]) for _, each in found)])
+            header = ("method", *names)
+            made.append(Table(f"{title}: {what}", header, rows, () if made else notes))
     return made
 
 
-def _table_2_row(each: Result) -> list[str]:
-    placed = [*(each.accuracy(name) for name in PLACEMENTS), each.right_tile("anywhere")]
-    views = " / ".join(str(len(each.plain["views"][name])) for name in PLACEMENTS)
-    paper = (
-        "-"
-        if each.registration
-        else published.accuracy(each.family, each.edges, column(each.scene))
-    )
-    return [named(each), EDGES[each.edges], paper, *map(percent, placed), views]
-
-
-def _area(found: Sequence[Result]) -> list[str]:
-    flown, first = found[0].plain["trajectory"], found[0]
-    tiles = first.plain["tiles"]
-    bound = ceiling(first.stride_m)
-    return [
-        f"{flown['length_m']:g} x {flown['band_m']:g} m from {flown['agl_m']:g} m, "
-        f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; a method "
-        f"that always finds the correct tile has {percent(bound)} % at 15 m anywhere",
-        "route: one view per tile step along the route; right tile: share of the views anywhere "
-        "that are within half a tile spacing (along the diagonal); of: number of views of each "
-        "kind",
-        TUNED,
-    ]
-
-
-def table_3(results: Sequence[Result]) -> list[Table]:
-    """The confidence criterion and the ratio with an exclusion radius; views on the grid."""
-    header = (
-        *("scene", "method", "input", "paper acc. / accepted", "Lowe 1.13: acc. / accepted"),
-        *(
-            "Lowe: accepted at 95 %",
-            "excluding: accepted at 95 %",
-            "median Lowe",
-            "median excluding",
-        ),
-    )
+def _rows(
+    found: Sequence[tuple[str, list[Result]]], cell: Cell, paper: Published | None
+) -> list[list[str]]:
+    """A row of cells for each method, and below it the paper's figures."""
+    cells: dict[Row, dict[str, str]] = {}
+    for scene, results in found:
+        for each in best_words(results):
+            star = "*" if is_tuned(each) else ""
+            cells.setdefault(row_of(each), {})[scene] = cell(each) + star
     rows = []
-    for scene, found in by_scene(results):
-        for each in best_words(found):
-            if each.registration or each.family == "bovw":
-                continue
-            rows.append(_table_3_row(scene, each))
-    if not rows:
-        return []
-    notes = (
-        "accuracy at 15 m of the accepted views, and their share, in %, views on the grid",
-        "accepted at 95 %: largest share that a threshold accepts with at least 95 % correct, "
-        "chosen on the same views; excluding: best score over the best one beyond half a tile",
-    )
-    return [Table("Table 3: confidence criteria", header, rows, notes)]
+    for row in sorted(cells):
+        rows.append([row_label(row), *(cells[row].get(scene, "-") for scene, _ in found)])
+        figures = [paper(row.family, row.edges, scene) for scene, _ in found] if paper else []
+        if not row.registration and any(each != "-" for each in figures):
+            rows.append(["- in the paper", *figures])
+    return rows
 
 
-def _table_3_row(scene: str, each: Result) -> list[str]:
-    right = each.right("grid")
-    lowe, peak = (each.column("grid", name) for name in ("lowe_ratio", "peak_ratio"))
-    found, accepted = confident(right, lowe, published.LOWE)
-    paper = published.confident(each.edges, scene) if each.family == "autoencoder" else "-"
-    cells = [percent(accepted_at(right, ratio)) for ratio in (lowe, peak)]
-    medians = [f"{_median(ratio):.3f}" for ratio in (lowe, peak)]
-    both = f"{percent(found)} / {percent(accepted)}"
-    return [scene, named(each), EDGES[each.edges], paper, both, *cells, *medians]
-
-
-def choice(results: Sequence[Result]) -> list[Table]:
-    """The paper's best method and orthonav over other imagery."""
-    rows = []
-    for scene, found in by_scene(results):
-        shown = [e for e in found if e.family == "gradient" or _is_papers_best(e)]
-        if column(scene) not in published.TRAJECTORIES and len(shown) > 1:
-            rows += [_choice_row(scene, each) for each in shown]
-    if not rows:
-        return []
-    header = (
-        *("scene", "method", "input", "on grid", "anywhere", "right tile", "criterion"),
-        *("correct / accepted", "learn s", "MB per km2", "encoder MB", "ms per view"),
-    )
-    notes = (
-        "accuracy at 15 m in %; right tile: of views anywhere; correct / accepted: of views on "
-        "the grid, by the criterion; ms: one view, one core, from its picture to the fix",
-        TUNED,
-    )
-    return [Table("The paper's best and orthonav on other imagery", header, rows, notes)]
-
-
-def _is_papers_best(each: Result) -> bool:
-    return each.family == "autoencoder" and each.edges == "canny"
-
-
-def _choice_row(scene: str, each: Result) -> list[str]:
-    plain, right = each.plain, each.right("grid")
-    name, threshold = (
-        ("confidence", CONFIDENT) if each.registration else ("lowe_ratio", published.LOWE)
-    )
-    found, accepted = confident(right, each.column("grid", name), threshold)
-    shares = [each.accuracy("grid"), each.accuracy("anywhere"), each.right_tile("anywhere")]
-    criterion = f"confidence {CONFIDENT}" if each.registration else f"Lowe {published.LOWE}"
-    figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
-    both = f"{percent(found)} / {percent(accepted)}"
-    cells = [named(each), EDGES[each.edges], *map(percent, shares), criterion, both]
-    return [scene, *cells, *map(number, figures)]
+def _joined(fractions: Iterable[float]) -> str:
+    return "/".join(map(percent, fractions))
 
 
 def rules(results: Sequence[Result]) -> list[Table]:
     """Rules of position and similarities on one trajectory."""
-    found = [each for each in results if each.plain.get("rules") and each.scene == "B"]
+    found = [each for each in results if each.plain.get("rules") and each.scene == SWEPT_ON]
     if not found:
         return []
-    names = list(found[0].plain["rules"]["grid"])
     rows = []
     for each in best_words(found):
-        for placement in ("grid", "anywhere"):
-            shares = [share(each.plain["rules"][placement][name]) for name in names]
-            rows.append([f"{named(each)}, {EDGES[each.edges]}", placement, *map(percent, shares)])
+        placed = [each.plain["rules"][placement] for placement in ("grid", "anywhere")]
+        cells = (_joined(share(part[name]) for part in placed) for name in SHOWN_RULES)
+        rows.append([named(each), *cells])
     notes = (
-        "product: embeddings without scaling; cosine: the same, scaled to length 1. best: the "
+        "views on the grid / anywhere",
+        "product: embeddings without scaling; cosine: the same, scaled to length 1; best: the "
         "paper; weighted: all tiles by score (Bianchi and Barfoot); neighbours: after Couturier "
-        "and Akhloufi; peak: orthonav's",
+        "and Akhloufi",
     )
-    header = ("method", "views", *names)
-    return [Table("Rules of position, B: accuracy at 15 m, %", header, rows, notes)]
-
-
-def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
-    """Methods that carry the reference images, and orthonav on the same trajectory."""
-    rows = []
-    for each in results:
-        for name, result in each.plain.get("baselines", {}).items():
-            shares = [share(result["views"][placement]) for placement in ("grid", "anywhere")]
-            count = result["views"]["anywhere"][1]
-            rows.append(
-                [each.scene, name, *map(percent, shares), str(count), number(result["view_ms"])]
-            )
-    if not rows:
-        return []
-    scenes = {row[0] for row in rows}
-    for each in made:
-        if each.family == "gradient" and each.scene in scenes:
-            shares = [each.accuracy(placement) for placement in ("grid", "anywhere")]
-            count = len(each.plain["views"]["anywhere"])
-            ms = number(each.plain["view_ms"])
-            rows.append([each.scene, named(each), *map(percent, shares), str(count), ms])
-    header = ("scene", "method", "on grid", "anywhere", "of", "ms per view")
-    notes = ("the baselines carry the orthophoto itself; reported pose, whole map, no prior",)
-    return [Table("Related work: accuracy at 15 m, %", header, rows, notes)]
-
-
-def costs(results: Sequence[Result]) -> list[Table]:
-    """What each method takes: time to learn, size of the map, time of a view."""
-    rows = []
-    for scene, found in by_scene(results):
-        for each in found:
-            plain = each.plain
-            figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
-            recipe = plain["method"]["recipe"]
-            name = f"{recipe}, with registration" if each.registration else recipe
-            rows.append([scene, name, EDGES[each.edges], *map(number, figures)])
-    header = ("scene", "method", "input", "learn s", "MB per km2", "encoder MB", "ms per view")
-    notes = (
-        "learn s: the encoder, with embedding all tiles; MB per km2: the map file less the encoder "
-        "or vocabulary, which it holds once; ms: one view from its picture to the fix",
-    )
-    return [Table("What it costs", header, rows, notes)]
+    header = ("method", *SHOWN_RULES)
+    return [Table(f"Rules of position, {SWEPT_ON}: accuracy at 15 m, %", header, rows, notes)]
 
 
 def sensitivity(results: Sequence[Result]) -> list[Table]:
     """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
-    made = []
-    for step, title in (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m")):
+    made: list[Table] = []
+    for step, title in STEPS:
         swept = [each for each in best_words(results) if each.plain.get("sweep")]
         if swept:
             values = list(swept[0].plain["sweep"][step])
             count = swept[0].plain["sweep"][step][values[0]][1]
             rows = [
                 [
-                    f"{named(each)}, {EDGES[each.edges]}",
+                    named(each),
                     *(percent(share(each.plain["sweep"][step][value])) for value in values),
                 ]
                 for each in swept
@@ -254,44 +258,275 @@ def sensitivity(results: Sequence[Result]) -> list[Table]:
     return made
 
 
-def resolutions(results: Sequence[Result]) -> list[Table]:
-    """Accuracy anywhere by ground resolution, where a trajectory was run at several."""
-    rows = []
-    for scene in sorted({each.scene for each in results if column(each.scene) != each.scene}):
-        if column(scene) not in published.TRAJECTORIES:
-            continue
-        for each in best_words([e for e in results if e.scene in (scene, column(scene))]):
-            shares = [ceiling(each.stride_m), each.accuracy("anywhere")]
-            gsd_m = f"{each.plain['trajectory']['gsd_m']:g}"
-            cells = [named(each), EDGES[each.edges], gsd_m, f"{each.stride_m:g}"]
-            rows.append([column(scene), *cells, *map(percent, shares)])
-    header = ("trajectory", "method", "input", "m per pixel", "tile step m", "possible", "anywhere")
-    return [Table("Accuracy anywhere by ground resolution, %", header, rows)] if rows else []
+def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
+    """Methods that carry the reference images, and orthonav on the same trajectory."""
+    found = []
+    for tried in (each for each in results if "baselines" in each.plain):
+        rows = []
+        for name, result in tried.plain["baselines"].items():
+            fractions = [share(result["views"][placement]) for placement in ("grid", "anywhere")]
+            count = result["views"]["anywhere"][1]
+            rows.append([name, *map(percent, fractions), str(count), number(result["view_ms"])])
+        for each in made:
+            if each.family == "gradient" and each.scene == tried.scene:
+                fractions = [each.accuracy(placement) for placement in ("grid", "anywhere")]
+                count = len(each.plain["views"]["anywhere"])
+                ms = number(each.plain["view_ms"])
+                rows.append([named(each), *map(percent, fractions), str(count), ms])
+        header = ("method", "on grid", "anywhere", "of", "ms per view")
+        notes = ("the baselines carry the orthophoto itself; reported pose, whole map, no prior",)
+        title = f"Related work, {tried.scene}: accuracy at 15 m, %"
+        found.append(Table(title, header, rows, notes))
+    return found
 
 
-def row_table(results: Sequence[Result]) -> Table:
-    """Commit, day, minutes and machine of every row."""
+def costs(results: Sequence[Result]) -> list[Table]:
+    """Time to learn, size of the map, time of a view, on one scene."""
+    found = dict(by_scene(results))
+    if not found:
+        return []
+    scene = SWEPT_ON if SWEPT_ON in found else next(iter(found))
     rows = []
-    for each in sorted(results, key=name_of):
-        made = each.plain["provenance"]
-        changed = "yes" if made["dirty"] else "no"
-        about = [str(made["commit"])[:10], changed, str(made["date"])[:10]]
-        mark = "yes" if each.family and is_tuned(each) else "no"
-        times = [each.plain.get("cpu_minutes"), each.plain["minutes"]]
-        cost = [*("-" if minutes is None else number(minutes) for minutes in times), made["cpu"]]
-        rows.append([name_of(each), mark, *about, *cost])
-    header = (
-        *("row", "tuned on it", "commit", "files not committed", "date"),
-        *("core minutes", "minutes", "processor"),
-    )
-    known = [each.plain["cpu_minutes"] for each in results if "cpu_minutes" in each.plain]
+    for each in best_words(found[scene]):
+        plain = each.plain
+        figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
+        rows.append([named(each), *map(number, figures)])
+    header = ("method", "learn s", "MB per km2", "encoder MB", "ms per view")
     notes = (
-        f"core minutes: processor time, {sum(known):.0f} for {len(known)} rows together; minutes: "
-        "elapsed time, longer beside other work",
+        "learn s: the encoder, with embedding all tiles; MB per km2: the map file less the encoder "
+        "or vocabulary, which it holds once; ms: one view from its picture to the fix, one core",
     )
-    return Table("Rows", header, rows, notes)
+    return [Table(f"Cost, {scene}", header, rows, notes)]
 
 
-def _median(values: Iterable[float]) -> float:
-    known = sorted(value for value in values if math.isfinite(value))
-    return known[len(known) // 2] if known else math.nan
+def provenance(results: Sequence[Result]) -> Table:
+    """Commit, day, command and core minutes of the rows."""
+    made: dict[tuple[str, str, str], list[Result]] = {}
+    for each in sorted(results, key=name_of):
+        about = each.plain["provenance"]
+        commit = str(about["commit"])[:10] + (", changed" if about["dirty"] else "")
+        key = (str(about["date"])[:10], commit, str(each.plain.get("command", PROGRAM)))
+        made.setdefault(key, []).append(each)
+    rows = []
+    for (day, commit, command), found in sorted(made.items()):
+        minutes = sum(each.plain.get("cpu_minutes", each.plain["minutes"]) for each in found)
+        names = " ".join(map(name_of, found))
+        rows.append(
+            [commit, day, number(minutes), f"`{command.removeprefix(PROGRAM).strip()}`", names]
+        )
+    header = ("commit", "date", "core minutes", "options", "rows")
+    processors = ", ".join(sorted({str(each.plain["provenance"]["cpu"]) for each in results}))
+    notes = (
+        f"options: of `{PROGRAM}`; processor: {processors}; changed: with files that were not "
+        "committed",
+    )
+    return Table("Measured at", header, rows, notes)
+
+
+def above_default(results: Sequence[Result]) -> list[Table]:
+    """Every row that locates more views within 15 m than orthonav's default on its scene."""
+    rows, compared = [], 0
+    for scene, found in by_scene(results):
+        for ours in (each for each in found if each.registration):
+            for each in (other for other in best_words(found) if not other.registration):
+                compared += len(PLACEMENTS)
+                rows += [
+                    _above_row(scene, name, ours, each)
+                    for name in PLACEMENTS
+                    if each.accuracy(name) > ours.accuracy(name)
+                ]
+    if not compared:
+        return []
+    header = ("scene", "views", "of", "default", "method", "accuracy", "difference")
+    notes = (
+        f"accuracy at 15 m in %; the default is as good or better in {compared - len(rows)} of "
+        f"{compared} comparisons",
+        "within the noise: less than two standard errors of the difference",
+    )
+    return [Table("Rows above orthonav's default", header, rows, notes)]
+
+
+def _above_row(scene: str, name: str, ours: Result, each: Result) -> list[str]:
+    shares = [ours.accuracy(name), each.accuracy(name)]
+    count = len(each.plain["views"][name])
+    spread = math.sqrt(sum(p * (1 - p) for p in shares) / count)
+    size = "within the noise" if shares[1] - shares[0] <= 2 * spread else "significant"
+    return [
+        *(scene, name, str(count), percent(shares[0])),
+        *(named(each), percent(shares[1]), size),
+    ]
+
+
+FAR_M, FAR_PX = 35.0, 10.0
+"""A position beyond both is wrong; pixels, for imagery on which 35 m are less than a view shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """What a method made of the views of one or several scenes.
+
+    - `error_m` (N,): infinite without an answer. `far_m` (N,): error above which it is wrong.
+    - `evidence` (N,): -inf without an answer. `mirrored` (M,): that of mirrored views.
+    """
+
+    error_m: NDArray[np.float64]
+    far_m: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+    mirrored: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rows: Sequence[Result], name: str) -> "Placed":
+        """All views of these scenes."""
+        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+        shapes = [each.plain["trajectory"] for each in rows if name in each.plain[FIELD]]
+        views = [row for part in parts for row in part["views"]]
+        far = [
+            max(FAR_M, FAR_PX * shape["gsd_m"])
+            for part, shape in zip(parts, shapes, strict=True)
+            for _ in part["views"]
+        ]
+        return cls(
+            numbers([error for error, _ in views], math.inf),
+            np.array(far),
+            numbers([evidence for _, evidence in views], -math.inf),
+            numbers([each for part in parts for each in part["mirrored"]], -math.inf),
+        )
+
+    @property
+    def right(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the views that are not wrong."""
+        return self.error_m <= self.far_m
+
+    def within(self, radius_m: float = ACCURACY_M) -> float:
+        """Share of all views."""
+        return float((self.error_m <= radius_m).mean())
+
+    def trusted(self) -> float:
+        """Largest share of the right views that a threshold accepts with no wrong one."""
+        wrong = np.concatenate([self.evidence[~self.right], self.mirrored, [-math.inf]])
+        right = self.evidence[self.right]
+        return float((right > wrong.max()).mean()) if right.size else math.nan
+
+    def accepted(self, threshold: float) -> tuple[float, int]:
+        """Share of the right views that a threshold accepts, and how many wrong ones."""
+        accepted = self.evidence >= threshold
+        right = float(accepted[self.right].mean()) if self.right.any() else math.nan
+        return right, int((accepted & ~self.right).sum() + (self.mirrored >= threshold).sum())
+
+    def median_m(self) -> float:
+        """Median error of the right views."""
+        return float(np.median(self.error_m[self.right])) if self.right.any() else math.nan
+
+
+def field(results: Sequence[Result]) -> list[Table]:
+    """Each method over all scenes, and scene by scene."""
+    rows = [each for each in results if FIELD in each.plain]
+    if not rows:
+        return []
+    names = list(dict.fromkeys(name for each in rows for name in each.plain[FIELD]))
+    flown = [Method(**plain) for each in rows for plain in each.plain["methods"]]
+    shown = {each.key: label(each) for each in flown}
+    return [_summary(rows, names, shown), _field_by_scene(rows, names, shown)]
+
+
+def _summary(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+    lines = []
+    for name in names:
+        placed = Placed.of(rows, name)
+        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+        own = placed.accepted(CONFIDENT) if name.endswith("registration") else None
+        lines.append(
+            [
+                shown.get(name, name),
+                percent(placed.within()),
+                percent(float(placed.right.mean())),
+                percent(placed.trusted()),
+                "-" if own is None else f"{percent(own[0])} / {own[1]}",
+                number(placed.median_m()),
+                number(max(part["cpu_s"] for part in parts)),
+                number(max(part["peak_mb"] for part in parts)),
+                number(sum(part["carried_mb"] for part in parts)),
+            ]
+        )
+    errors = rows[0].plain["errors"]
+    counts = Placed.of(rows, names[0])
+    header = (
+        *("method", "15 m", "35 m or 10 px", "accepted at no wrong"),
+        *("accepted / wrong", "median m", "CPU s per view", "peak MB", "carried MB"),
+    )
+    notes = (
+        f"scenes: {', '.join(each.scene for each in rows)}; "
+        f"{len(counts.error_m)} views anywhere, of the later date, and {len(counts.mirrored)} "
+        "mirrored; "
+        f"standard deviations of the reported heading, {errors['yaw_std_deg']:g} deg, the height, "
+        f"{errors['agl_std']:.0%}, and the prior, {errors['prior_std_px']:g} px: the same for all",
+        "views in %; accepted at no wrong: of those correct within 35 m or 10 px, the "
+        "largest fraction that one threshold over all scenes accepts without a wrong one; every "
+        "answer to a mirrored view is wrong; evidence: inliers, Lowe's ratio, or the confidence",
+        f"accepted / wrong: of the correct ones, and number of wrong ones, at a confidence of "
+        f"{CONFIDENT:g}, where a method states one",
+        "CPU s, peak MB: the largest of the scenes' medians and peaks, one core; carried: "
+        "keypoints (descriptors in 16 bits) or maps with their encoders, all scenes",
+    )
+    return Table("The field today: all scenes", header, lines, notes)
+
+
+def _field_by_scene(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+    lines = []
+    for name in names:
+        cells = [shown.get(name, name)]
+        for each in rows:
+            placed = Placed.of([each], name) if name in each.plain[FIELD] else None
+            far = None if placed is None else float(placed.right.mean())
+            cells.append("-" if placed is None else f"{percent(placed.within())}/{percent(far)}")
+        lines.append(cells)
+    guess = ["the prior itself"]
+    for each in rows:
+        away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
+        far_m = max(FAR_M, FAR_PX * each.plain["trajectory"]["gsd_m"])
+        shares = (float((away <= radius).mean()) for radius in (ACCURACY_M, far_m))
+        guess.append("/".join(map(percent, shares)))
+    header = ("method", *(each.scene for each in rows))
+    notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)
+    return Table("The field today, scene by scene", header, [*lines, guess], notes)
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "paper-results.md"
+FIGURES = ("canny", "learnt", "share_canny", "share_learnt")
+HEAD = """# Results of the paper's experiments
+
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
+experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
+1.
+"""
+
+
+def page(rows: Sequence[Result]) -> str:
+    """Text of the page: tables of each setting."""
+    text = [HEAD]
+    for name in SETTINGS:
+        found = [row for row in rows if row.plain["setting"]["name"] == name]
+        if found:
+            text.append(f"## The {name} setting\n")
+            text += [table.markdown() for table in tables(found)]
+    text.append(agreement().markdown())
+    return "\n".join(text)
+
+
+def agreement() -> Table:
+    """How the edges of two dates agree on landscapes that the network was not learnt from."""
+    found = json.loads(BETWEEN_DATES.with_suffix(".json").read_text(encoding="utf-8"))
+    rows = []
+    for gsd_m in sorted({each["gsd_m"] for each in found}):
+        pairs = [each for each in found if each["gsd_m"] == gsd_m]
+        mean = {name: sum(each[name] for each in pairs) / len(pairs) for name in FIGURES}
+        correlations = (f"{mean[name]:.2f}" for name in FIGURES[:2])
+        rows.append([f"{gsd_m:g}", *correlations, *(percent(mean[name]) for name in FIGURES[2:])])
+    notes = (
+        "correlation of the edges of two dates, smoothed by a Gaussian of 1 px, mean of three "
+        "pairs; density: pixels that are edges, in %; generated landscapes that were not learnt "
+        "from",
+        "made by `python -m experiments.paper.between_dates`",
+    )
+    header = ("m per pixel", "Canny", "learnt", "density Canny", "density learnt")
+    return Table("Edges between dates", header, rows, notes)

@@ -23,11 +23,9 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def atlas(area, made_once):
     """An atlas of the first date with its index; read-only."""
-    from orthonav.ground.atlas.build import build_atlas
-    from orthonav.ground.atlas.catalog import Atlas
+    from orthonav.ground.atlas.build import AtlasRequest, build_atlas
+    from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
     from orthonav.ground.atlas.cluster import SerialRunner
-    from orthonav.ground.atlas.recipe import CoarseRecipe
-    from orthonav.ground.atlas.sheet_tasks import AtlasRequest
 
     def make(folder):
         recipe = {**RECIPE, "coarse": dataclasses.asdict(CoarseRecipe(*COARSE))}
@@ -63,7 +61,7 @@ def flown(area, made_once):
             seed=3,
         )
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
+            patch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)
             simulate_flight(request)
 
     return made_once("searched-flight", make) / "flight"

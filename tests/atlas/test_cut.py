@@ -17,16 +17,14 @@ from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.core.tiles.stored import embedder_of
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.coverage import box_deg, check_shown
-from orthonav.ground.atlas.cut import cut_in_memory, cut_map
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.cut import box_deg, check_shown, cut_in_memory, cut_map
 from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.layout import grid_of
+from orthonav.ground.build.sheet import grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -67,7 +65,7 @@ def folder(ortho, names, middle, tmp_path_factory):
     atlas = Atlas.open_or_create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
-        patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 1)
+        patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
         dem = write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0)
         for name in names:
             terrain = {"dem": dem, "dem_datum": "msl"}

@@ -14,13 +14,12 @@ import pytest
 from orthonav.cli import main
 from orthonav.core.errors import AtlasError
 from orthonav.core.mapfile import open_map
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.index_manifest import IndexManifest, Part, ShardInfo
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.index import IndexManifest
 from orthonav.ground.atlas.integrity import check_atlas
 from orthonav.ground.atlas.item import Sheet, StoredFile, canonical
-from orthonav.ground.atlas.quantizers import VectorRecipe
-from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.atlas.store import Store
+from orthonav.ground.atlas.vectors import Part, ShardInfo, VectorRecipe
 from orthonav.ground.planning.area import Area
 
 RECIPE = AtlasRecipe(gsd_m=2.5, tile_px=128, calibration_views=24, coarse=None)
@@ -213,7 +212,7 @@ def test_a_full_disk_is_reported(near, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orthonav.ground.atlas.filesystems.shutil.copyfile", full)
+    monkeypatch.setattr("orthonav.ground.atlas.store.shutil.copyfile", full)
     assert main(["atlas", "add", near.url + "2", near.url, "-q"]) == 1
 
 

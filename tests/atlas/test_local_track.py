@@ -13,8 +13,7 @@ from orthonav.core.records import NoFix, View
 from orthonav.core.track import State
 from orthonav.ground.atlas import locate
 from orthonav.ground.atlas.agreement import Placement
-from orthonav.ground.atlas.find import FoundPlace
-from orthonav.ground.atlas.locate import LocalTrack
+from orthonav.ground.atlas.locate import FoundPlace, LocalTrack
 
 STD_M = 12.5
 BEGUN = 3
@@ -59,14 +58,6 @@ def test_the_track_follows_from_one_map_to_the_next(atlas, views, places, monkey
         assert track.fix.confidence > 0.9
         assert abs((track.fix.heading_deg - heading_deg + 180) % 360 - 180) < 5
     assert len(cuts) > 1
-
-
-@pytest.mark.long
-def test_a_focal_length_of_a_specification_is_uncertain(atlas, views, places):
-    cameras = [replace(view, camera=replace(view.camera, focal_std=0.06)) for view in views]
-    track = LocalTrack(atlas, found(cameras, places), heading_known=False)
-    usual = locate.MODEL.log_scale
-    assert track._tracker.model.log_scale == pytest.approx(math.hypot(usual, 0.06))
 
 
 @pytest.mark.long

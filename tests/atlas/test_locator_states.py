@@ -8,9 +8,8 @@ from orthonav.core.errors import AtlasError
 from orthonav.core.records import NoFix
 from orthonav.core.track import State
 from orthonav.ground.atlas import locate
-from orthonav.ground.atlas.find import FoundPlace
-from orthonav.ground.atlas.locate import AtlasLocator
-from orthonav.ground.atlas.recipe import AtlasRecipe
+from orthonav.ground.atlas.catalog import AtlasRecipe
+from orthonav.ground.atlas.locate import AtlasLocator, FoundPlace
 
 SEARCHING = NoFix("searching", "nothing agrees")
 FOUND = FoundPlace((), 1.0, 0.95)

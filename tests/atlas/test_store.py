@@ -183,7 +183,7 @@ def test_local_files_are_whole_or_absent(tmp_path, monkeypatch, error):
         to.write_bytes(b"ne")
         raise error
 
-    monkeypatch.setattr("orthonav.ground.atlas.filesystems.shutil.copyfile", half)
+    monkeypatch.setattr("orthonav.ground.atlas.store.shutil.copyfile", half)
     with pytest.raises((KeyboardInterrupt, StorageError)) as caught:
         store.write("items/a", tmp_path)
     assert "full" in str(caught.value) or isinstance(error, KeyboardInterrupt)

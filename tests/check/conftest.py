@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
+from lab.landscape import DEFAULT_DATES, generate_area
 
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
 
 
 def blank_east(path, seed):
@@ -34,7 +34,7 @@ def half_blank(made_once):
         request = BuildRequest(dates[:1], out, tile_px=128, overlap=0.75, calibration_views=10)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("orthonav.ground.build.calibrate.CROPS", 48)
-            patch.setattr("orthonav.ground.build.calibrate_registration.ENOUGH_RIGHT", 4)
+            patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 4)
             build_map(request)
 
     folder = made_once("half-blank", make)

@@ -9,21 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.registered import (
-    BEFORE_PHASE,
-    BIAS_BEFORE_PHASE,
+from orthonav.core.localize.confidence import (
     CHANCES,
     FEATURES,
-    OLD_FEATURES,
     STAND_IN,
-    USUAL_BIASES,
-    USUAL_DETAIL,
     Chances,
     RegisteredConfidence,
     features_of,
-    fit_registered,
 )
 from orthonav.core.records import CONFIDENT
+from orthonav.ground.build.fit import fit_registered
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
 MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)
@@ -63,12 +58,6 @@ def test_features_by_hand():
     assert len(features) == len(FEATURES)
 
 
-def test_a_view_of_one_level_is_compared_with_the_chance_of_one_level():
-    features = features_of(evidence(30.0, 0.0, 30.0, 20.0, detail_ratio=math.nan), CHANCE)
-    np.testing.assert_allclose(np.exp(features[:2]), [30 / 15, 1 / STAND_IN * 30 / 15])
-    assert features[3] == math.log(USUAL_DETAIL)
-
-
 def test_a_place_that_fits_as_well_a_little_aside_is_not_believed():
     """A lattice: strong, without a rival far away."""
     usual = RegisteredConfidence.usual(CHANCE)
@@ -100,11 +89,6 @@ def test_the_finer_level_counts_where_it_was_looked_at():
         assert np.exp(features_of(plain, CHANCE))[1] == pytest.approx(50 / 45)
 
 
-@given(evidences)
-def test_it_is_a_probability(plain):
-    assert 0 <= MODEL(plain) <= 1
-
-
 @pytest.mark.parametrize("value", [0.0, -30.0, 1e-300, 1e300])
 def test_absurd_evidence_gives_a_probability(value):
     for name in ("strength", "rival", "look", "look_rival"):
@@ -118,22 +102,6 @@ def test_better_evidence_never_lowers_it(plain, gain):
             assert MODEL({**plain, name: gain * plain[name]}) >= MODEL(plain) - 1e-12
 
 
-@given(evidences, st.floats(1.0, 4.0))
-def test_a_better_rival_never_raises_it(plain, gain):
-    for name in ("rival", "look_rival", "fine_rival"):
-        if math.isfinite(plain[name]):
-            assert MODEL({**plain, name: gain * plain[name]}) <= MODEL(plain) + 1e-12
-
-
-def test_strength_and_ratios_each_raise_it():
-    middle = MODEL(evidence(40.0, 30.0, 25.0, 20.0))
-    assert 0.05 < middle < 0.95
-    assert MODEL(evidence(44.0, 33.0, 25.0, 20.0)) > middle  # stronger, the same ratio
-    assert MODEL(evidence(40.0, 27.0, 25.0, 20.0)) > middle
-    assert MODEL(evidence(40.0, 30.0, 25.0, 18.0)) > middle
-    assert MODEL(evidence(40.0, 40.0, 25.0, 25.0)) < 0.15
-
-
 @given(
     st.tuples(*[st.floats(-50, 50)] * 2),
     st.tuples(*[st.floats(0, 50)] * len(FEATURES)),
@@ -143,29 +111,6 @@ def test_plain_round_trip(biases, weights, chances):
     model = RegisteredConfidence(biases, weights, Chances(*chances))
     again = RegisteredConfidence.from_plain(json.loads(json.dumps(model.to_plain())))
     assert again == model and again(evidence()) == model(evidence())
-
-
-def test_an_older_map_has_the_usual_weights_and_its_own_chance():
-    plain = {**PLAIN, "weights": dict.fromkeys(sorted(OLD_FEATURES), 2.0)}
-    plain["chances"] = {"total": 45.0, "look": 15.0, "fine": 60.0}
-    usual = RegisteredConfidence.usual(Chances(45.0, 15.0, 60.0))
-    assert RegisteredConfidence.from_plain(plain) == usual
-    plain["chances"]["total"] = 16.0  # of views of one level
-    assert RegisteredConfidence.from_plain(plain).chances == Chances(32.0, 15.0, 60.0)
-    with pytest.raises(VariantError, match="chances"):
-        RegisteredConfidence.from_plain(without(plain, "chances"))
-    plain["weights"] = dict.fromkeys(sorted(BEFORE_PHASE), 2.0)
-    assert RegisteredConfidence.from_plain(plain).chances == Chances(16.0, 15.0, 60.0)
-
-
-@pytest.mark.parametrize(("shift", "expected"), [(-5.0, -5.0), (2.0, 0.0)])
-def test_an_older_map_stays_as_cautious_as_another_date_made_it(shift, expected):
-    plain = {**PLAIN, "weights": dict.fromkeys(sorted(BEFORE_PHASE), 2.0)}
-    plain["biases"] = [BIAS_BEFORE_PHASE + shift, -1.75]
-    found = RegisteredConfidence.from_plain(plain)
-    assert found.biases[0] == pytest.approx(USUAL_BIASES[0] + expected)
-    with pytest.raises(VariantError):
-        RegisteredConfidence.from_plain({**plain, "biases": [math.nan, 0.0]})
 
 
 def test_a_search_that_was_cut_short_is_not_confident():
@@ -202,12 +147,6 @@ NUMBERS += [("chances", name) for name in CHANCES]
 def test_a_bad_number_is_refused(path, value):
     with pytest.raises(VariantError, match=r"confidence|chance"):
         RegisteredConfidence.from_plain(changed(PLAIN, value, *path))
-
-
-@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
-def test_a_missing_number_is_refused(path):
-    with pytest.raises(VariantError, match="confidence"):
-        RegisteredConfidence.from_plain(without(PLAIN, *path))
 
 
 @pytest.mark.parametrize("plain", [None, [], {}, "text", 3, {"weights": [1, 2, 3]}], ids=str)
@@ -269,7 +208,7 @@ def test_one_sided_views_give_a_finite_answer(all_right):
     assert min(moved) > 0 if all_right else max(moved) < 0
 
 
-def test_the_same_views_give_the_same_confidence():
-    views, right = synthetic(100, seed=4)
-    first, second = (fit_registered(views, right, CHANCE) for _ in range(2))
-    assert first == second
+@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
+def test_a_missing_number_is_refused(path):
+    with pytest.raises(VariantError, match="confidence"):
+        RegisteredConfidence.from_plain(without(PLAIN, *path))

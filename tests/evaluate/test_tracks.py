@@ -15,7 +15,7 @@ from helpers import textured
 from orthonav.cli import main
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.fixes import write_results
-from orthonav.core.flight.writer import FlightWriter
+from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.geo.camera import Camera, camera_from_en
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid

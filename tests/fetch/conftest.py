@@ -11,10 +11,10 @@ import servers
 import terrain
 from servers import QUICK
 
+from orthonav.ground.fetch.mosaic import Packing
 from orthonav.ground.fetch.options import ImageryOptions
+from orthonav.ground.fetch.presets import parse_source
 from orthonav.ground.fetch.run import FetchRequest, fetch
-from orthonav.ground.fetch.sources import parse_source
-from orthonav.ground.fetch.write import Packing
 from orthonav.ground.planning.area import Area
 
 MAPPROXY = """

@@ -12,9 +12,9 @@ from urllib.parse import parse_qsl, urlsplit
 
 import terrain
 
-from orthonav.ground.fetch.politeness import RequestLimits
+from orthonav.ground.fetch.web import RequestLimits
 
-QUICK = RequestLimits(parallel=4, per_second=2000, attempts=3, backoff_s=0.01, backoff_max_s=0.02)
+QUICK = RequestLimits(parallel=4, attempts=3, backoff_s=0.01, backoff_max_s=0.02)
 
 
 @dataclass

@@ -4,58 +4,55 @@ Written by hand to the form that the services document, with the quirks that pub
 around: limits of zooms, names of grids, rows before columns, rounded scales.
 """
 
+import re
 from pathlib import Path
-from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 import pytest
+import rasterio
+import servers
+import terrain
+from pyproj import Transformer
 
 from orthonav.core.errors import FetchError
-from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.fetch import wms, wmts
-from orthonav.ground.fetch.client import Client
-from orthonav.ground.fetch.crs import MERCATOR_HALF_M
-from orthonav.ground.fetch.documents import parse_xml
 from orthonav.ground.fetch.options import ImageryOptions, Provenance, SourceSpec
 from orthonav.ground.fetch.presets import presets
+from orthonav.ground.fetch.run import FetchRequest, estimate_fetch, fetch
+from orthonav.ground.planning.area import Area
 
 FOLDER = Path(__file__).parent / "capabilities"
-PROVENANCE = Provenance("", "")
 PLACES = {
-    "ign": LocalFrame(46.5, 3.0),
-    "pdok": LocalFrame(52.1, 5.1),
-    "swisstopo": LocalFrame(46.95, 7.45),
-    "basemap": LocalFrame(48.2, 16.4),
+    "ign": (3.0, 46.5),
+    "pdok": (5.1, 52.1),
+    "swisstopo": (7.45, 46.95),
+    "basemap": (16.4, 48.2),
+    "old": (8.0, 51.5),
+    "degrees": (3.0, 46.5),
 }
+NOISE = np.random.default_rng(1).integers(1, 255, (1024, 1024, 3), dtype=np.uint8)
 
 
-CLIENT = Client()
+def requested(tmp_path, name, options, protocol="wmts", suffix=""):
+    """The request of the one tile at a place, and the estimate; the service is on the loopback."""
+    text = (FOLDER / f"{name}.xml").read_text(encoding="utf-8")
+    lon, lat = PLACES[name.partition("_")[0]]
+    url = []
 
+    def answer(asked):
+        if asked.path.endswith(".xml") or asked.query.get("REQUEST") == "GetCapabilities":
+            ours = re.sub(r'(href|template)="https?://[\w.-]+', rf'\1="{url[0]}', text)
+            return servers.Answer(ours.encode(), kind="text/xml")
+        width, height = (int(asked.query.get(name, 256)) for name in ("WIDTH", "HEIGHT"))
+        return servers.Answer(terrain.encoded(np.resize(NOISE, (height, width, 3))))
 
-def document(name):
-    return parse_xml((FOLDER / f"{name}.xml").read_bytes())
-
-
-def answering(module, found):
-    """The service answers with this document."""
-    return mock.patch.object(module, "get_xml", lambda client, url: found)
-
-
-def asked(protocol, url, options, place):
-    """What is asked for, and an area of which only the place matters."""
-    return SourceSpec(protocol, url, options, PROVENANCE), SimpleNamespace(frame=place)
-
-
-def tiles(name, options, url="https://a.example/wmts"):
-    with answering(wmts, document(f"{name}_wmts")):
-        place = PLACES.get(name, PLACES["ign"])
-        return wmts.wmts_tiles(CLIENT, *asked("wmts", url, options, place))
-
-
-def cells(name, url, options, place):
-    with answering(wms, document(name)):
-        return wms.wms_cells(CLIENT, *asked("wms", url, options, place))
+    with servers.serving(answer) as server:
+        url.append(server.url)
+        spec = SourceSpec(protocol, f"{server.url}/{suffix}", options, Provenance("", ""))
+        area = Area.from_bounds((lon, lat, lon + 1e-6, lat + 1e-6))
+        request = FetchRequest(spec, area, tmp_path / "o.tif", 0.0, limits=servers.QUICK)
+        estimate = estimate_fetch(request)
+        fetch(request)
+        return server.log[-1], estimate
 
 
 def of_preset(name, id_, **rest):
@@ -63,156 +60,134 @@ def of_preset(name, id_, **rest):
     return ImageryOptions(**rest).over(preset.layer(id_).options)
 
 
-def test_ign_by_parameters():
-    source = tiles("ign", of_preset("ign", "2021", gsd_m=0.25))
-    assert source.address(363000, 265000) == (
-        "https://data.geopf.fr/wmts?SERVICE=WMTS&REQUEST=GetTile&VERSION=1.0.0"
-        "&LAYER=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLE=normal&FORMAT=image/jpeg"
-        "&TILEMATRIXSET=PM_0_19&TILEMATRIX=19&TILEROW=363000&TILECOL=265000"
-    )
-    assert source.grid.res_x == 2 * MERCATOR_HALF_M / 256 / 2**19
-    row0, col0, row1, col1 = source.grid.limits
-    assert 0 < row0 < row1 < 2**19 and 0 < col0 < col1 < 2**19  # the layer's own
+def web_tile(name, zoom):
+    """Row and column of the tile of the web grid at a place."""
+    x, y = Transformer.from_crs(4326, 3857, always_xy=True).transform(*PLACES[name])
+    half = np.pi * 6378137
+    return int((half - y) / (2 * half) * 2**zoom), int((x + half) / (2 * half) * 2**zoom)
 
 
-def test_ign_limits_of_zooms_and_styles():
-    assert "TILEMATRIX=18" in tiles("ign", of_preset("ign", "2000-2005")).address(1, 1)
+def test_ign_by_parameters(tmp_path):
+    asked, estimate = requested(tmp_path, "ign_wmts", of_preset("ign", "2021", gsd_m=0.25))
+    row, col = web_tile("ign", 19)
+    assert asked.query == {
+        "SERVICE": "WMTS", "REQUEST": "GetTile", "VERSION": "1.0.0", "STYLE": "normal",
+        "LAYER": "ORTHOIMAGERY.ORTHOPHOTOS2021", "FORMAT": "image/jpeg",
+        "TILEMATRIXSET": "PM_0_19", "TILEMATRIX": "19", "TILEROW": f"{row}", "TILECOL": f"{col}",
+    }  # fmt: skip
+    assert estimate.gsd_m == pytest.approx(0.2055, abs=5e-4)
+
+
+def test_ign_limits_of_zooms_and_styles(tmp_path):
+    asked, _ = requested(tmp_path, "ign_wmts", of_preset("ign", "2000-2005"))
+    assert asked.query["TILEMATRIX"] == "18"
     with pytest.raises(FetchError, match=r"no zoom 19; available: 6 .*18 \(0.411 m\)"):
-        tiles("ign", of_preset("ign", "2000-2005", zoom="19"))
+        requested(tmp_path, "ign_wmts", of_preset("ign", "2000-2005", zoom="19"))
     with pytest.raises(FetchError, match=r"the finest is 0.411 m"):
-        tiles("ign", of_preset("ign", "2000-2005", gsd_m=0.2))
-    old = tiles("ign", of_preset("ign", "1965-1980", gsd_m=1.0))
-    assert "STYLE=BDORTHOHISTORIQUE&FORMAT=image/png" in old.address(1, 1)
+        requested(tmp_path, "ign_wmts", of_preset("ign", "2000-2005", gsd_m=0.2))
+    old, _ = requested(tmp_path, "ign_wmts", of_preset("ign", "1965-1980", gsd_m=1.0))
+    assert (old.query["STYLE"], old.query["FORMAT"]) == ("BDORTHOHISTORIQUE", "image/png")
     with pytest.raises(FetchError, match="no style normal; available: BDORTHOHISTORIQUE"):
-        tiles("ign", of_preset("ign", "1965-1980", style="normal"))
+        requested(tmp_path, "ign_wmts", of_preset("ign", "1965-1980", style="normal"))
+    options = ImageryOptions(
+        layer="ORTHOIMAGERY.ORTHOPHOTOS2021", preferred_style="BDORTHOHISTORIQUE"
+    )
+    assert requested(tmp_path, "ign_wmts", options)[0].query["STYLE"] == "normal"
 
 
-def test_an_unknown_year_lists_the_available_ones():
+def test_an_unknown_year_lists_the_available_ones(tmp_path):
     words = "no layer ORTHOIMAGERY.ORTHOPHOTOS2020; available: .*ORTHOPHOTOS2021"
     with pytest.raises(FetchError, match=words):
-        tiles("ign", of_preset("ign", "2020"))
+        requested(tmp_path, "ign_wmts", of_preset("ign", "2020"))
     with pytest.raises(FetchError, match=r"ign has no '1999'; available: .*1950-1965.*2021"):
         presets()["ign"].layer("1999")
 
 
-def test_a_preferred_style_that_is_missing_is_ignored():
-    options = ImageryOptions(
-        layer="ORTHOIMAGERY.ORTHOPHOTOS2021", preferred_style="BDORTHOHISTORIQUE"
-    )
-    assert "STYLE=normal" in tiles("ign", options).address(1, 1)
+def test_pdok_by_templates_in_both_grids(tmp_path):
+    asked, _ = requested(tmp_path, "pdok_wmts", of_preset("pdok", "2022"))
+    row, col = web_tile("pdok", 18)
+    assert asked.path.endswith(f"/2022_ortho25/EPSG:3857/18/{col}/{row}.jpeg")
+    options = of_preset("pdok", "2022", crs="EPSG:28992", gsd_m=0.25)
+    national, estimate = requested(tmp_path, "pdok_wmts", options)
+    x, y = Transformer.from_crs(4326, 28992, always_xy=True).transform(*PLACES["pdok"])
+    row, col = int((903401.92 - y) / 0.21 / 256), int((x + 285401.92) / 0.21 / 256)
+    assert national.path.endswith(f"/2022_ortho25/EPSG:28992/14/{col}/{row}.jpeg")
+    assert estimate.gsd_m == pytest.approx(0.21, rel=1e-3)
 
 
-def test_pdok_by_templates_in_both_grids():
-    source = tiles("pdok", of_preset("pdok", "2022"))
-    assert source.address(7, 5) == (
-        "https://service.pdok.nl/hwh/luchtfotorgb/wmts/v1_0/2022_ortho25/EPSG:3857/18/5/7.jpeg"
-    )
-    national = tiles("pdok", of_preset("pdok", "2022", crs="EPSG:28992", gsd_m=0.25))
-    assert national.address(7, 5).endswith("/2022_ortho25/EPSG:28992/14/5/7.jpeg")
-    assert national.grid.res_x == pytest.approx(0.21, rel=1e-9)
-    assert national.grid.corner(0, 0) == (-285401.92, 903401.92)
+def test_swisstopo_by_time(tmp_path):
+    row, col = web_tile("swisstopo", 20)
+    options = of_preset("swissimage", "2021", gsd_m=0.12)
+    asked, _ = requested(tmp_path, "swisstopo_wmts", options, suffix="EPSG/3857/1.0.0/c.xml")
+    layer = "ch.swisstopo.swissimage"
+    assert asked.path == f"/1.0.0/{layer}-product/default/2021/3857/20/{col}/{row}.jpeg"
+    current, _ = requested(tmp_path, "swisstopo_wmts", of_preset("swissimage", None))
+    assert f"/{layer}/default/current/3857/" in current.path
+    words = "no time 1999; available: 2020, 2021, 2022, 2023, current"
+    with pytest.raises(FetchError, match=words):
+        requested(tmp_path, "swisstopo_wmts", of_preset("swissimage", "2021", time="1999"))
 
 
-def test_swisstopo_by_time_and_on_https():
-    where = "https://wmts.geo.admin.ch/EPSG/3857/1.0.0/WMTSCapabilities.xml"
-    source = tiles("swisstopo", of_preset("swissimage", "2021", gsd_m=0.12), where)
-    assert source.address(7, 5) == (
-        "https://wmts.geo.admin.ch/1.0.0/ch.swisstopo.swissimage-product/default/2021/3857/20/5/7.jpeg"
-    )
-    current = tiles("swisstopo", of_preset("swissimage", None), where)
-    assert "/ch.swisstopo.swissimage/default/current/3857/" in current.address(1, 1)
-    with pytest.raises(
-        FetchError, match="no time 1999; available: 2020, 2021, 2022, 2023, current"
-    ):
-        tiles("swisstopo", of_preset("swissimage", "2021", time="1999"), where)
+def test_basemap_rows_before_columns_and_rounded_scales(tmp_path):
+    asked, _ = requested(tmp_path, "basemap_wmts", of_preset("basemap-at", None, gsd_m=0.25))
+    row, col = web_tile("basemap", 19)
+    assert asked.path == f"/basemap/bmaporthofoto30cm/normal/google3857/19/{row}/{col}.jpeg"
+    half = np.pi * 6378137
+    with rasterio.open(tmp_path / "o.tif") as data:  # not 0.1 m off at Vienna
+        assert data.res[0] == 2 * half / 256 / 2**19
+        assert data.bounds.left == pytest.approx(col * 256 * data.res[0] - half, abs=1e-6)
 
 
-def test_basemap_rows_before_columns_and_rounded_scales():
-    source = tiles("basemap", of_preset("basemap-at", None, gsd_m=0.25))
-    assert source.address(7, 5) == (
-        "https://mapsneu.wien.gv.at/basemap/bmaporthofoto30cm/normal/google3857/19/7/5.jpeg"
-    )
-    assert source.grid.res_x == 2 * MERCATOR_HALF_M / 256 / 2**19  # not 0.1 m off at Vienna
-    assert source.grid.corner(0, 0) == (-MERCATOR_HALF_M, MERCATOR_HALF_M)
+def test_a_grid_in_degrees_has_the_latitude_first(tmp_path):
+    requested(tmp_path, "degrees_wmts", ImageryOptions(gsd_m=1.0))
+    lon, lat = PLACES["degrees"]
+    with rasterio.open(tmp_path / "o.tif") as data:
+        assert data.res[0] == pytest.approx(360 / 512 / 2**16, rel=1e-8)
+        assert data.bounds.left <= lon <= data.bounds.right
+        assert data.bounds.bottom <= lat <= data.bounds.top
+        assert ((data.bounds.left + 180) / data.res[0]) % 256 == pytest.approx(0, abs=1e-3)
 
 
-def test_a_grid_in_degrees_has_the_latitude_first():
-    source = tiles("degrees", ImageryOptions(gsd_m=1.0))
-    assert source.grid.corner(0, 0) == (-180.0, 90.0)
-    assert source.grid.res_x == pytest.approx(360 / 512 / 2**16, rel=1e-8)
+def test_ign_wms_in_lambert(tmp_path):
+    options = of_preset("ign-wms", "2021", gsd_m=0.5)
+    asked, _ = requested(tmp_path, "ign_wms", options, "wms", "wms-r/wms")
+    west, south, east, north = map(float, asked.query.pop("BBOX").split(","))
+    assert (east - west, north - south) == (512, 512) and west % 512 == south % 512 == 0
+    x, y = Transformer.from_crs(4326, 2154, always_xy=True).transform(*PLACES["ign"])
+    assert west <= x <= east and south <= y <= north
+    assert asked.path == "/wms-r/wms" and asked.query == {
+        "SERVICE": "WMS", "VERSION": "1.3.0", "REQUEST": "GetMap", "STYLES": "",
+        "LAYERS": "ORTHOIMAGERY.ORTHOPHOTOS2021", "CRS": "EPSG:2154", "WIDTH": "1024",
+        "HEIGHT": "1024", "FORMAT": "image/jpeg", "TRANSPARENT": "FALSE",
+    }  # fmt: skip
 
 
-def test_ign_wms_in_lambert():
-    url = "https://data.geopf.fr/wms-r/wms"
-    source = cells("ign_wms", url, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"])
-    assert source.address(-12891, 1367) == (
-        "https://data.geopf.fr/wms-r/wms?SERVICE=WMS&VERSION=1.3.0&REQUEST=GetMap"
-        "&LAYERS=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLES=&CRS=EPSG:2154&WIDTH=1024&HEIGHT=1024"
-        "&FORMAT=image/jpeg&TRANSPARENT=FALSE&BBOX=699904,6599680,700416,6600192"
-    )
-    degrees = of_preset("ign-wms", "2021", crs="EPSG:4326", format="image/png")
-    source = cells("ign_wms", url, degrees, PLACES["ign"])
-    south, west, _, _ = map(
-        float, source.address(*cell_at(source, 3.0, 46.5))[-80:].split("=")[-1].split(",")
-    )
-    assert west == pytest.approx(3.0, abs=0.01) and south == pytest.approx(46.5, abs=0.01)
-
-
-def cell_at(source, x, y):
-    grid = source.grid
-    col = np.floor((x - grid.west) / (grid.cell_w_px * grid.res_x))
-    row = np.floor((grid.north - y) / (grid.cell_h_px * grid.res_y))
-    return int(row), int(col)
-
-
-def test_an_old_wms_with_times():
-    url, place = "http://maps.example/wms", LocalFrame(51.5, 8.0)
+def test_an_old_wms_with_times(tmp_path):
     options = ImageryOptions(layer="ortho", time="2018", gsd_m=0.5)
-    source = cells("old_wms", url, options, place)
-    address = source.address(0, 0)
-    start = "http://maps.example/cgi?map=/srv/ortho.map&SERVICE=WMS&VERSION=1.1.1"
-    assert address.startswith(start)
-    assert "SRS=EPSG:25832" in address and "TIME=2018" in address
+    asked, _ = requested(tmp_path, "old_wms", options, "wms", "wms")
+    assert asked.query["MAP"] == "/srv/ortho.map" and asked.query["VERSION"] == "1.1.1"
+    assert asked.query["SRS"] == "EPSG:25832" and asked.query["TIME"] == "2018"
     with pytest.raises(FetchError, match="no time 2019; available: 2015, 2018, 2021"):
-        cells("old_wms", url, ImageryOptions(layer="ortho", time="2019"), place)
+        requested(tmp_path, "old_wms", ImageryOptions(layer="ortho", time="2019"), "wms", "wms")
 
 
-BOMB = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "bbbbbbbbbb"><!ENTITY c "&b;&b;&b;">]>
-<Capabilities version="1.0.0">&c;</Capabilities>"""
-OUTSIDE = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>
-<Capabilities version="1.0.0">&b;</Capabilities>"""
+NESTED = b"<Layer>" * 5000 + b"</Layer>" * 5000
 
 
 @pytest.mark.parametrize(
-    "body, words",
+    "protocol, body, words",
     [
-        (BOMB, "entities"),
-        (BOMB.decode().encode("utf-16"), "entities|not an XML"),
-        (OUTSIDE, "entities"),
-        (b"<html><p>no", "not an XML"),
-        (b"", "not an XML"),
+        ("wmts", b"<a/>", "lists no layer"),
+        ("wmts", b"<Capabilities version='1.0.0'>" + NESTED + b"</Capabilities>", "no layer"),
+        ("wms", b"<a/>", r"supported versions of WMS are 1\.1\.1 and 1\.3\.0"),
+        ("wms", b"<WMS_Capabilities version='2.0'/>", r"supported versions of WMS"),
+        ("wms", b"<WMS_Capabilities version='1.3.0'/>", "no address of GetMap"),
+        ("stac", b"{}", "no imagery of the area"),
     ],
 )
-def test_harmful_documents_are_rejected(body, words):
-    with pytest.raises(FetchError, match=words):
-        parse_xml(body)
-
-
-def refused(module, body, words):
-    opened = wms.wms_cells if module is wms else wmts.wmts_tiles
-    place = PLACES["ign"]
-    with answering(module, parse_xml(body)), pytest.raises(FetchError, match=words):
-        opened(CLIENT, *asked("", "http://a/b", ImageryOptions(), place))
-
-
-def test_a_deeply_nested_document_is_rejected():
-    layers = b"<Layer>" * 5000 + b"</Layer>" * 5000
-    body = b"<WMS_Capabilities version='1.3.0'>" + layers + b"</WMS_Capabilities>"
-    refused(wms, body, "cannot be read")
-    refused(wmts, b"<Capabilities version='1.0.0'>" + layers + b"</Capabilities>", "cannot be read")
-
-
-@pytest.mark.parametrize("body", [b"<a/>", b"<WMS_Capabilities version='2.0'/>"])
-def test_other_documents_are_rejected(body):
-    refused(wmts, body, "cannot be read|lists no layer")
-    refused(wms, body, r"supported versions of WMS are 1\.1\.1 and 1\.3\.0")
+def test_other_documents_are_rejected(tmp_path, protocol, body, words):
+    with servers.serving(lambda _: servers.Answer(body)) as server:
+        spec = SourceSpec(protocol, server.url, ImageryOptions(), Provenance("", ""))
+        area = Area.from_bounds(terrain.bounds(10))
+        with pytest.raises(FetchError, match=words):
+            estimate_fetch(FetchRequest(spec, area, tmp_path / "o.tif", limits=servers.QUICK))

@@ -7,8 +7,14 @@ import pytest
 
 from orthonav.core.errors import FetchError
 from orthonav.ground.fetch.options import ImageryOptions
-from orthonav.ground.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
-from orthonav.ground.fetch.sources import check_date, parse_source
+from orthonav.ground.fetch.presets import (
+    CURRENT,
+    PROTOCOLS,
+    check_date,
+    find_preset,
+    parse_source,
+    presets,
+)
 from orthonav.ground.fetch.urls import checked_url
 from orthonav.ground.imagery.datum import datum_of
 

@@ -72,13 +72,6 @@ def test_opendronemap_takes_accuracy_only_after_a_height(tmp_path):
     assert written(tmp_path, "odm-geo", None).splitlines()[1] == "a.jpg -2.25000000 48.50000000"
 
 
-def test_opendronemap_takes_no_names_with_spaces(tmp_path):
-    positions = camera_positions([result("a b.jpg", 1.0, 2.0)], None)
-    with pytest.raises(VariantError, match="spaces"):
-        export(tmp_path / "geo.txt", "odm-geo", positions)
-    assert not (tmp_path / "geo.txt").exists()
-
-
 def test_exiftool_gets_references_of_both_hemispheres(tmp_path):
     one, other = csv.DictReader(io.StringIO(written(tmp_path, "exif", hill)))
     assert one["SourceFile"] == "a.jpg"
@@ -92,11 +85,6 @@ def test_exiftool_gets_references_of_both_hemispheres(tmp_path):
 def test_an_unknown_export_is_refused(text):
     with pytest.raises(VariantError, match="odm-geo"):
         export_of(text)
-
-
-def test_an_export_is_a_format_and_a_path(tmp_path):
-    name, path = export_of(f"csv={tmp_path}/a=b.csv")
-    assert name == "csv" and path == tmp_path / "a=b.csv"
 
 
 def test_a_trajectory_for_evo(tmp_path):

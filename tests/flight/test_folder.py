@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.core.errors import CameraError, FlightError, MissingFileError, OutputError
+from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Prior, Telemetry
@@ -80,43 +80,11 @@ def test_round_trip(folder):
     assert truth == {"a.png": (46.5, 2.5), "b.jpg": (-46.12345679, 179.5), "c.tif": (0.0, 0.0)}
 
 
-def test_a_fisheye_round_trip(tmp_path):
-    fish = Camera(64, 48, 30.0, 30.0, 32.0, 24.0, (0.02, -0.01, 0.003, -0.001), "fisheye")
-    writer = FlightWriter(tmp_path, fish, "")
-    writer.add("a.png", rgb(), FULL, (0.0, 0.0))
-    writer.close()
-    assert json.loads((tmp_path / "flight.json").read_text())["camera"]["model"] == "fisheye"
-    assert open_flight(tmp_path).camera == fish
-
-
-def test_a_flight_without_truth(tmp_path):
-    writer = FlightWriter(tmp_path, CAMERA, "")
-    data = cv2.imencode(".png", scene())[1].tobytes()
-    writer.add_encoded("sub/a.png", data, FULL, None)
-    writer.close()
-    assert not (tmp_path / "truth.csv").exists()
-    (view,) = open_flight(tmp_path).views
-    assert np.array_equal(view.grey(), scene()) and view.where == str(view.path)
-
-
 def test_columns_that_no_view_needs_are_not_written(tmp_path):
     writer = FlightWriter(tmp_path, CAMERA, "")
     writer.add("a.png", rgb(), BARE, (0.0, 0.0))
     writer.close()
     assert (tmp_path / "telemetry.csv").read_text() == f"{HEADER}\na.png,2,nan,0,0,99.75\n"
-
-
-def test_an_image_of_no_known_kind_is_not_written(tmp_path):
-    with pytest.raises((OutputError, cv2.error)):
-        FlightWriter(tmp_path, CAMERA, "").add("a.xyz", rgb(), BARE, (0.0, 0.0))
-
-
-def test_images_come_back_as_grey_levels(folder):
-    grey = cv2.cvtColor(rgb(), cv2.COLOR_RGB2GRAY)
-    for name, off in (("a.png", 1), ("b.jpg", 12), ("c.tif", 1)):
-        read = read_image(folder / "frames" / name)
-        assert read.dtype == np.uint8 and read.shape == grey.shape
-        assert np.abs(read.astype(int) - grey).max() <= off
 
 
 def test_spreadsheets_are_read(folder):
@@ -128,24 +96,10 @@ def test_spreadsheets_are_read(folder):
     assert view.telemetry.missing() == ["pitch_deg", "roll_deg"]
 
 
-@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,92,3", "46,361,3", "46,2,inf"])
-def test_an_incomplete_prior_is_ignored(folder, values):
-    text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m,vel_east_mps\n{ROW},{values},1\n"
-    view = open_flight(telemetry(folder, text)).views[0]
-    assert view.telemetry.prior is None and view.telemetry.vel_en_mps is None
-
-
 def test_a_swapped_prior_is_named(folder):
     text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m\n{ROW},121.5,24,30\n"
     with pytest.raises(FlightError, match=r"line 2: prior .* seem to be swapped"):
         open_flight(telemetry(folder, text))
-
-
-def test_views_in_subfolders(folder):
-    (folder / "frames" / "left").mkdir()
-    (folder / "frames" / "a.png").rename(folder / "frames" / "left" / "a.png")
-    flight = open_flight(telemetry(folder, f"{HEADER}\nleft/{ROW}\n"))
-    assert read_image(flight.views[0].path).shape == (48, 64)
 
 
 @pytest.mark.parametrize(
@@ -178,11 +132,6 @@ def test_views_without_an_image(folder, frame):
     refused(telemetry(folder, text), "line 2 names an image that does not", names=f"frames/{frame}")
 
 
-def test_telemetry_in_another_encoding(folder):
-    (folder / "telemetry.csv").write_bytes(f"{HEADER}\né.png,1,0,0,0,9\n".encode("latin-1"))
-    refused(folder, "not a CSV file in UTF-8")
-
-
 @pytest.mark.parametrize("name", ["telemetry.csv", "flight.json"])
 def test_missing_files(folder, name):
     (folder / name).unlink()
@@ -196,11 +145,6 @@ def test_missing_folders(folder):
     refused(folder / "flight.json", "is a file, not a folder", MissingFileError, "")
     (folder / "frames").rename(folder / "pictures")
     refused(folder, "does not exist", names="frames/a.png")
-
-
-def test_huge_telemetry_is_refused(folder, monkeypatch):
-    monkeypatch.setattr("orthonav.core.flight.folder.MAX_TEXT_BYTES", 10)
-    refused(folder, "larger than")
 
 
 def camera(folder, **changes):
@@ -219,39 +163,18 @@ def test_a_camera_without_distortion_and_note(folder):
     assert flight.camera == replace(CAMERA, distortion=()) and flight.note == ""
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"width_px": 0},
-        {"height_px": 10**6},
-        {"fx_px": -5},
-        {"fy_px": math.nan},
-        {"cx_px": math.inf},
-        {"distortion": [1, 2, 3]},
-        {"distortion": [1, 2, 3, math.nan]},
-    ],
-    ids=str,
-)
-def test_cameras_that_cannot_be(folder, changes):
-    refused(camera(folder, **changes), "camera", CameraError, "flight.json")
+IMPOSSIBLE = [{"width_px": 0}, {"height_px": 10**6}, {"fx_px": -5}, {"fy_px": math.nan}]
+IMPOSSIBLE += [{"cx_px": math.inf}, {"distortion": [1, 2, 3]}, {"distortion": [1, 2, 3, math.nan]}]
+NO_NUMBERS = [{"width_px": None}, {"width_px": math.inf}, {"fx_px": "wide"}, {"fx_px": 10**400}]
+NO_NUMBERS += [{"distortion": bad} for bad in (None, "1234", {"k1": 0}, [[0], 0, 0, 0])]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"width_px": None},
-        {"width_px": math.inf},
-        {"fx_px": "wide"},
-        {"fx_px": 10**400},
-        {"distortion": None},
-        {"distortion": "1234"},
-        {"distortion": {"k1": 0}},
-        {"distortion": [[0], 0, 0, 0]},
-    ],
-    ids=lambda changes: str(changes)[:30],
-)
+@pytest.mark.parametrize("changes", IMPOSSIBLE + NO_NUMBERS, ids=lambda each: str(each)[:30])
 def test_invalid_cameras_are_rejected(folder, changes):
-    refused(camera(folder, **changes), "expected {camera", names="flight.json")
+    error, message = CameraError, "camera"
+    if changes in NO_NUMBERS:
+        error, message = FlightError, "expected {camera"
+    refused(camera(folder, **changes), message, error, "flight.json")
 
 
 @pytest.mark.parametrize("text", ["", "{", "null", "5", "[]", "{}", '{"camera": 5}', "[" * 10**5])
@@ -291,14 +214,6 @@ def unreadable(path, content, message="cannot be decoded|was cut short"):
     with pytest.raises(FlightError, match=message) as caught:
         read_image(path)
     assert str(caught.value).endswith(str(path))
-
-
-def test_what_is_no_image(tmp_path):
-    path = tmp_path / "a.jpg"
-    with pytest.raises(MissingFileError, match="image of the flight does not exist"):
-        read_image(path)
-    for content in (b"", b"\xff\xd8", b"\xff\xd8\xff\xe0", b"not an image", bytes(1000)):
-        unreadable(path, content)
 
 
 PROGRESSIVE = (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
@@ -368,3 +283,10 @@ def test_every_depth_and_kind_becomes_8_bit_grey(tmp_path):
         read = read_image(tmp_path / name)
         assert read.dtype == np.uint8 and read.shape == grey.shape, name
         assert np.abs(read.astype(int) - expected).max() <= (15 if "JPEG" in name else 1), name
+
+
+@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,92,3", "46,361,3", "46,2,inf"])
+def test_an_incomplete_prior_is_ignored(folder, values):
+    text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m,vel_east_mps\n{ROW},{values},1\n"
+    view = open_flight(telemetry(folder, text)).views[0]
+    assert view.telemetry.prior is None and view.telemetry.vel_en_mps is None

@@ -2,7 +2,7 @@
 
 import pytest
 
-from orthonav.core.errors import FlightError, MissingFileError
+from orthonav.core.errors import FlightError
 from orthonav.core.flight.gnss import GnssSample, read_gnss, write_gnss
 
 S = 10**9
@@ -20,13 +20,6 @@ def test_what_is_written_is_read(tmp_path):
     assert read[1].satellites == -1 and read[1].stamp_ns is None and read[1].time_ns == 11 * S
 
 
-def test_optional_columns_may_be_missing(tmp_path):
-    path = tmp_path / "gnss.csv"
-    path.write_text(HEAD + "1.5,48,2,3\n")
-    (sample,) = read_gnss(path)
-    assert (sample.time_ns, sample.lat_deg, sample.receiver) == (1_500_000_000, 48.0, 0)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -41,8 +34,3 @@ def test_broken_files_are_named(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(FlightError, match=message):
         read_gnss(path)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(MissingFileError, match=r"gnss\.csv"):
-        read_gnss(tmp_path / "gnss.csv")

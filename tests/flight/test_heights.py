@@ -1,5 +1,6 @@
 """Heights above ground from heights above sea, take-off and the ellipsoid."""
 
+import logging
 import math
 import re
 
@@ -10,6 +11,7 @@ from orthonav.core.flight.heights import (
     MISMATCH_M,
     FlownHeights,
     GroundHeights,
+    TerrainFit,
     assumed_heights,
     is_measured,
 )
@@ -78,15 +80,6 @@ def test_no_height_is_taken_for_another(heights):
     )
 
 
-def test_spread_of_the_ground_widens_the_height():
-    over = GroundHeights(terrain, Ground(320.0, 4.0, 1.0))
-    below = Ground(400.0, 3.0, 1.0)
-    found = over.above(reported(home_m=250.0, agl_std_m=12.0), below, place(0, 0))
-    assert found.agl_std_m == pytest.approx(13.0)
-    found = over.above(reported(amsl_m=700.0), below, place(0, 0))
-    assert found.agl_std_m == pytest.approx(math.hypot(0.08 * 300, 3))
-
-
 def test_the_ground_around_a_place():
     exact = ground_around(terrain, place(0, 500), 0.0)
     assert (exact.height_m, exact.std_m, exact.known) == pytest.approx((350, 0, 1))
@@ -122,14 +115,6 @@ def test_a_flight_uses_its_prior_and_its_last_confident_fix():
     assert far.agl_std_m > 5 * found.agl_std_m  # a place ages
 
 
-def test_a_velocity_moves_the_last_place():
-    heights = flown()
-    heights.observe(0, fix(0, -1000), None)
-    found = heights.corrected(reported(20.0, amsl_m=700.0, vel_en_mps=(0.0, 50.0)))
-    assert found.agl_m == pytest.approx(400, abs=0.5)  # 1 km farther north
-    assert found.agl_std_m == pytest.approx(math.hypot(32, SLOPE * (5 + 300)), rel=0.02)
-
-
 @pytest.mark.parametrize(
     "outcome, state",
     [
@@ -143,15 +128,6 @@ def test_doubtful_positions_say_nothing_about_the_ground(outcome, state):
     heights = flown()
     heights.observe(0, outcome, state)
     assert heights.corrected(reported(amsl_m=700.0)).agl_m == pytest.approx(400, abs=0.1)
-
-
-def test_a_place_of_long_ago_or_of_a_wide_prior_is_unknown():
-    heights = flown()
-    heights.observe(0, fix(0, 1000), None)
-    wide = Prior(*place(0, 1500), 1e6)
-    for time_s in (1e3, 1e9):
-        found = heights.corrected(reported(time_s, amsl_m=700.0, prior=wide))
-        assert found.agl_m == pytest.approx(400, abs=1)
 
 
 def test_a_track_that_is_lost_forgets_its_place():
@@ -201,7 +177,62 @@ def test_what_is_assumed_is_said(telemetry, terrain_name, words):
     assert is_measured(telemetry) == (telemetry.agl_m == 100.0 and telemetry.home_m != 100.0)
 
 
-def test_level_ground_is_not_assumed_where_the_terrain_has_no_height():
-    heights = FlownHeights(lambda lat, lon: np.full(lat.shape, np.nan), area())
-    assert math.isnan(heights.corrected(reported(agl_m=100.0, home_m=100.0)).agl_m)
-    assert heights.corrected(reported(agl_m=90.0, home_m=100.0)).agl_m == 90.0  # measured
+def test_a_velocity_moves_the_last_place():
+    heights = flown()
+    heights.observe(0, fix(0, -1000), None)
+    found = heights.corrected(reported(20.0, amsl_m=700.0, vel_en_mps=(0.0, 50.0)))
+    assert found.agl_m == pytest.approx(400, abs=0.5)  # 1 km farther north
+    assert found.agl_std_m == pytest.approx(math.hypot(32, SLOPE * (5 + 300)), rel=0.02)
+
+
+def hills(shift_deg=0.0, more_m=0.0, hole=False):
+    def heights(lat, lon):
+        made = 200 + 30 * np.sin((np.asarray(lon) + shift_deg) * 1200) + more_m
+        return np.where(np.asarray(lon) > 2.01, np.nan, made) if hole else made
+
+    return heights
+
+
+def said_of(terrain, caplog, baro_m=10.0):
+    rng = np.random.default_rng(3)
+    fit = TerrainFit(terrain)
+    with caplog.at_level(logging.WARNING):
+        for lon in np.linspace(2.0, 2.02, 60):
+            agl_m = 450.0 - float(hills()(47.0, lon))
+            found_m = agl_m * (1 + float(rng.normal(0, 0.01)))
+            fix = Fix(47.0, float(lon), np.eye(2), 0.99, 15.0, 0.0, found_m, {})
+            fit.take(fix, 450.0 + baro_m)
+    return [record.getMessage() for record in caplog.records]
+
+
+def test_a_terrain_that_fits_is_not_named(caplog):
+    assert said_of(hills(), caplog) == []
+
+
+@pytest.mark.parametrize(
+    ("terrain", "named"),
+    [
+        (hills(more_m=50.0), "m higher than reported over this terrain: check its vertical datum"),
+        (hills(shift_deg=0.0015), "it may be displaced"),
+        (hills(hole=True), "the terrain has no height below"),
+    ],
+)
+def test_what_does_not_fit_is_named_once(terrain, named, caplog):
+    said = said_of(terrain, caplog)
+    assert len(said) == 1 and named in said[0]
+
+
+def test_a_long_flight_is_judged_by_its_latest_views(caplog, monkeypatch):
+    """A wrong datum is named once most of them lie on the part of the terrain that has it."""
+    monkeypatch.setattr("orthonav.core.flight.heights.MAX_VIEWS", 40)
+
+    def joined(lat, lon):
+        return np.where(np.asarray(lon) < 2.005, 200.0, 260.0)
+
+    fit = TerrainFit(joined)
+    for number in range(240):
+        if number == 200:
+            assert caplog.records == []
+        lon = 2.0 if number < 200 else 2.01
+        fit.take(Fix(47.0, lon, np.eye(2), 0.99, 15.0, 0.0, 250.0, {}), 450.0)
+    assert "m higher than reported" in caplog.records[0].getMessage()

@@ -1,17 +1,13 @@
 """A mount is written, read again, and removed from telemetry."""
 
-import json
 import math
-from functools import partial
-from types import SimpleNamespace
 
 import pytest
 
-from orthonav.core.errors import FlightError, MissingFileError
-from orthonav.core.flight.mount import Bias, Mount, MountedFlight, read_mount, write_mount
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.mount import Bias, Mount, read_mount, write_mount
 from orthonav.core.records import Telemetry
 
-Recorded = partial(SimpleNamespace, camera="camera", note="note", expected=1)
 MOUNT = Mount(
     Bias(4.0, 0.5, 1.0), Bias(-0.1, 0.01, 0.02), Bias(6.5, 0.3, 0.7), Bias(-1.25, 0.4, 0.5), 17
 )
@@ -30,11 +26,6 @@ def test_reported_values_are_corrected():
     assert (found.time_ns, found.vel_en_mps) == (5, (1.0, 2.0))
     of_mount = max(MOUNT.pitch_deg.std, MOUNT.roll_deg.std)
     assert found.tilt_std_deg == pytest.approx(math.hypot(0.5, of_mount))
-
-
-def test_unknown_values_stay_unknown():
-    found = MOUNT.corrected(Telemetry(0, math.nan, 0.0, 0.0, math.nan))
-    assert found.missing() == ["yaw_deg", "agl_m"]
 
 
 BROKEN = {
@@ -57,32 +48,3 @@ def test_broken_files_are_refused(tmp_path, how):
     path.write_text(BROKEN[how](path.read_text()))
     with pytest.raises(FlightError, match="mount file"):
         read_mount(path)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(MissingFileError, match=r"mount file .*none\.json"):
-        read_mount(tmp_path / "none.json")
-
-
-def test_the_file_can_be_read_by_people(tmp_path):
-    write_mount(tmp_path / "mount.json", MOUNT)
-    plain = json.loads((tmp_path / "mount.json").read_text())
-    assert plain["pitch_deg"] == {"value": 6.5, "std": 0.3, "scatter": 0.7}
-    assert plain["views"] == 17
-
-
-def test_a_missing_field_is_named(tmp_path):
-    path = tmp_path / "mount.json"
-    path.write_text('{"camera": 1}')
-    with pytest.raises(FlightError, match="orthonav_mount is missing"):
-        read_mount(path)
-
-
-def test_a_flight_is_seen_without_the_errors_of_its_mount():
-    flight = Recorded(
-        views=(SimpleNamespace(frame="1.png", telemetry=Telemetry(5, 1.0, 2.0, 0.0, 9.0)),)
-    )
-    mounted = MountedFlight(flight, MOUNT)
-    (view,) = mounted.views
-    assert view.frame == "1.png" and view.telemetry.pitch_deg == 8.5
-    assert (mounted.camera, mounted.note, mounted.expected) == ("camera", "note", 1)

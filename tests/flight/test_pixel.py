@@ -57,22 +57,6 @@ def test_on_a_slope_it_is_where_the_line_of_sight_meets_it(px):
     assert found.height_m == pytest.approx(100 + 0.3 * direction[0] * drop, abs=0.02)
 
 
-def test_a_hill_in_front_hides_what_is_behind():
-    def ridge(lat_deg, lon_deg):
-        east = FRAME.en_from_latlon(lat_deg, lon_deg)[..., 0]
-        return np.where((east > 60) & (east < 80), 100.0, 0.0)
-
-    found = locate_pixel(CAMERA, telemetry(), fix(heading_deg=0.0), (620, 240), ridge)
-    assert en_of(found)[0] == pytest.approx(60.0, abs=2.0)  # 120 m on level ground
-
-
-def test_biases_of_a_track_count():
-    tracked = {"pitch_bias_deg": 2.0, "heading_bias_std_deg": 0.5}
-    found = locate_pixel(CAMERA, telemetry(1.0), fix(evidence=tracked), (10, 20))
-    same = locate_pixel(CAMERA, telemetry(3.0), fix(), (10, 20))
-    np.testing.assert_allclose(en_of(found), en_of(same), atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("px", "tilt_deg"),
     [
@@ -176,3 +160,12 @@ def test_a_fix_that_states_its_camera_moves_a_pixel_by_all_six(px):
     # Less is known of the camera's place than of the ground, most of all in the middle.
     share = 0.05 if px == (320, 240) else 0.5
     assert np.trace(found.cov_en_m2) < share * np.trace(covariance[:2, :2])
+
+
+def test_a_hill_in_front_hides_what_is_behind():
+    def ridge(lat_deg, lon_deg):
+        east = FRAME.en_from_latlon(lat_deg, lon_deg)[..., 0]
+        return np.where((east > 60) & (east < 80), 100.0, 0.0)
+
+    found = locate_pixel(CAMERA, telemetry(), fix(heading_deg=0.0), (620, 240), ridge)
+    assert en_of(found)[0] == pytest.approx(60.0, abs=2.0)  # 120 m on level ground

@@ -108,23 +108,6 @@ def test_colour_of_every_kind_is_the_same_picture(tmp_path, make):
     assert off.max() <= (8 if make is jpeg_ycbcr else 3)
 
 
-def grey(path):
-    return write(path, SCENE[:1])
-
-
-def two_bands(path):
-    return write(path, SCENE[:2])
-
-
-@pytest.mark.parametrize("make", [grey, two_bands])
-def test_grey_fills_all_three(tmp_path, make):
-    pixels = read(make(tmp_path / "ortho.tif"))
-    for band in range(3):
-        off = np.abs(pixels.rgb[INNER][..., band].astype(int) - SCENE[0][INNER])
-        assert off.max() <= 3
-    assert np.abs(pixels.grey[INNER].astype(int) - SCENE[0][INNER]).max() <= 3
-
-
 @pytest.mark.parametrize(
     "dtype, scale, offset",
     [("uint16", 16, 100), ("int16", 20, -3000), ("float32", 1 / 255, 0), ("float64", 1e4, -7e5)],
@@ -304,25 +287,6 @@ def test_colours_beside_a_hole_are_not_mixed_with_it(tmp_path, make):
     assert rim.sum() > 100 and off.max() <= 30
 
 
-@pytest.mark.parametrize("make", HOLED)
-@pytest.mark.parametrize("coarser", [2, 5])
-def test_thinning_keeps_the_holes(tmp_path, make, coarser):
-    pixels = read(make(tmp_path / "ortho.tif"), SIZE // coarser, gsd_m=coarser)
-    share = HOLE.reshape(SIZE // coarser, coarser, -1, coarser).mean(axis=(1, 3))
-    inner = np.s_[2:-2, 2:-2]
-    assert not pixels.valid[share == 1].any()
-    assert pixels.valid[inner][~binary_dilation(share > 0, iterations=2)[inner]].all()
-    assert not pixels.rgb[~pixels.valid].any()
-
-
-def test_outside_the_imagery_is_not_valid_and_black(tmp_path):
-    pixels = read(rgb(tmp_path / "ortho.tif"), 2 * SIZE)
-    inside = np.s_[SIZE // 2 + 2 : -SIZE // 2 - 2]
-    assert pixels.valid[inside, inside].all()
-    assert pixels.valid.sum() == pytest.approx(SIZE**2, rel=0.04)
-    assert not pixels.rgb[~pixels.valid].any() and not pixels.grey[~pixels.valid].any()
-
-
 def shifted(path, cols, level, **more):
     bands = np.full((3, SIZE, SIZE), level, np.uint8)
     return write(path, bands, transform=placed() * Affine.translation(cols, 0), **more)
@@ -355,18 +319,6 @@ def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
     clear = ~binary_dilation(HOLE, iterations=3)[INNER]
     off = np.abs(pixels.rgb[INNER].astype(int) - SCENE.transpose(1, 2, 0)[INNER])
     assert off[clear].max() <= 3
-
-
-def test_more_files_than_may_be_open(tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.ground.imagery.raster.MAX_OPEN", 2)
-    paths = []
-    for index in range(5):
-        strip = np.full((3, 24, SIZE), 50 * index, np.uint8)
-        transform = placed() * Affine.translation(0, 24 * index)
-        paths.append(write(tmp_path / f"{index}.tif", strip, transform=transform))
-    pixels = read(paths)
-    assert (pixels.rgb[12::24, 4:-4, 0] == np.arange(0, 250, 50)[:, None]).all()
-    assert pixels.valid[INNER].all()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Many orthophotos that lie side by side are one picture: no seam shows where they meet."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import rasterio
@@ -9,10 +7,7 @@ from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from rasterio.transform import Affine
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery.lattice import CellCache
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.imagery.quiet import quiet
-from orthonav.ground.imagery.thin import cells_of
 
 BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
 
@@ -158,31 +153,6 @@ def test_what_is_named_first_covers_what_it_shares_a_lattice_with(tmp_path):
     assert (pixels.rgb[10:-10, 3:8] == 150).all()
 
 
-def test_8_and_16_bit_are_mixed(tmp_path, caplog):
-    scene = smooth_scene()
-    shallow = write(tmp_path / "a.tif", scene, transform=placed() * Affine.translation(-60, 0))
-    deep = (scene.astype(np.uint16) - 30) * 300
-    paths = [
-        shallow,
-        write(tmp_path / "b.tif", deep, transform=placed() * Affine.translation(60, 0)),
-    ]
-    mosaic = Mosaic.open(paths)
-    assert mosaic.stretches[0] is None and mosaic.stretches[1] == mosaic.stretch is not None
-    assert "8 bits separately" in caplog.text
-    pixels = read(paths, 100)
-    assert pixels.valid[2:-2, 2:-2].all()
-    assert pixels.rgb[:, :45].std() > 20 and pixels.rgb[:, -45:].std() > 20
-
-
-def test_grey_is_that_of_the_colours(tmp_path):
-    size = 260
-    path = write(tmp_path / "a.tif", smooth_scene(size), transform=placed(gsd_m=0.5, size=size))
-    with sheet_of(path, 100) as sheet:
-        colour, grey = sheet.read(0, 0, 100, 100), sheet.read_grey(0, 0, 100, 100)
-    assert np.abs(colour.grey.astype(int) - grey.grey).max() <= 1
-    np.testing.assert_array_equal(colour.valid, grey.valid)
-
-
 def test_files_that_a_window_depends_on(tmp_path):
     paths = cut(tmp_path, smooth_scene(120), placed(), 30)
     with sheet_of(paths, 100) as sheet:
@@ -191,43 +161,14 @@ def test_files_that_a_window_depends_on(tmp_path):
         assert len(sheet.stamps(0, 0, 100, 100)) == 16 and not sheet.stamps(300, 0, 10, 10)
 
 
-def test_hidden_files_are_not_read_and_shared_ones_once(tmp_path, monkeypatch):
-    """Two years of the same tiles, read by two threads."""
-    transform, counted = placed(size=120), []
+def test_files_that_others_hide_are_not_read(tmp_path):
+    """Two years of the same tiles."""
     for year in ("2021", "2015"):
-        cut(tmp_path / year, smooth_scene(120), transform, 30)
-
-    def counting(dataset, source, *arguments):
-        counted.append(source.path)
-        return cells_of(dataset, source, *arguments)
-
-    monkeypatch.setattr("orthonav.ground.imagery.lattice.cells_of", counting)
+        older = cut(tmp_path / year, smooth_scene(120), placed(size=120), 30)
     mosaic = Mosaic.open([tmp_path / "2021", tmp_path / "2015"])
-    place = {"west_m": -45, "north_m": 45, "width_px": 90, "height_px": 90, "gsd_m": 1.0}
-
-    def read(col):
-        with mosaic.sheet(FRAME, **place, threads=1) as sheet:
-            return [sheet.read(col, row, 45, 30).valid.all() for row in (0, 30, 60)]
-
-    with quiet(), ThreadPoolExecutor(2) as pool:
-        assert all(all(each) for each in pool.map(read, [0, 45]))
-    assert len(counted) == len(set(counted)) == 16
-    assert {path.parent.name for path in counted} == {"2021"}
-
-
-def test_the_cache_has_a_limit():
-    kept, reads = CellCache(limit_bytes=25_000), []
-
-    def reader(number):
-        def read():
-            reads.append(number)
-            return np.zeros((3, 40, 40), np.uint8), np.zeros((40, 40), np.float32)
-
-        return read
-
-    for number in (1, 2, 1, 3, 1, 2):
-        kept.get((number, 1), reader(number))
-    assert reads == [1, 2, 3, 2]
-    kept.begin((2, 1), reader(2))
-    kept.begin((9, 1), reader(9))
-    assert reads == [1, 2, 3, 2, 9]
+    for path in older:
+        path.unlink()
+    with mosaic.sheet(
+        FRAME, west_m=-45, north_m=45, width_px=90, height_px=90, gsd_m=1.0, threads=1
+    ) as sheet:
+        assert sheet.read(0, 0, 90, 90).valid.all()

@@ -4,6 +4,7 @@ The views are rendered by code that shares nothing with the program.
 """
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.registered import Chances, RegisteredConfidence
+from orthonav.core.localize.confidence import Chances, RegisteredConfidence
+from orthonav.core.localize.policy import DEFAULT_PLAN
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.calibrate_registration import RegistrationCalibration
+from orthonav.ground.build.calibrate import RegistrationCalibration
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 
@@ -25,6 +27,15 @@ SIDE_M = 620
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 AGL_M = 150.0
 FINEST_M = 0.5
+
+
+def planned(**changes):
+    """The usual plan of a search with other values of its policy, its costs or its options."""
+    parts = {"policy": DEFAULT_PLAN.policy, "costs": DEFAULT_PLAN.costs}
+    for name, part in parts.items():
+        own = [key for key in changes if hasattr(part, key)]
+        parts[name] = replace(part, **{key: changes.pop(key) for key in own})
+    return replace(DEFAULT_PLAN, **parts, **changes)
 
 
 class Ground:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.core.localize.propose import peak_poses
+from orthonav.core.localize.tiles import peak_poses
 from orthonav.core.register.search import bank
 
 STEP_RAD, SCALE_STEP = math.radians(8.0), 0.13
@@ -22,7 +22,7 @@ def scores_around(poses, turn_rad, log_scale):
 @pytest.mark.parametrize("turn_deg, log_scale", [(0.0, 0.0), (3.1, -0.05), (-2.5, 0.06)])
 def test_a_pose_lies_between_those_that_were_tried(turn_std_rad, turn_deg, log_scale):
     made = bank(turn_std_rad, 0.1, turn_step_rad=STEP_RAD, scale_step=SCALE_STEP, sigmas=3.0)
-    poses = np.array(made.poses)
+    poses = np.array(made)
     scores = scores_around(poses, math.radians(turn_deg), log_scale)
     found, first = peak_poses(
         poses, np.stack([scores, scores_around(poses, 0.0, 0.0)]), np.ones(len(poses), np.float32)
@@ -36,11 +36,3 @@ def test_at_the_rim_of_what_was_tried_it_is_the_pose_tried():
     poses = np.array([(0.0, 0.0), (STEP_RAD, 0.0)])
     assert not peak_poses(poses, np.float32([[1.0, 0.9]]), np.ones(2, np.float32)).any()
     assert not peak_poses(poses[:1], np.float32([[0.5]]), np.ones(1, np.float32)).any()
-
-
-def test_the_telemetry_decides_between_poses_that_are_about_as_similar():
-    poses = np.array([(turn * STEP_RAD, 0.0) for turn in (-2, -1, 0, 1, 2)])
-    scores = np.float32([[0.70, 0.72, 0.60, 0.71, 0.65]])
-    weights = np.float32([0.6, 0.8, 1.0, 0.95, 0.8])
-    assert peak_poses(poses, scores, np.ones(5, np.float32))[0, 0] < 0
-    assert peak_poses(poses, scores, weights)[0, 0] > 0.5 * STEP_RAD

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
+from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, planned, rendered
 
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.plan import DEFAULT_PLAN
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
@@ -176,20 +175,6 @@ def test_the_scale_is_known_place_by_place(opened, grey):
         assert fix.agl_m == pytest.approx(agl_m, rel=0.01)
 
 
-@pytest.mark.parametrize("pitch_deg", [50.0, 60.0])
-def test_views_far_off_nadir_over_level_ground(opened, pitch_deg):
-    attitude = (20.0, pitch_deg, 4.0)
-    place = np.array([-60.0, -150.0])
-    picture = rendered(GROUND, place, attitude, 100.0)
-    localizer = Localizer(opened)
-    fix = localizer.locate(View(picture, CAMERA, telemetry((22.0, *attitude[1:]), 102.0)))
-    assert error_m(localizer, fix, place) < 2.0 and fix.confidence > 0.9
-    assert fix.agl_m == pytest.approx(100.0, rel=0.02)
-    assert "terrain_gain" not in fix.evidence
-    seen = localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg) - place
-    assert np.hypot(*seen) == pytest.approx(100 * math.tan(math.radians(pitch_deg)), rel=0.05)
-
-
 def test_level_ground_is_as_without_a_terrain(opened):
     """Views of a map whose terrain is level are placed as on a map without one."""
     picture = rendered(GROUND, PLACE, ATTITUDE)
@@ -200,14 +185,6 @@ def test_level_ground_is_as_without_a_terrain(opened):
     np.testing.assert_allclose(fix.pose_cov, level.pose_cov, rtol=1e-3, atol=1e-6)
     evidence = {**level.evidence, "terrain_gain": 1.0}
     assert {**fix.evidence} == pytest.approx(evidence, rel=1e-3, abs=1e-3, nan_ok=True)
-
-
-def test_candidates_on_maps_without_a_terrain_are_placed_once(opened, monkeypatch):
-    """Up to 45 deg off nadir."""
-    monkeypatch.delattr("orthonav.core.localize.registration.ViewOverRelief")
-    picture = rendered(GROUND, np.zeros(2), (30.0, 44.0, 0.0))
-    fix = Localizer(opened).locate(View(picture, CAMERA, telemetry((30.0, 44.0, 0.0))))
-    assert "terrain_gain" not in fix.evidence
 
 
 def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
@@ -221,7 +198,7 @@ def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
 
 def looking(opened, relief, **changes):
     """A localizer to which every further search is dear."""
-    plan = replace(DEFAULT_PLAN, **{"cheap_ms": 0.0, "terrain_trial_ms": 0.0} | changes)
+    plan = planned(**{"cheap_ms": 0.0, "terrain_trial_ms": 0.0} | changes)
     localizer = Localizer(opened, plan=plan)
     localizer.registration.relief = Relief(Terrain(relief), localizer.grid)
     return localizer

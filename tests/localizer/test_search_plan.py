@@ -1,23 +1,40 @@
 """Which searches are run for a view, in which order."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
-from orthonav.core.localize import plan
-from orthonav.core.localize.plan import DEFAULT_PLAN, Budget
-from orthonav.core.register.registrar import Levels, PosePrior
+from orthonav.core.localize import policy
+from orthonav.core.localize.policy import DEFAULT_PLAN, Budget
+from orthonav.core.localize.search import Search
+from orthonav.core.register.pose import PosePrior
+from orthonav.core.register.template import Levels
 
 LEVELS = Levels(2, 1, 0)
+POLICY = DEFAULT_PLAN.policy
 TRACKED = PosePrior(0.5, math.radians(2.0), 0.03)
 
 
-def levels_of(prior, pose_ms, levels=LEVELS):
-    """Levels of the searches for a view where a pose at a level costs `pose_ms[level]`."""
-    searches = DEFAULT_PLAN.searches(
-        levels, prior, lambda level, poses: poses * pose_ms[level], lambda: (0, 0)
-    )
-    return [each.level for each in searches]
+class Priced(Search):
+    """A search where a pose at a level costs `pose_ms[level]`."""
+
+    def __init__(self, prior, pose_ms, tiles=0, levels=LEVELS):
+        self.policy, self.costs, self.levels, self.tiles = POLICY, DEFAULT_PLAN.costs, levels, tiles
+        self.view = SimpleNamespace(prior=prior)
+        self.sheet = SimpleNamespace(propose=SimpleNamespace(embedder=SimpleNamespace(dims=128)))
+        self._pose_ms = pose_ms
+
+    def fft_ms(self, level, poses):
+        return poses * self._pose_ms[level]
+
+
+def steps(*given, **more):
+    return list(Priced(*given, **more).steps())
+
+
+def levels_of(*given, **more):
+    return [each.level for each in steps(*given, **more)]
 
 
 def test_the_final_level_comes_last_where_it_is_cheap():
@@ -31,54 +48,31 @@ def test_the_final_level_is_left_out_where_it_is_dear():
 
 
 def test_a_small_view_is_finished_where_it_is_judged():
-    assert set(levels_of(TRACKED, (0.1, 0.1), Levels(1, 0, 0))) == {0}
-    searches = list(
-        DEFAULT_PLAN.searches(
-            Levels(1, 0, 0), TRACKED, lambda _, poses: 0.1 * poses, lambda: (0, 0)
-        )
-    )
-    assert {each.candidates for each in searches} == {DEFAULT_PLAN.stage_candidates}
+    made = steps(TRACKED, (0.1, 0.1), levels=Levels(1, 0, 0))
+    assert {(each.level, each.count) for each in made} == {(0, POLICY.candidates)}
 
 
 def test_where_the_coarse_level_takes_too_long_the_level_above_is_searched():
     pose_ms = {3: 1.0, 2: 1e3, 1: 1e4, 0: 1e5}
-    (search,) = DEFAULT_PLAN.searches(
-        LEVELS, TRACKED, lambda level, poses: poses * pose_ms[level], lambda: (0, 0)
-    )
-    assert search.level == 3 and search.candidates == DEFAULT_PLAN.far_candidates
+    (step,) = steps(TRACKED, pose_ms)
+    assert step.level == 3 and step.count == POLICY.far_candidates
     pose_ms[3] = math.inf  # there is no such level
-    (search,) = DEFAULT_PLAN.searches(
-        LEVELS, TRACKED, lambda level, poses: poses * pose_ms[level], lambda: (0, 0)
-    )
-    assert search.level == LEVELS.coarse  # the first search is run whatever it costs
+    assert levels_of(TRACKED, pose_ms) == [LEVELS.coarse]  # the first is run whatever it costs
 
 
 @pytest.mark.parametrize("tiles", [0, 1000])
 def test_with_an_unknown_heading_the_likely_scales_come_first(tiles):
     """All poses are tried in the end, each once, at their share of the cost."""
-    prior, pose_ms = PosePrior(None, math.pi, 0.1), (1e3, 20.0, math.inf if tiles else 0.1)
-    searches = list(
-        DEFAULT_PLAN.searches(
-            LEVELS,
-            prior,
-            lambda level, poses: poses * (*pose_ms, math.inf)[level],
-            lambda: (tiles, 128),
-        )
-    )
-    first, rest = (each for each in searches if each.level == LEVELS.coarse)
+    pose_ms = 1e3, 20.0, math.inf if tiles else 0.1, math.inf
+    made = steps(PosePrior(None, math.pi, 0.1), pose_ms, tiles)
+    first, rest = (each for each in made if each.level == LEVELS.coarse)
     assert first.from_tiles == rest.from_tiles == bool(tiles)
-    turns = {turn for turn, _ in first.poses}
-    assert turns == {turn for turn, _ in rest.poses} and len(turns) == 45
-    scales = [sorted({scale for _, scale in each.poses}) for each in (first, rest)]
+    turns = {turn for turn, _ in first.directions}
+    assert turns == {turn for turn, _ in rest.directions} and len(turns) == 45
+    scales = [sorted({scale for _, scale in each.directions}) for each in (first, rest)]
     assert scales[0] == pytest.approx([-0.13, 0.0, 0.13]) and len(scales[1]) == 2
-    assert len(first.poses) + len(rest.poses) == 45 * 5
+    assert len(first.directions) + len(rest.directions) == 45 * 5
     assert first.cost_ms / rest.cost_ms == pytest.approx(3 / 2)
-
-
-def test_with_a_known_heading_the_coarse_level_is_searched_at_once():
-    prior, pose_ms = PosePrior(0.5, math.radians(10.0), 0.1), (1e3, 20.0, 0.1)
-    levels = levels_of(prior, pose_ms)
-    assert levels.count(LEVELS.coarse) == 1
 
 
 @pytest.mark.parametrize(
@@ -94,27 +88,20 @@ def test_the_last_stage_is_left_out_where_it_is_dear_and_was_tried_at_the_coarse
     pose_ms, tiles, coarse_ms, left_out
 ):
     prior = PosePrior(0.5, math.radians(10.0), 0.1)
-    searches = DEFAULT_PLAN.searches(
-        LEVELS,
-        prior,
-        lambda level, poses: poses * (0.01, pose_ms, coarse_ms, math.inf)[level],
-        lambda: (tiles, 128),
-    )
     nats = [
-        prior.nats(*pose, within=(math.radians(3.0), 0.045))
-        for search in searches
-        if search.level == LEVELS.look
-        for pose in search.poses
+        prior.nats(*direction, within=(math.radians(3.0), 0.045))
+        for step in steps(prior, (0.01, pose_ms, coarse_ms, math.inf), tiles)
+        if step.level == LEVELS.judged
+        for direction in step.directions
     ]
-    least = DEFAULT_PLAN.stages_nats[-2]
-    assert (max(nats) <= least) == left_out and max(nats) > 1.5
+    assert (max(nats) <= POLICY.stages_nats[-2]) == left_out and max(nats) > 1.5
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that only moves when advanced, s."""
     now = [100.0]
-    monkeypatch.setattr(plan.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(policy.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -132,25 +119,9 @@ def test_a_search_that_would_end_too_late_is_left_out(clock):
     assert budget.allows(20.0)
 
 
-def test_nothing_is_begun_after_the_budget_is_spent(clock):
-    budget = Budget(100.0)
-    assert budget.allows(10.0)
-    clock[0] += 0.2
-    assert not budget.allows(0.0)
-
-
-def test_more_tiles_give_more_candidates_within_bounds():
-    least, most = DEFAULT_PLAN.tile_candidates
-    counts = [DEFAULT_PLAN.candidates_from(tiles) for tiles in (1, 8_000, 10**6)]
-    assert counts == [least, 8_000 // DEFAULT_PLAN.tiles_per_candidate, most]
-
-
 @pytest.mark.parametrize("tiles, from_tiles", [(10_000, True), (0, False)])
 def test_tiles_come_first_where_they_are_the_cheaper_way(tiles, from_tiles):
-    first = next(
-        DEFAULT_PLAN.searches(LEVELS, TRACKED, lambda _, poses: 50.0 * poses, lambda: (tiles, 128))
-    )
+    first = steps(TRACKED, (50.0,) * 4, tiles)[0]
     assert first.from_tiles == from_tiles and first.level == LEVELS.coarse
     if from_tiles:
-        assert first.candidates == DEFAULT_PLAN.candidates_from(tiles)
-        assert DEFAULT_PLAN.enough(first, LEVELS) == DEFAULT_PLAN.clear_at_judged
+        assert first.count == POLICY.candidates_from(tiles)

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from orthonav.core.errors import VariantError
-from orthonav.core.tiles.canny import Canny
-from orthonav.core.tiles.embed import TABLE
-from orthonav.core.tiles.stored import embedder_of
+from orthonav.core.tiles.embed import TABLE, embedder_of
+from orthonav.core.tiles.represent import Canny
 from orthonav.core.variants import variant_recipe
 from orthonav.research import caevl
 from orthonav.research.augment import augmented

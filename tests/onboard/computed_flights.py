@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from orthonav.core.geo.attitude import LOOKS_DOWN, enu_from_body_camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard import latency as latencies
-from orthonav.onboard.arrival import ArrivalWatch
 from orthonav.onboard.motion import ImageMotion, reported_motion
 from orthonav.onboard.telemetry import VehicleState
 
@@ -33,12 +32,7 @@ class ComputedOdometry:
     def reset(self):
         self.before = None
 
-    def wants(self, arrived_ns):
-        return self.before is None or arrived_ns - self.before[0] >= 0.08 * S
-
     def motion(self, grey, camera, arrived_ns):
-        if not self.wants(arrived_ns):
-            return None
         flight, start = self.flight, self.before
         self.before = arrived_ns, flight.exposed_s
         if start is None or not 0 < flight.exposed_s - start[1] < 1.0:
@@ -64,8 +58,7 @@ class ComputedFlight:
         self.rng = np.random.default_rng(seed)
         self.monitor = latencies.LatencyMonitor(stated_s)
         self.monitor._odometry = ComputedOdometry(self)
-        self.watch, self.states = ArrivalWatch(), {}
-        self.watch.opened()
+        self.interruptions, self.states = 0, {}
         self.wrong = lambda exposed_s: 0.0  # added to the motion that is seen
         self.images = []  # seconds since the start, reason or None, error of the position
 
@@ -99,18 +92,18 @@ class ComputedFlight:
 
     def _image(self, at_s):
         arrived_ns = round((BEGIN_S + at_s + abs(self.rng.normal(0, 0.01))) * S)
-        arrival = self.watch.arrived(arrived_ns, math.nan)
         self.exposed_s = BEGIN_S + at_s - self.delay_s(at_s)
-        found, error_m = self.monitor.latency(arrival), math.nan
-        if found.reason is None:
+        used, error_m = self.monitor.latency(arrived_ns, self.interruptions), math.nan
+        reason = used.reason
+        if reason is None:
             place = self.truth(self.exposed_s)[1]
-            exposed_ns = arrived_ns - round(found.delay_s * S)
+            exposed_ns = arrived_ns - round(used.delay_s * S)
             error_m = float(np.hypot(*(place - self.truth(exposed_ns / S)[1])))
             lat, lon = FRAME.latlon_from_en(place + self.rng.normal(0, 1.5, 2))
-            found = self.monitor.located(arrival, exposed_ns, (float(lat), float(lon)), 3.5)
+            reason = self.monitor.located(used, (float(lat), float(lon)), 3.5)
         covered_ns = round((BEGIN_S + at_s - 0.02) * S)
-        self.monitor.observe(arrival, None, None, self.state_at, covered_ns)
-        return found.reason, error_m
+        self.monitor.observe(arrived_ns, None, None, self.state_at, covered_ns)
+        return reason, error_m
 
 
 def sent(images):

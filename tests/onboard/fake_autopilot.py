@@ -1,5 +1,5 @@
-"""Fake surroundings of a flight, beyond those of `benchmarks.fakes`: faults of the port, an
-autopilot over UDP, a flight folder, a locator."""
+"""Fake surroundings of a flight, beyond those of `benchmarks.fakes`: an autopilot over UDP, a
+flight folder, a locator."""
 
 import json
 import socket
@@ -10,53 +10,14 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-from benchmarks.fakes import MS, UTC_NS, S, Time
+from benchmarks.fakes import UTC_NS, Port, S, Time
+from examples.simulated_autopilot import Encoder as Autopilot
 
-from benchmarks import fakes
 from orthonav.core.records import Fix
 from wire import TABLES, decode
 
-__all__ = ["MS", "UTC_NS", "Time"]  # tests import them from here
-
-
-class Port(fakes.Port):
-    """A port that can refuse to open, and break."""
-
-    def __init__(self):
-        super().__init__()
-        self.broken, self.opened, self.refuse = None, 0, False
-
-    def open(self):
-        if self.refuse:
-            raise ConnectionRefusedError("nobody there")
-        self.opened += 1
-        return super().open()
-
-    def read(self):
-        if self.broken:
-            raise self.broken
-        return super().read()
-
-    def write(self, data):
-        if self.broken:
-            raise self.broken
-        super().write(data)
-
-
-class Autopilot(fakes.Autopilot):
-    """An autopilot that can sign, and has a rangefinder."""
-
-    def __init__(self, system=1, component=1, key=None):
-        super().__init__(system, component)
-        if key is not None:
-            self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
-            self.mav.signing.timestamp = 2**47
-
-    def distance(self, boot_ns, metres, orientation=25):
-        centimetres = round(metres * 100)
-        return self.say(
-            "distance_sensor", boot_ns // MS, 1, 65535, centimetres, 0, 0, orientation, 255
-        )
+__all__ = ["UTC_NS", "Port", "Time"]  # tests import them from here
+MS = 10**6
 
 
 class LiveAutopilot(threading.Thread):
@@ -105,7 +66,7 @@ class LiveAutopilot(threading.Thread):
             return
         message = decode(frame)
         if message["name"] == "TIMESYNC" and message["tc1"] == 0:
-            self._send(self.autopilot.say("timesync", self.boot_ns(), message["ts1"]))
+            self._send(self.autopilot.timesync(self.boot_ns(), message["ts1"]))
         self.heard.append(message)
 
     def stop(self):

@@ -10,14 +10,28 @@ from flown import SMALL, Flown
 from orthonav.cli import main
 from orthonav.cli.flying import _stated
 from orthonav.core.errors import FlightError, OrthonavError
-from orthonav.core.flight.latency import CameraLatency, read_latency, write_latency
+from orthonav.core.flight.mount import CameraLatency, read_latency, write_latency
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.telemetry import VehicleState
 
 RATE_HZ = 5.0
 
 
-def logged(folder, flown, delay_s, *, used_s=0.0, seconds=32, rate_hz=RATE_HZ, heading_off=0.0):
+def as_seen(grey):
+    return grey
+
+
+def logged(
+    folder,
+    flown,
+    delay_s,
+    *,
+    used_s=0.0,
+    seconds=32,
+    rate_hz=RATE_HZ,
+    heading_off=0.0,
+    change=as_seen,
+):
     """A log of a flight whose images are late, flown with another latency."""
     log = FlightLog(folder / "flight.mcap", SMALL, {})
     begin_ns = UTC_NS + 1000 * S
@@ -28,7 +42,8 @@ def logged(folder, flown, delay_s, *, used_s=0.0, seconds=32, rate_hz=RATE_HZ, h
         state = VehicleState(flown.ned_from_body(at_s), flown.agl_m, (north, east, 0.0))
         telemetry = state.telemetry(begin_ns + round(at_s * S))
         telemetry = replace(telemetry, yaw_deg=telemetry.yaw_deg + heading_off)
-        grey = flown.picture(arrived_s - delay_s, SMALL)
+        late_s = delay_s(arrived_s) if callable(delay_s) else delay_s
+        grey = change(flown.picture(arrived_s - late_s, SMALL))
         log.view(number, f"{number:06d}", grey, telemetry, used_s * 1e3, number % 3 == 0)
     log.close()
     return folder / "flight_0001.mcap"
@@ -51,22 +66,21 @@ def test_the_latency_is_found(tmp_path, capsys, caplog, delay_s, used_s):
     assert _stated(str(out)) == read_latency(out) == CameraLatency(**found)
 
 
-def test_a_straight_flight_is_refused(tmp_path, capsys):
-    log = logged(tmp_path, Flown(80, turns=False, turbulence_deg=0.05, seed=2), 0.4)
+@pytest.mark.parametrize(
+    ("flown", "delay_s", "options", "why"),
+    [
+        (Flown(80, turns=False, turbulence_deg=0.05, seed=2), 0.4, {}, "turns"),
+        (Flown(80, seed=1), 0.4, {"rate_hz": 1.0}, "1.0 s apart"),
+        (Flown(80, seed=1), 0.4, {"heading_off": 180.0}, "--mount-deg"),
+        (Flown(80, seed=6), 0.4, {"change": lambda grey: grey[::-1, ::-1].copy()}, "--mount-deg"),
+        (Flown(80, seed=1), lambda at: 0.1 + 0.1 * (at - 10), {"seconds": 60}, ""),
+    ],
+    ids=["straight", "rare views", "wrong heading", "rotated", "growing"],
+)
+def test_flights_that_do_not_show_it_are_refused(tmp_path, capsys, flown, delay_s, options, why):
+    log = logged(tmp_path, flown, delay_s, **options)
     assert calibrated(log, tmp_path / "latency.json") == 1
-    assert "turns" in capsys.readouterr().err and not (tmp_path / "latency.json").exists()
-
-
-def test_views_that_are_rare_are_refused(tmp_path, capsys):
-    log = logged(tmp_path, Flown(80, seed=1), 0.4, rate_hz=1.0)
-    assert calibrated(log, tmp_path / "latency.json") == 1
-    assert "1.0 s apart" in capsys.readouterr().err
-
-
-def test_a_wrong_mount_is_refused(tmp_path, capsys):
-    log = logged(tmp_path, Flown(80, seed=1), 0.4, heading_off=180.0)
-    assert calibrated(log, tmp_path / "latency.json") == 1
-    assert "--mount-deg" in capsys.readouterr().err
+    assert why in capsys.readouterr().err and not (tmp_path / "latency.json").exists()
 
 
 def test_a_stated_latency_is_a_number_or_a_file(tmp_path):

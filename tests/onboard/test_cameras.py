@@ -13,7 +13,6 @@ from orthonav.core.records import Telemetry
 from orthonav.onboard.cameras import (
     CameraGoneError,
     CameraImage,
-    CameraThread,
     FrozenCheck,
     LiveCamera,
     NewestImage,
@@ -62,18 +61,6 @@ class Device:
         self.released = True
 
 
-def test_take_returns_the_newest_image():
-    newest = NewestImage()
-    for number in range(5):
-        newest.put(image(number))
-    assert newest.take(0).number == 4
-    assert newest.take(0) is None
-    assert (newest.taken, newest.replaced, newest.is_over) == (5, 4, False)
-    newest.put(image(5))
-    newest.end()
-    assert not newest.is_over and newest.take(1).number == 5 and newest.is_over
-
-
 def test_take_waits_for_an_image():
     newest = NewestImage()
     threading.Timer(0.05, newest.put, [image(7)]).start()
@@ -85,7 +72,7 @@ def test_images_of_a_live_camera_carry_their_arrival():
     device = Device([noisy(0), np.dstack([noisy(1)] * 3), None])
     camera = LiveCamera(0, time.clocks, size_px=(320, 240), capture=lambda _: device)
     first = camera.read()
-    assert first.exposed_ns == first.arrival.arrived_ns == time.now_ns
+    assert first.exposed_ns == time.now_ns
     assert first.time_ns == UTC_NS + first.exposed_ns
     time.go(1.0)
     time.utc_ahead_ns += 3600 * S  # the clock is set while we fly
@@ -95,6 +82,20 @@ def test_images_of_a_live_camera_carry_their_arrival():
     third = camera.read()
     assert third.grey is None and third.problem.reason == "bad_image"
     assert device.settings[cv2.CAP_PROP_FRAME_WIDTH] == 320
+
+
+def test_images_that_stop_for_a_while_are_interruptions():
+    def interruptions(intervals_s):
+        time, device = Time(), Device([noisy(0)] * len(intervals_s))
+        camera, found = LiveCamera(0, time.clocks, capture=lambda _: device), []
+        for each in intervals_s:
+            time.go(each)
+            found.append(camera.read().interruptions)
+        return found
+
+    assert interruptions([0.1, 0.2] * 20) == [0] * 40
+    assert interruptions([0.1] * 10 + [2.0] + [0.1] * 5) == [0] * 10 + [1] * 6
+    assert interruptions([1.0] * 10) == [0, *[1] * 9]  # a slow camera
 
 
 def test_a_camera_that_stops_comes_back():
@@ -111,7 +112,8 @@ def test_a_camera_that_stops_comes_back():
     assert newest.taken == 3 and newest.outages == 2
     assert pauses[:3] == [0.5, 1.0, 2.0] and pauses[3] == 0.5
     assert all(each.released for each in opened)
-    assert newest.take(0).number == 3 and newest.is_over
+    last = newest.take(0)
+    assert last.number == 3 and last.interruptions > 0 and newest.is_over
 
 
 def test_a_camera_is_retried_after_a_fault_of_its_driver(caplog):
@@ -174,7 +176,7 @@ def test_flight_folders_have_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
     write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
-    telemetry = list(recorded_images(tmp_path, 1.0))
+    telemetry = list(recorded_images(tmp_path))
     assert [each.time_ns for each in telemetry] == [row.time_ns for row in rows]
     assert [each.telemetry for each in telemetry] == rows
     np.testing.assert_array_equal(telemetry[2].load(), noisy(2))
@@ -187,13 +189,13 @@ def test_an_incomplete_image_is_a_bad_image(tmp_path):
     (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "note.txt").write_text("no picture")
     time = Time()
-    telemetry = recorded_images(tmp_path, 4.0)
+    telemetry = recorded_images(tmp_path)
     source = Playback(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
     seen = [source.read() for _ in range(4)]
     assert [each and each.frame for each in seen] == ["0.jpg", "1.jpg", "2.jpg", None]
     assert seen[1].grey is None and seen[1].problem.reason == "bad_image"
     assert "cut short" in seen[1].problem.detail
-    assert seen[2].exposed_ns - seen[0].exposed_ns == S // 2
+    assert seen[2].exposed_ns - seen[0].exposed_ns == S
     (tmp_path / "0.jpg").unlink()
     assert (
         Playback(
@@ -208,26 +210,25 @@ def test_an_incomplete_image_is_a_bad_image(tmp_path):
     )
 
 
-def test_a_video_has_its_own_times_and_can_be_thinned(tmp_path):
+def test_a_video_has_its_own_times(tmp_path):
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
     for number in range(4):
         writer.write(np.dstack([np.full((240, 320), 40 * number, np.uint8)] * 3))
     writer.release()
-    found = list(recorded_images(path, None))
+    found = list(recorded_images(path))
     assert [each.time_ns for each in found] == [0, S // 10, S // 5, 3 * S // 10]
     assert [round(float(each.load().mean()) / 40) for each in found] == [0, 1, 2, 3]
-    assert [each.time_ns for each in recorded_images(path, 5.0)] == [0, S // 5]
 
 
 def test_invalid_sources_are_refused(tmp_path):
     with pytest.raises(MissingFileError):
-        recorded_images(tmp_path / "nothing", 1.0)
+        recorded_images(tmp_path / "nothing")
     with pytest.raises(FlightError, match="no images"):
-        recorded_images(tmp_path, 1.0)
+        recorded_images(tmp_path)
     (tmp_path / "x.mp4").write_bytes(b"no video")
     with pytest.raises(FlightError, match="video"):
-        recorded_images(tmp_path / "x.mp4", 1.0)
+        recorded_images(tmp_path / "x.mp4")
 
 
 def test_a_missing_device_is_gone_for_now():
@@ -266,21 +267,3 @@ def test_hovering_is_not_frozen():
     """The same scene with the noise of a good sensor, one grey level."""
     scene, check = ground(), FrozenCheck()
     assert not any(check.is_repeat(sensed(scene, seed)) for seed in range(10))
-
-
-def test_a_moving_view_is_not_frozen():
-    scene, check = ground(), FrozenCheck()
-    assert not any(check.is_repeat(scene[:, i : i + 500]) for i in range(5))
-    assert not check.is_repeat(scene[:100, :500])  # another size
-
-
-def test_a_camera_reads_in_a_thread(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), noisy(0))
-    time, stopping = Time(), threading.Event()
-    source = Playback(
-        recorded_images(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
-    )
-    thread = CameraThread(source, stopping)
-    assert thread.newest.take(5).frame == "a.png"
-    thread.stop()
-    assert thread.newest.is_over

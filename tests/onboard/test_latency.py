@@ -1,325 +1,101 @@
-"""Whole flights with a live camera whose images are late: nothing wrong is sent."""
+"""Flights of the fault suite over a known ground: nothing wrong is sent.
 
-import math
+Most have a locator that is always right about where an image was exposed, but not when. The suite
+itself, with all faults over generated landscapes: `python -m benchmarks.faults`.
+"""
 
 import numpy as np
 import pytest
-from benchmarks.fakes import BEGIN_NS, Stream
-from fake_autopilot import MS, Autopilot, FakeLocator, Port, S, Time, fix
-from flown import SMALL as CAMERA
-from flown import Flown
+from benchmarks.fault_flights import CAMERA, Fault, FaultFlight, World
+from benchmarks.fault_scenarios import CAMERA_FAULTS, COMBINED_FAULTS, TELEMETRY_FAULTS
+from blots import AGL_M, GROUND, as_grey, known_map, rendered
+from fake_autopilot import FakeLocator, fix
 
-from orthonav.onboard.cameras import LiveCamera, NewestImage
-from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.latency import LatencyMonitor
-from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.messages.estimate import Clock
-from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.outputs import MessageOptions, Messenger
-from orthonav.onboard.publisher import Publisher
-from orthonav.onboard.telemetry import TelemetryBuffer
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
 
-METRES = 111_195.0  # a degree of latitude; the flights are at the equator
-BEGIN_S = 10.0
-AHEAD_NS = -90 * S
-LARGEST_ERROR_M = 8.0
+FAULTS = {each.name: each for each in (*CAMERA_FAULTS, *TELEMETRY_FAULTS, *COMBINED_FAULTS)}
+FRAME = LocalFrame(48.0, 2.0)
 
 
-class LateStream(Stream):
-    """A capture whose images arrive when the test says so, exposed at `exposed_s`."""
-
-    def __init__(self, flight):
-        super().__init__(lambda: self.change(flight.flown.picture(self.exposed_s, CAMERA)))
-        self.exposed_s, self.stamp_s = 0.0, math.nan
-        self.change = lambda grey: grey
-
-    def get(self, _):
-        return 0.0 if math.isnan(self.stamp_s) else self.stamp_s * 1e3
+def picture(place, attitude, agl_m, rng):
+    grey = rendered(GROUND, place, attitude, agl_m, CAMERA)
+    return as_grey(0.75 * grey + 30 + rng.normal(0, 5, grey.shape))
 
 
-class LateFlight:
-    """A flight of `orthonav fly` with a fake clock, whose locator is always right about where an
-    image was exposed, but not when."""
+def right(flight):
+    """A locator that knows where an image was exposed."""
 
-    def __init__(self, flown, stated_s, delay_s, *, rate_hz=5.0, max_age_s=1.0, clock_rate=0.0):
-        """`clock_rate`: how much faster the autopilot's clock runs than ours."""
-        self.flown, self.delay_s, self.rate_hz = flown, delay_s, rate_hz
-        self.clock_rate = clock_rate
-        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
-        clocks = self.time.clocks
-        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
-        self.gate = Gate(GateRules(max_age_s=max_age_s), Clock.BOOT)
-        messages = MessageOptions(("global-position",))
-        messenger = Messenger(messages, self.gate, self.link.send, clocks)
-        publisher = Publisher(self.gate, clocks, messenger=messenger, link=self.link)
-        self.stream = LateStream(self)
-        self.source = LiveCamera(0, clocks, capture=lambda _: self.stream)
-        self.newest, self.monitor = NewestImage(), LatencyMonitor(stated_s)
-        self.runner = Runner(
-            self.newest,
-            CAMERA,
-            FakeLocator(self.where),
-            publisher,
-            FlyOptions(),
-            clocks,
-            link=self.link,
-            latency=self.monitor,
-        )
-        self.sent = []  # time since the start, error in metres, age
-        self.results = []
-        self.stamps, self.stalled = False, False
-        self.requests = []  # of TIMESYNC, not yet answered
-        self.hear(self.autopilot.heartbeat())
+    def where(view):
+        lat_deg, lon_deg = FRAME.latlon_from_en(flight.path.place(flight.exposed_s))
+        return fix(float(lat_deg), float(lon_deg), heading_deg=view.telemetry.yaw_deg)
 
-    @property
-    def now_s(self):
-        """Time of the generated flight, of which a late stream shows an earlier part."""
-        return BEGIN_S + (self.time.now_ns - BEGIN_NS) / S
-
-    def where(self, view):
-        north, east = self.flown.at(self.stream.exposed_s)[2]
-        heading, height = view.telemetry.yaw_deg, view.telemetry.agl_m
-        return fix(north / METRES, east / METRES, std_m=2.0, heading_deg=heading, agl_m=height)
-
-    def hear(self, *frames):
-        self.port.coming.extend(frames)
-        self.link.poll()
-
-    def talk(self):
-        """Telemetry of this moment, and answers to TIMESYNC."""
-        ahead_ns = AHEAD_NS + round(self.clock_rate * (self.time.now_ns - BEGIN_NS))
-        boot_ns = self.time.now_ns + ahead_ns
-        (yaw, pitch, roll), (north, east), _ = self.flown.at(self.now_s)
-        requests, self.requests = self.requests + self.port.sent("TIMESYNC"), []
-        answers = self.autopilot.answers(requests, self.time.now_ns, ahead_ns)
-        self.hear(
-            self.autopilot.attitude(boot_ns, yaw, pitch, roll),
-            self.autopilot.home(boot_ns, self.flown.agl_m),
-            self.autopilot.local(boot_ns, (north, east, 0.0)),
-            *answers,
-        )
-
-    def fly(self, seconds):
-        """Fly on; the errors of the messages of this time."""
-        end_ns, before = self.time.now_ns + round(seconds * S), len(self.sent)
-        due_ns, step_ns = self.time.now_ns, round(S / self.rate_hz)
-        while self.time.now_ns < end_ns:
-            self.time.now_ns += 100 * MS
-            self.talk()
-            if self.time.now_ns >= due_ns and not self.stalled:
-                due_ns += step_ns
-                self.image()
-            due_ns = max(due_ns, self.time.now_ns - step_ns)
-        return self.sent[before:]
-
-    def image(self):
-        """One image arrives."""
-        self.stream.exposed_s = self.now_s - self.delay_s(self.now_s)
-        if self.stamps:
-            self.stream.stamp_s = 1000 + self.stream.exposed_s
-        self.requests += self.port.sent("TIMESYNC")
-        self.newest.put(self.source.read())
-        result = self.runner.step(0)
-        self.results.append((self.now_s, result))
-        for message in self.port.sent("GLOBAL_POSITION_SENSOR"):
-            age_s = message["processing_time"] / 1e6
-            north, east = self.flown.at(self.now_s - age_s)[2]
-            off = message["lat"] * 1e-7 * METRES - north, message["lon"] * 1e-7 * METRES - east
-            self.sent.append((self.now_s, float(np.hypot(*off)), age_s))
-
-    def reasons(self):
-        return set(self.runner.health.reasons)
+    return FakeLocator(where)
 
 
-def constant(delay_s):
-    return lambda now_s: delay_s
+def fly(fault, lead_s=8.0, recovery_s=0.0):
+    world = World(None, FRAME, picture, 140.0, AGL_M, 20.0)
+    flight = FaultFlight(world, fault, seed=3, lead_s=lead_s, recovery_s=recovery_s, locator=right)
+    return flight, flight.fly()
 
 
-def worst_m(sent):
-    return max((error for _, error, _ in sent), default=0.0)
-
-
-def test_an_undisturbed_flight_keeps_its_messages():
-    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
-    flight.fly(5)
-    assert flight.gate.withheld["latency_unknown"] < 4.5 * flight.rate_hz  # compared first
-    before = len(flight.results)
-    sent = flight.fly(12)
-    assert len(sent) >= 0.98 * (len(flight.results) - before) and worst_m(sent) < 4.0
-    assert flight.runner.health.reasons == ()
-    plain = flight.monitor.plain()
-    assert (plain["latency_ms"], plain["latency"]) == (120.0, "stated")
-
-
-def test_an_autopilot_whose_clock_runs_slow():
-    """As PX4's simulator in lockstep."""
-    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12), clock_rate=-0.022)
-    flight.fly(20)
-    before = len(flight.results)
-    sent = flight.fly(15)
-    assert len(sent) >= 0.98 * (len(flight.results) - before) and worst_m(sent) < 4.0
-    assert flight.runner.health.reasons == ()
-    assert flight.monitor.plain()["latency"] == "stated"
-
-
-def test_a_straight_flight_with_a_stated_latency_is_undisturbed():
-    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
-    flight = LateFlight(straight, 0.12, constant(0.12))
-    flight.fly(5.5)
-    before = len(flight.results)
-    assert len(flight.fly(10)) >= 0.98 * (len(flight.results) - before)
-
-
-@pytest.mark.long
-def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
-    flight = LateFlight(Flown(70, seed=1), None, constant(0.25))
-    assert flight.fly(10) == []
-    assert "latency_unknown" in flight.reasons()
-    assert flight.gate.withheld["latency_unknown"] >= len(flight.results) - 1
-    assert "--camera-latency-ms" in flight.monitor.plain()["latency"]
-    sent = flight.fly(26)
-    assert len(sent) > 42 and worst_m(sent) < 4.0
-    plain = flight.monitor.plain()
-    assert plain["latency_ms"] == pytest.approx(250, abs=80) and plain["latency"] == "measured"
-    assert flight.reasons() == set()
-
-
-def test_without_a_stated_latency_a_straight_flight_sends_nothing():
-    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
-    flight = LateFlight(straight, None, constant(0.12))
-    assert flight.fly(15) == []
-
-
-@pytest.mark.long
-def test_a_stream_that_is_late_from_the_start():
-    """The stated latency is compared with the first images before it is used; then it is
-    measured, and positions are withheld as stale."""
-    late_s = 8.0
-    flight = LateFlight(Flown(90, seed=3), 0.12, constant(late_s))
-    flight.fly(40)
-    assert worst_m(flight.sent) < LARGEST_ERROR_M
-    plain = flight.monitor.plain()
-    assert plain["latency_ms"] == pytest.approx(late_s * 1e3, abs=80)
-    assert flight.gate.withheld["stale"] > 31
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("late_s", "stamps"), [(0.7, False), pytest.param(8.0, True, marks=pytest.mark.slow)]
-)
-def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
-    delay = {"s": 0.12}
-    flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
-    flight.stamps = stamps
-    assert len(flight.fly(14)) > 50
-    flight.stalled = True
-    flight.fly(late_s - 0.12)
-    flight.stalled, delay["s"] = False, late_s
-    sent = flight.fly(1.5)
-    assert sent == [] and flight.reasons() & {"latency_unknown", "latency_unsteady"}
-    sent = flight.fly(18)
-    assert worst_m(sent) < LARGEST_ERROR_M
-    assert flight.monitor.plain()["latency_ms"] == pytest.approx(late_s * 1e3, abs=80)
-    if late_s < 0.9:
-        assert len(sent) > 30
-    # The stream catches up: a burst, then live images.
-    delay["s"] = 0.12
-    sent = flight.fly(20)
-    late = [each for each in sent if each[1] > LARGEST_ERROR_M]
-    assert all(at - flight.now_s < -15 for at, _, _ in late)
-    assert worst_m(sent[-50:]) < 4.0 and len(sent) > 50
-    assert flight.monitor.plain()["latency"] == "stated"
-
-
-@pytest.mark.long
-def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
-    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
-    flight = LateFlight(straight, 0.12, constant(0.12))
-    flight.stamps = True
-    flight.fly(12)
-    flight.stalled = True
-    flight.fly(2.0)
-    flight.stalled = False
-    assert len(flight.fly(10)) >= 48
-
-
-@pytest.mark.parametrize("gap_s", [0.7, 2.0])
-def test_a_stated_latency_holds_through_a_gap_without_a_manoeuvre(gap_s):
-    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
-    flight = LateFlight(straight, 0.12, constant(0.12))
-    flight.fly(8)
-    flight.stalled = True
-    flight.fly(gap_s)
-    flight.stalled = False
-    flight.fly(5.5)  # compared with the images again, as at the start
-    assert len(flight.fly(10)) >= 48 and flight.monitor.plain()["latency"] == "stated"
-
-
-def test_a_latency_that_grew_in_a_gap_is_noticed_without_a_manoeuvre():
-    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
-    delay = {"s": 0.12}
-    flight = LateFlight(straight, 0.12, lambda _: delay["s"], max_age_s=9.0)
-    flight.fly(12)
-    flight.stalled = True
-    flight.fly(3.0)
-    flight.stalled, delay["s"] = False, 3.0
-    assert worst_m(flight.fly(15)) < LARGEST_ERROR_M
-
-
-def test_a_gap_without_a_stated_latency_needs_a_manoeuvre():
-    flight = LateFlight(Flown(70, seed=1), None, constant(0.25))
-    flight.fly(30)
-    assert flight.monitor.plain()["latency"] == "measured"
-    flight.stalled = True
-    flight.fly(1.0)
-    flight.stalled = False
-    assert flight.fly(1) == [] and "latency_unsteady" in flight.reasons()
-    assert "no image for 1" in flight.monitor.plain()["latency"]
-
-
-@pytest.mark.slow
-def test_a_drifting_latency_is_followed():
-    flight = LateFlight(Flown(90, seed=5), 0.1, lambda now_s: 0.1 + 0.012 * now_s)
-    flight.fly(20)
-    sent = flight.fly(40)
-    assert worst_m(sent) < LARGEST_ERROR_M and len(sent) > 62
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda grey: grey[:, ::-1].copy(),
-        lambda grey: grey[::-1, ::-1].copy(),
-    ],
-)
-def test_mirrored_and_rotated_images_give_no_latency(change):
-    flight = LateFlight(Flown(70, seed=1), None, constant(0.12))
-    flight.stream.change = change
-    assert flight.fly(15) == []
-    assert flight.reasons() & {"latency_unknown", "motion_mismatch"}
-
-
-@pytest.mark.long
-def test_a_camera_that_freezes_with_noise_is_noticed():
-    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
-    flight.fly(8)
-    rng, still = np.random.default_rng(0), flight.flown.picture(flight.now_s, CAMERA)
-    flight.stream.change = lambda _: np.uint8(
-        np.clip(still + rng.normal(0, 3, still.shape), 0, 255)
-    )
-    flight.fly(8)
-    assert len(flight.fly(5)) == 0
-    flight.stream.change = lambda grey: grey
-    flight.fly(10)
-    assert len(flight.fly(5)) >= 24
+def test_an_undisturbed_flight_keeps_its_messages_and_states_the_latency():
+    flight, report = fly(Fault("none", "none", 12.0))
+    sent, views = report.lead_in()
+    assert sent >= 10 and sent + len(report.during()) >= 0.98 * (views + 60)
+    assert report.worst_m() < 4.0
+    assert set(report.withheld) == {"latency_unknown"}  # compared with the first images
+    plain = flight.runner._latency.plain()
+    assert plain == {"latency_ms": 120.0, "latency_std_ms": 30.0, "latency": "stated"}
 
 
 def test_the_covariance_includes_the_latency():
-    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
-    flight.fly(6)
-    cov = flight.results[-1][1].outcome.cov_en_m2
-    (north, east) = flight.flown.at(flight.now_s - 0.12)[1]
-    along = np.array([east, north]) / np.hypot(east, north)
-    across = np.array([-along[1], along[0]])
-    assert along @ cov @ along == pytest.approx(4 + (0.03 * np.hypot(east, north)) ** 2, rel=0.02)
-    assert across @ cov @ across == pytest.approx(4.0, rel=0.02)
+    flight, report = fly(Fault("none", "none", 0.2), lead_s=7.0)
+    assert report.sent
+    values = np.linalg.eigvalsh(flight.gate._last.cov_en_m2)
+    speed = np.hypot(flight.path.reported(22.0).north, flight.path.reported(22.0).east)
+    assert values == pytest.approx([4.0, 4.0 + (0.03 * speed) ** 2], rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [
+        ("2 s late from the start", 0),
+        ("mirrored", 12),
+        pytest.param("rotated by 180 deg", 12, marks=pytest.mark.slow),
+        ("frozen with noise", 12),
+    ],
+)
+@pytest.mark.long
+def test_images_that_do_not_move_as_reported_stop_the_messages(name, most):
+    _, report = fly(FAULTS[name], recovery_s=20.0)
+    assert report.wrong() == [] and len(report.during()) <= most
+    assert report.recovery_s() < 12.0
+
+
+@pytest.fixture(scope="module")
+def world(made_once, make_ortho):
+    _, path, frame = known_map(made_once, make_ortho)
+    return World(Localizer(open_map(path)), frame, picture, 140.0, AGL_M, 20.0)
+
+
+@pytest.mark.long
+def test_pictures_that_show_nothing_of_the_map_give_no_wrong_message(world):
+    fault = FAULTS["mirrored, velocity reversed"]
+    flight = FaultFlight(world, fault, seed=3, lead_s=9.0, recovery_s=0.0)
+    flight.fault_s, flight.end_s = (9.0, 12.0), 12.0
+    report = flight.fly()
+    sent, views = report.lead_in()
+    assert sent >= 0.95 * views >= 15  # it was tracking before
+    assert max(each.error_m for each in report.sent if each not in report.during()) < 12.0
+    assert report.wrong() == [] and len(report.during()) <= 3
+
+
+@pytest.mark.long
+def test_the_suite_notices_a_wrong_message(world):
+    """A map that is displaced by 60 m cannot be noticed: its messages count as wrong."""
+    fault = Fault("shifted", "map", 8.0, from_start=True, ground_en_m=(60.0, 0.0))
+    report = FaultFlight(world, fault, seed=3, lead_s=9.0, recovery_s=0.0).fly()
+    assert len(report.wrong()) > 5 and report.worst_m() == pytest.approx(60.0, abs=8.0)
+    assert np.isinf(report.recovery_s())

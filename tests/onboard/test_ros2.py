@@ -33,15 +33,15 @@ from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import ViewResult
 from orthonav.ground.recordings.opening import open_source
-from orthonav.onboard.messages.correlation import messages_averaged
 from orthonav.onboard.messages.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
     floored,
+    messages_averaged,
 )
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.lost import LostImages
 from orthonav.onboard.ros2.messages import Definitions

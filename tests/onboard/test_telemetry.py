@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from orthonav.core.flight.telemetry_track import RecordedTrack, Samples, attitude_of_angles
 from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.onboard import telemetry
 from orthonav.onboard.telemetry import (
-    BufferLimits,
     ClockSync,
     TelemetryBuffer,
     VehicleState,
@@ -67,7 +67,7 @@ def test_telemetry_equals_that_of_an_imported_log(angles, mount):
 @pytest.mark.parametrize("every_ms, known", [(20, True), (50, True), (100, False)])
 def test_dense_attitudes_are_extrapolated_a_little(every_ms, known):
     """A view need not wait for the next one; it turns on as it turned."""
-    buffer = TelemetryBuffer(BufferLimits(attitude_ahead_s=0.03))
+    buffer = TelemetryBuffer()
     for number in range(5):
         attitude(buffer, number * every_ms * MS, yaw_deg=number * every_ms * 0.1)
     last_ns = 4 * every_ms * MS
@@ -79,16 +79,8 @@ def test_dense_attitudes_are_extrapolated_a_little(every_ms, known):
     assert later.yaw_deg == pytest.approx(4 * every_ms * 0.1)
 
 
-def test_single_attitudes_are_not_extrapolated():
-    buffer = TelemetryBuffer()
-    assert buffer.covered_ns is None
-    attitude(buffer, 0)
-    assert buffer.covered_ns == 0
-
-
 def test_gaps_are_not_interpolated():
-    limits = BufferLimits(attitude_gap_s=0.5, attitude_hold_s=0.1, slow_gap_s=2.0, slow_hold_s=1.5)
-    buffer = TelemetryBuffer(limits)
+    buffer = TelemetryBuffer()
     assert buffer.at(0).ned_from_body is None and buffer.covered_ns is None
     attitude(buffer, 1 * S)
     attitude(buffer, 2 * S)
@@ -131,24 +123,15 @@ def test_a_distance_is_corrected_for_the_tilt():
     assert buffer.at(1).height_m == pytest.approx(100 * tilt)
 
 
-def test_velocity_and_height_of_the_local_frame():
-    buffer = TelemetryBuffer()
-    buffer.add_local(0, (10.0, 2.0, -1.0), -50.0)
-    buffer.add_local(1 * S, (12.0, 2.0, math.nan), -50.0)
-    vehicle = buffer.at(0)
-    assert vehicle.telemetry(0).vel_en_mps == (2.0, 10.0)
-    assert (vehicle.velocity_ned_mps[2], vehicle.down_m) == (-1.0, -50.0)
-    assert VehicleState(None).telemetry(0).vel_en_mps is None
-
-
 def circling(time_ns):
     """Velocity north, east, down of an aircraft that turns once in 20 s."""
     angle = math.tau * time_ns / (20 * S)
     return 20 * math.cos(angle), 20 * math.sin(angle), 0.0
 
 
-def test_the_displacement_follows_turns_for_longer_than_samples_are_kept():
-    buffer = TelemetryBuffer(BufferLimits(keep_s=2.0))
+def test_the_displacement_follows_turns_for_longer_than_samples_are_kept(monkeypatch):
+    monkeypatch.setattr(telemetry, "KEEP_S", 2.0)
+    buffer = TelemetryBuffer()
     buffer.add_local(0, circling(0), 0.0)
     first = buffer.at(0).travelled
     for time_ns in range(40 * MS, 50 * S + 1, 40 * MS):
@@ -174,7 +157,7 @@ def test_the_displacement_is_not_known_across_gaps_and_restarts():
     buffer = TelemetryBuffer()
     buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
     first = buffer.at(0).travelled
-    later = round(BufferLimits().slow_gap_s * S) + 1
+    later = round(telemetry.SLOW_GAP_S * S) + 1
     buffer.add_local(later, (10.0, 0.0, 0.0), 0.0)
     second = buffer.at(later).travelled
     assert second.since(first) is None and second.since(None) is None
@@ -197,12 +180,13 @@ def test_an_invalid_attitude_is_dropped(wxyz):
     assert buffer.covered_ns is None
 
 
-def test_samples_out_of_order_and_old_ones_are_dropped():
-    buffer = TelemetryBuffer(BufferLimits(keep_s=1.0))
+def test_samples_out_of_order_and_old_ones_are_dropped(monkeypatch):
+    monkeypatch.setattr(telemetry, "KEEP_S", 1.0)
+    buffer = TelemetryBuffer()
     for number in range(1000):
         attitude(buffer, number * 10 * MS, yaw_deg=10.0)
     attitude(buffer, 5 * S, yaw_deg=90.0)
-    assert buffer.covered_ns == 9990 * MS + round(BufferLimits().attitude_ahead_s * S)
+    assert buffer.covered_ns == 9990 * MS + round(telemetry.ATTITUDE_AHEAD_S * S)
     assert buffer.at(5 * S).ned_from_body is None
     assert buffer.at(9500 * MS).telemetry(0).yaw_deg == pytest.approx(10.0)
     assert len(buffer._attitude.times) <= 201
@@ -289,18 +273,6 @@ def test_heights_above_sea_and_home_are_apart_from_the_one_above_ground():
     buffer.add_height("distance", 0, 60.0)
     telemetry = buffer.at(0).telemetry(0)
     assert (telemetry.agl_m, telemetry.home_m, telemetry.amsl_m) == (60.0, 90.0, 700.0)
-
-
-def test_a_second_height_above_sea_stands_in_for_the_first():
-    buffer = TelemetryBuffer()
-    buffer.add_height("altitude", 0, 650.0)
-    assert buffer.at(0).amsl_m == 650.0
-    buffer.add_height("amsl", 0, 700.0)
-    assert buffer.at(0).amsl_m == 700.0
-    only = TelemetryBuffer(heights=("home",))
-    only.add_height("amsl", 0, 700.0)
-    only.add_height("altitude", 0, 700.0)
-    assert math.isnan(only.at(0).amsl_m)
 
 
 @pytest.mark.parametrize("rate", [-0.022, 0.03, 2e-5])

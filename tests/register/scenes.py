@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import Reference
 
 
 class Ground:

@@ -8,15 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import Ground, random_poses, reference_of, templates_of
+from test_place import VIEW_PX
 from test_refine import GROUND, HOLES, REACH_PX, SHAPE, errors, moved, noisy, normalized_squares
-from test_registrar import VIEW_PX
 
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.refine import Refiner
-from orthonav.core.register.registrar import Registrar
-from orthonav.core.register.search import search
+from orthonav.core.register.search import SearchWindows, search
+from orthonav.core.register.window import Reference
 
 
 @pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
@@ -37,22 +36,6 @@ def test_errors_on_a_part_of_the_map_are_as_large_as_the_covariance_says(hole, l
         covariances.append(placed.covariance)
     squares = normalized_squares(np.array(off), np.array(covariances))
     assert 1.0 < squares.mean() < 3.5
-
-
-@pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
-@pytest.mark.parametrize("turn_deg", [0.0, 35.0])
-def test_a_part_of_the_map_is_converged_upon_as_fast_and_known_less_exactly(hole, turn_deg):
-    valid = np.ones(SHAPE, bool)
-    valid[hole] = False
-    pose = Pose(222.0, 181.0, math.radians(turn_deg), 0.0)
-    template = noisy(GROUND, pose, np.random.default_rng(1), noise=10.0).at(0)
-    start = moved(pose, 1.5, 2.0, 2.0, 1.02)
-    part, whole = (
-        Refiner(template, reference_of(GROUND, SHAPE, v)).place(start, with_covariance=True)
-        for v in (valid, None)
-    )
-    assert np.hypot(*errors(part, pose)[:2]) < 0.12
-    assert np.trace(part.covariance[:2, :2]) > np.trace(whole.covariance[:2, :2])
 
 
 @pytest.mark.parametrize("log_scale", [2.0, 7.0, 700.0])
@@ -93,9 +76,9 @@ def test_where_the_ground_runs_in_one_direction_the_covariance_covers_the_errors
 @pytest.mark.parametrize("reach_px", [2e3, 1e6, math.inf])
 @pytest.mark.parametrize("centre", [(200.0, 170.0), (-1500.0, 100.0)])
 def test_a_part_is_no_larger_than_the_sheet_and_a_view_around_it(reach_px, centre):
-    registrar = Registrar(reference_of(GROUND, SHAPE))
-    window = registrar.part_window(1, FINE, VIEW_PX, centre, reach_px)
-    rows, cols = registrar.reference.shape(1)
+    reference = reference_of(GROUND, SHAPE)
+    window = SearchWindows(reference).part(1, FINE, VIEW_PX, centre, reach_px)
+    rows, cols = reference.shape(1)
     assert window.height <= rows + 2 * VIEW_PX + 8 and window.width <= cols + 2 * VIEW_PX + 8
     pose = Pose(150.0, 120.0, 0.2, 0.0)
     best = search(templates_of(GROUND, pose).at(1), window, [(0.2, 0.0)], 1)[0]
@@ -103,12 +86,12 @@ def test_a_part_is_no_larger_than_the_sheet_and_a_view_around_it(reach_px, centr
 
 
 def test_threads_may_ask_for_windows_of_many_sizes():
-    registrar = Registrar(reference_of(GROUND, (64, 64)))
-    registrar.whole_window(2, FINE, 20.0)
+    windows = SearchWindows(reference_of(GROUND, (64, 64)))
+    windows.whole(2, FINE, 20.0)
 
     def ask(seed):
         for view_px in np.random.default_rng(seed).uniform(8, 300, 400):
-            registrar.whole_window(2, FINE, float(view_px))
+            windows.whole(2, FINE, float(view_px))
 
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)

@@ -15,15 +15,14 @@ from scenes import (
     turned_rad,
 )
 
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import (
-    Bank,
+    MAX_KEPT_WINDOWS,
     SearchWindow,
-    _best_of,
+    SearchWindows,
     bank,
     best_near,
-    largest_half_px,
     search,
 )
 from orthonav.core.register.template import Template
@@ -32,6 +31,7 @@ SHAPE = (384, 448)
 GROUND = Ground()
 ALL_TURNS = bank(None, 0.06, turn_step_rad=math.radians(8), scale_step=0.13, sigmas=2)
 LEVEL = 1
+VIEW_PX = math.sqrt(96 * 128)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_heading_and_scale_are_found_all_around(window):
     ]
     for pose in poses:
         template = templates_of(GROUND, pose).at(LEVEL)
-        best, second = search(template, window, ALL_TURNS.poses, 2)
+        best, second = search(template, window, ALL_TURNS, 2)
         assert apart_px(best.pose, pose) / 2**LEVEL < 1.0
         assert abs(turned_rad(best.pose, pose)) < math.radians(4.5)
         assert abs(best.pose.log_scale - pose.log_scale) < 0.08
@@ -105,30 +105,6 @@ def test_views_of_which_a_part_is_seen(window, kind):
         assert apart_px(best.pose, pose) / 2**LEVEL < (2.6 if kind == "half" else 1.0)
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
-def test_any_level(reference, level):
-    window = SearchWindow(reference.whole(level), level, 0, 0, 110 >> level)
-    for pose in random_poses(4, SHAPE, 90, seed=6):
-        template = templates_of(GROUND, pose).at(level)
-        best = search(template, window, near(pose), 1)[0]
-        assert apart_px(best.pose, pose) / 2**level < 0.25
-
-
-@pytest.mark.parametrize("margin_px", [0, 27])
-@pytest.mark.parametrize("moved_px", [(0, 0), (-40, 31), (25, -60)])
-def test_part_of_the_sheet(reference, margin_px, moved_px):
-    """A window that begins anywhere, also beyond the sheet, gives the place on the sheet."""
-    pose = Pose(170.0 + moved_px[0], 150.0 + moved_px[1], 1.1, 0.05)
-    row, col = int(pose.y_px) // 2 - 71, int(pose.x_px) // 2 - 93
-    made = reference.window(LEVEL, row, col, 130, 140)
-    window = SearchWindow(made, LEVEL, row, col, 55, margin_px)
-    found = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 5)
-    assert apart_px(found[0].pose, pose) / 2**LEVEL < 0.25
-    for each in found:
-        x, y = each.pose.x_px / 2**LEVEL - col, each.pose.y_px / 2**LEVEL - row
-        assert margin_px - 0.5 <= x <= 140 - margin_px and margin_px - 0.5 <= y <= 130 - margin_px
-
-
 def test_the_best_place_near_by_is_that_of_a_whole_search(window):
     for pose in random_poses(12, SHAPE, 90, seed=8, log_scale=0.1):
         template = templates_of(GROUND, pose).at(LEVEL)
@@ -142,17 +118,6 @@ def test_the_best_place_near_by_is_that_of_a_whole_search(window):
         assert apart_px(missed.pose, guess) <= math.hypot(10.0, 10.0)
 
 
-def test_near_the_border_of_a_window_beyond_it_is_nothing(reference):
-    made = reference.window(LEVEL, 60, 70, 80, 80)
-    part = SearchWindow(made, LEVEL, 60, 70, 55)
-    pose = Pose(2 * (70 + 12.0), 2 * (60 + 40.0), 0.4, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    outside = Pose(2 * (70 - 200.0), 2 * (60 + 40.0), 0.4, 0.0)
-    inside, beyond = best_near(template, part, [pose, outside], 12.0)
-    assert apart_px(inside.pose, pose) < 1.0 and beyond.score == 0.0
-    assert best_near(template, part, [], 12.0) == []
-
-
 def test_no_middle_is_sought_in_the_margin(reference):
     """A view whose middle lies there is not found, one just inside is."""
     made = reference.window(LEVEL, 20, 30, 120, 120)
@@ -161,28 +126,6 @@ def test_no_middle_is_sought_in_the_margin(reference):
         pose = Pose(x_px, 2 * (20 + 60.0), 0.4, 0.0)
         best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]
         assert (apart_px(best.pose, pose) / 2**LEVEL < 0.25) == inside
-
-
-@pytest.mark.parametrize("by_kernel", [True, False])
-def test_a_window_as_small_as_a_view_allows_gives_the_same(monkeypatch, reference, by_kernel):
-    """No middle sought sees across the border, however its view is turned and scaled."""
-    if not by_kernel:
-        monkeypatch.setattr("orthonav.core.register.search.KERNEL", None)
-    made, margin_px, poses = reference.window(LEVEL, 20, 30, 90, 84), 27, ALL_TURNS.poses[::3]
-    poses += [(turn, 0.2) for turn, _ in poses]
-    template = templates_of(GROUND, Pose(150.0, 130.0, 0.4, 0.1)).at(LEVEL)
-    half_px = largest_half_px(template, poses)
-    assert half_px > margin_px
-    small = SearchWindow(made, LEVEL, 20, 30, 55, margin_px, half_px)
-    large = SearchWindow(made, LEVEL, 20, 30, 55, margin_px, 200)
-    assert max(small.size) < 90 + 55 and min(large.size) >= 400
-    inner = slice(margin_px, -margin_px), slice(margin_px, -margin_px)
-    for number in range(len(poses)):
-        one, other = (
-            _best_of(template, window, poses, range(number, number + 1), None)[0][inner]
-            for window in (small, large)
-        )
-        np.testing.assert_allclose(one, other, atol=1e-3)
 
 
 def test_a_view_over_the_border_of_the_sheet(window):
@@ -196,7 +139,7 @@ def test_candidates_are_counted_sorted_and_apart(window):
     pose = Pose(200.0, 200.0, 0.0, 0.0)
     template = templates_of(GROUND, pose).at(LEVEL)
     apart = round(math.sqrt(template.pixels) / 8)
-    many = search(template, window, ALL_TURNS.poses[::4], 60)
+    many = search(template, window, ALL_TURNS[::4], 60)
     assert 20 < len(many) <= 60
     assert all(one.score >= other.score for one, other in pairwise(many))
     for number, one in enumerate(many):
@@ -204,32 +147,15 @@ def test_candidates_are_counted_sorted_and_apart(window):
             x = abs(one.pose.x_px - other.pose.x_px) / 2**LEVEL
             y = abs(one.pose.y_px - other.pose.y_px) / 2**LEVEL
             assert max(x, y) >= apart  # less half a pixel on either side
-    few = search(template, window, ALL_TURNS.poses[::4], 7)
+    few = search(template, window, ALL_TURNS[::4], 7)
     assert few == many[:7]
-
-
-def test_the_same_search_gives_the_same(reference, window):
-    pose = Pose(200.0, 200.0, 0.5, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    fresh = SearchWindow(reference.whole(LEVEL).copy(), LEVEL, 0, 0, 55)
-    first = search(template, window, ALL_TURNS.poses[::5], 10)
-    assert search(template, window, ALL_TURNS.poses[::5], 10) == first
-    assert search(template, fresh, ALL_TURNS.poses[::5], 10) == first
-
-
-def test_more_poses_never_lower_a_score(window):
-    pose = Pose(200.0, 200.0, 0.5, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    one = search(template, window, near(pose), 1)[0]
-    more = search(template, window, [*ALL_TURNS.poses[::6], *near(pose)], 1)[0]
-    assert more.score >= one.score - 1e-4 and apart_px(one.pose, more.pose) < 1e-3
 
 
 def test_a_view_of_elsewhere_stands_out_nowhere(window):
     elsewhere = Ground(seed=9)
     pose = Pose(200.0, 200.0, 0.5, 0.0)
-    here = search(templates_of(GROUND, pose).at(LEVEL), window, ALL_TURNS.poses[::3], 4)
-    there = search(templates_of(elsewhere, pose).at(LEVEL), window, ALL_TURNS.poses[::3], 4)
+    here = search(templates_of(GROUND, pose).at(LEVEL), window, ALL_TURNS[::3], 4)
+    there = search(templates_of(elsewhere, pose).at(LEVEL), window, ALL_TURNS[::3], 4)
     assert there[0].score < 0.5 * here[0].score
     assert there[0].score < 1.4 * there[1].score
 
@@ -242,7 +168,7 @@ def test_holes_of_the_map_attract_nothing():
     elsewhere = templates_of(Ground(seed=9), Pose(200.0, 200.0, 0.0, 0.0)).at(LEVEL)
     assert all(
         not (each.pose.x_px > 270 and each.pose.y_px < 170)
-        for each in search(elsewhere, window, ALL_TURNS.poses[::3], 12)
+        for each in search(elsewhere, window, ALL_TURNS[::3], 12)
     )
     for pose in (Pose(120.0, 280.0, 0.7, 0.0), Pose(250.0, 250.0, -0.7, 0.0)):
         best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]
@@ -285,20 +211,64 @@ def test_nothing_to_compare_is_no_crash(reference):
 def test_the_bank_reaches_what_is_likely(turn_std_deg, log_scale_std, turns, scales):
     std = None if turn_std_deg is None else math.radians(turn_std_deg)
     made = bank(std, log_scale_std, turn_step_rad=math.radians(8), scale_step=0.13, sigmas=3)
-    assert (len(made.turns_rad), len(made.log_scales)) == (turns, scales)
-    assert len(made.poses) == turns * scales == len(set(made.poses))
+    turns_rad, scales_tried = (np.unique(each) for each in zip(*made, strict=True))
+    assert (len(turns_rad), len(scales_tried)) == (turns, scales)
+    assert len(made) == turns * scales == len(set(made))
     if turns == 45:  # all around, with no gap where the circle closes
-        gaps = np.diff([*made.turns_rad, made.turns_rad[0] + 2 * math.pi])
+        gaps = np.diff([*turns_rad, turns_rad[0] + 2 * math.pi])
         np.testing.assert_allclose(gaps, math.radians(8))
     else:
         reach = 3 * std
-        off = np.abs(np.linspace(-reach, reach, 99)[:, None] - made.turns_rad).min(axis=1)
+        off = np.abs(np.linspace(-reach, reach, 99)[:, None] - turns_rad).min(axis=1)
         assert off.max() <= math.radians(4) + 1e-9
-        assert made.turns_rad.sum() == pytest.approx(0, abs=1e-9)
-    off = np.abs(np.linspace(-3, 3, 99)[:, None] * log_scale_std - made.log_scales).min(axis=1)
+        assert turns_rad.sum() == pytest.approx(0, abs=1e-9)
+    off = np.abs(np.linspace(-3, 3, 99)[:, None] * log_scale_std - scales_tried).min(axis=1)
     assert off.max() <= 0.065 + 1e-9
 
 
-def test_poses_are_every_turn_with_every_scale():
-    made = Bank(np.array([0.0, 1.0]), np.array([-0.1, 0.1]))
-    assert sorted(made.poses) == [(0.0, -0.1), (0.0, 0.1), (1.0, -0.1), (1.0, 0.1)]
+@pytest.fixture(scope="module")
+def windows(reference):
+    return SearchWindows(reference)
+
+
+def test_no_more_windows_are_kept_than_a_few():
+    windows = SearchWindows(reference_of(GROUND, (128, 128)))
+    for view_px in np.geomspace(20, 400, 25):
+        windows.whole(1, FINE, float(view_px))
+    assert len(windows._windows) == MAX_KEPT_WINDOWS
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_part_reaches_as_far_as_given(windows, level):
+    """Middles of views within the reach are sought, those well beyond it are not."""
+    centre, reach = (200.0, 170.0), 40.0
+    window = windows.part(level, FINE, VIEW_PX, centre, reach)
+    unit = 2**level
+    assert window.width < SHAPE[1] // unit
+    for x, y, inside in (
+        (0, 0, True),
+        (-39, 0, True),
+        (39, 39, True),
+        (0, -39, True),
+        (-39, 39, True),
+        (40 + 4 * unit, 0, False),
+        (0, -40 - 4 * unit, False),
+    ):
+        pose = Pose(centre[0] + x, centre[1] + y, 0.2, 0.0)
+        found = search(templates_of(GROUND, pose).at(level), window, [(pose.turn_rad, 0.0)], 5)
+        assert (apart_px(found[0].pose, pose) < 0.6 * unit) == inside
+        for each in found:
+            off = abs(each.pose.x_px - centre[0]), abs(each.pose.y_px - centre[1])
+            assert max(off) <= reach + 2.5 * unit
+
+
+@pytest.mark.parametrize(
+    "centre", [(5.0, 5.0), (440.0, 200.0), (-60.0, 190.0), (1e5, 1e5)], ids=str
+)
+def test_a_part_over_the_border_of_the_sheet(windows, centre):
+    window = windows.part(1, FINE, VIEW_PX, centre, 60.0)
+    pose = Pose(40.0, 50.0, 0.2, 0.0)
+    found = search(templates_of(GROUND, pose).at(1), window, [(0.2, 0.0)], 5)
+    assert all(math.isfinite(each.score) for each in found)
+    if centre == (5.0, 5.0):
+        assert apart_px(found[0].pose, pose) < 1.0

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.core.register.evidence import FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.sharpness import sharpness
 from orthonav.core.register.template import Template
+from orthonav.core.register.window import Reference
 
 SIDE, VIEW = 240, 96
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from scenes import Ground, as_grey, reference_of, seen, templates_of
 
-from orthonav.core.register.evidence import COARSE, FINE, GROUPS, evidence
+from orthonav.core.register.channels import COARSE, FINE, GROUPS
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import posed_channels, posed_half_px
 from orthonav.core.register.template import (
     BLOCKS,
+    JUDGED_PX,
+    Levels,
     Template,
     ViewTemplates,
     energy_of,
@@ -39,20 +41,6 @@ def ragged(shape=(96, 128)):
     return (np.abs(x - shape[1] / 2) < (0.25 + 0.25 * y / shape[0]) * shape[1]) & (
         np.hypot(x - 60, y - 40) > 9
     )
-
-
-@pytest.mark.parametrize("valid", [None, ragged()], ids=["whole", "ragged"])
-def test_each_kind_of_evidence_has_the_energy_of_its_weight(valid):
-    template = templates_of(GROUND, PLACE, valid=valid).at(0)
-    assert template.weights == (1.0, FINE.grey_share) and template.channels.shape == (3, 96, 128)
-    for group, weight in zip(GROUPS, template.weights, strict=True):
-        assert energy_of(template.channels[group]) == pytest.approx(weight, rel=1e-4)
-    assert template.whole == (valid is None)
-    assert (
-        template.pixels == template.mask.sum()
-        and not template.channels[:, template.mask == 0].any()
-    )
-    np.testing.assert_array_equal(np.moveaxis(template.interleaved, -1, 0), template.channels)
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (6, 40), (16, 16)])
@@ -107,29 +95,6 @@ def test_what_blocks_add_up_to_is_the_whole(shape):
     assert blocks[0, 1, 1, 1] == pytest.approx(float(rows @ rows), rel=1e-4)
 
 
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_planes_turn_with_their_picture(quarters):
-    """Clockwise: `rot90` turns a picture counter-clockwise, y being to the south."""
-    grey = as_grey(seen(GROUND, PLACE, (60, 80)))
-    plain = evidence(grey, np.ones(grey.shape, bool))
-    picture = np.ascontiguousarray(np.rot90(grey, -quarters))
-    turned = evidence(picture, np.ones(picture.shape, bool))
-    planes = turned_planes(np.ascontiguousarray(np.rot90(plain, -quarters)), quarters * math.pi / 2)
-    np.testing.assert_allclose(np.moveaxis(planes, 0, -1), turned, atol=2e-3)
-
-
-def test_planes_turned_back_are_the_same():
-    made = evidence(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
-    kept = made.copy()
-    there = turned_planes(made, 0.7)
-    np.testing.assert_allclose(
-        np.hypot(*there[:2]), np.hypot(made[..., 0], made[..., 1]), atol=1e-5
-    )
-    back = turned_planes(np.ascontiguousarray(np.moveaxis(there, 0, -1)), -0.7)
-    np.testing.assert_allclose(back, np.moveaxis(made, -1, 0), atol=1e-5)
-    np.testing.assert_array_equal(made, kept)
-
-
 @pytest.mark.parametrize("number, size", [(0, 0.7), (1, 0.7), (2, 0.02), (3, 0.02)])
 def test_derivatives_tell_how_the_view_changes_with_the_window(number, size):
     """Against views really moved, turned and scaled: directions are turned back by the pose."""
@@ -150,23 +115,6 @@ def test_derivatives_tell_how_the_view_changes_with_the_window(number, size):
         assert 0.6 < float((one * other).sum() / (one**2).sum()) < 1.1
 
 
-def test_hessians_are_the_products_of_the_derivatives():
-    template = templates_of(GROUND, PLACE, valid=ragged()).at(0)
-    for group, hessian in zip(GROUPS, template.hessians, strict=True):
-        rows = template.jacobian[group].astype(np.float64)
-        np.testing.assert_allclose(hessian, np.einsum("cphw,cqhw->pq", rows, rows), rtol=1e-3)
-        assert np.linalg.eigvalsh(hessian).min() > 0
-    assert not template.jacobian[:, :, template.mask == 0].any()
-
-
-@pytest.mark.parametrize("shape", [(96, 128), (50, 34), (7, 9)])
-def test_blocks_cut_the_whole_window(shape):
-    template = Template.of(np.zeros(shape, np.uint8), np.ones(shape, bool), 0, FINE)
-    for starts, side in zip(template.block_starts, shape, strict=True):
-        assert len(starts) == BLOCKS and starts[0] == 0 and (np.diff(starts) > 0).all()
-        assert side - starts[-1] <= side / BLOCKS + 1
-
-
 def test_coarser_templates_show_the_same_window():
     """Halved about the same middle: a level down, the pixels cover four of the one above."""
     views = templates_of(GROUND, PLACE, (96, 128))
@@ -178,13 +126,6 @@ def test_coarser_templates_show_the_same_window():
     fours = as_grey(seen(GROUND, PLACE, (96, 128))).reshape(48, 2, 64, 2).mean(axis=(1, 3))
     expected = Template.of(np.rint(fours).astype(np.uint8), np.ones((48, 64), bool), 1, FINE)
     np.testing.assert_allclose(views.at(1).channels, expected.channels, atol=2e-3)
-
-
-def test_levels_count_from_the_finest():
-    grey = as_grey(seen(GROUND, PLACE, (64, 64)))
-    views = ViewTemplates(grey, np.ones(grey.shape, bool), 2)
-    assert views.at(2).level == 2 and views.at(2).mask.shape == (64, 64)
-    assert views.at(4).mask.shape == (16, 16)
 
 
 def test_halving_keeps_only_pixels_that_are_valid_all_over():
@@ -200,14 +141,33 @@ def test_halving_keeps_only_pixels_that_are_valid_all_over():
     np.testing.assert_array_equal(valid, kept[1])
 
 
-def test_halving_a_whole_view_keeps_it_whole():
-    smaller, inside = halved(np.full((8, 12), 7, np.uint8), np.ones((8, 12), bool))
-    assert smaller.shape == inside.shape == (4, 6) and inside.all() and (smaller == 7).all()
-
-
 def test_masks_do_not_shift_what_is_seen():
     """A view cut by a mask says of its inner part what the whole view says."""
     whole, cut = (templates_of(GROUND, PLACE, valid=v).at(0) for v in (None, ragged()))
     inner = cv2.erode(ragged().astype(np.uint8), np.ones((9, 9))) > 0
     for group in GROUPS:
         assert alike(whole.channels[group][:, inner], cut.channels[group][:, inner]) > 0.97
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3, 7, 12])
+def test_levels_of_any_view(levels):
+    judged = []
+    for view_px in (1e-9, 0.5, 1.0, 20.0, 72.0, 110.0, 300.0, 1000.0, 3e4, 1e9):
+        made = Levels.of(view_px, levels)
+        assert 0 <= made.final <= made.judged <= made.coarse <= levels - 1
+        assert made.coarse - made.judged <= 1 and made.judged - made.final <= 1
+        if 0 < made.judged < levels - 1:
+            assert JUDGED_PX / 1.5 < view_px / 2**made.judged < JUDGED_PX * 1.5
+        judged.append(made.judged)
+        for level in range(levels):
+            assert made.recipe(level) == (COARSE if level > made.judged else FINE)
+    assert judged == sorted(judged) and judged[0] == 0 and judged[-1] == levels - 1
+
+
+def test_the_side_of_a_view_is_the_root_of_what_is_seen():
+    valid = np.zeros((96, 128), bool)
+    valid[:, :48] = True
+    grey = as_grey(seen(GROUND, Pose(100.0, 100.0, 0.0, 0.0), (96, 128)))
+    views = ViewTemplates(np.where(valid, grey, 0), valid, 2)
+    # The border of what is seen does not count: two pixels.
+    assert views.side_px == pytest.approx(4 * math.sqrt(96 * 46), rel=0.01)

@@ -15,7 +15,7 @@ from orthonav.core.tiles.learned import VARIABLE, LearnedEdges
 from orthonav.core.tiles.represent import TABLE
 from orthonav.core.variants import make_variant, variant_from_recipe
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.methods import stored_representation
+from orthonav.ground.build.encoders import stored_representation
 
 DOUBLE = onnx.TensorProto.DOUBLE
 

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from recorders import HEIGHT, START_S, WIDTH, picture
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -29,16 +30,21 @@ class Messages:
         self.store.register(get_types_from_msg(ALTITUDE, "mavros_msgs/msg/Altitude"))
 
     def new(self, name, **fields):
-        return self.store.types[name](**fields)
+        """A message of that type; fields that are not given are zero or empty."""
+        values = {field: self._zero(*kind) for field, kind in self.store.fielddefs[name][1]}
+        return self.store.types[name](**values | fields)
 
-    def header(self, time_ns, frame="camera"):
+    def _zero(self, node, what):
+        if node == Nodetype.NAME:
+            return self.new(what)
+        if node == Nodetype.BASE:
+            return {"string": "", "bool": False}.get(what[0], 0)
+        return np.zeros(what[1] if node == Nodetype.ARRAY else 0, dtype=np.float64)
+
+    def header(self, time_ns):
         sec, nanosec = divmod(time_ns, 10**9)
         stamp = self.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        more = {"seq": 0} if self.ros1 else {}
-        return self.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **more)
-
-    def vector(self, x=0.0, y=0.0, z=0.0):
-        return self.new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        return self.new("std_msgs/msg/Header", stamp=stamp)
 
     def turn(self, yaw, pitch=0.0, roll=0.0):
         """A quaternion as ROS counts: ENU from forward-left-up, Z-Y-X in degrees."""
@@ -47,42 +53,23 @@ class Messages:
 
     def image(self, time_ns, pixels, encoding="mono8", **changes):
         rows, columns = pixels.shape[:2]
-        step = pixels[0].nbytes
         fields = {
             "header": self.header(time_ns),
             "height": rows,
             "width": columns,
             "encoding": encoding,
-            "is_bigendian": 0,
-            "step": step,
+            "step": pixels[0].nbytes,
             "data": np.frombuffer(pixels.tobytes(), dtype=np.uint8),
         }
         return self.new("sensor_msgs/msg/Image", **(fields | changes))
 
     def compressed(self, time_ns, grey, suffix=".jpg"):
-        data = cv2.imencode(suffix, grey)[1].ravel()
-        return self.new(
-            "sensor_msgs/msg/CompressedImage",
-            header=self.header(time_ns),
-            format=suffix[1:],
-            data=data,
-        )
+        header, data = self.header(time_ns), cv2.imencode(suffix, grey)[1].ravel()
+        name = "sensor_msgs/msg/CompressedImage"
+        return self.new(name, header=header, format=suffix[1:], data=data)
 
     def camera_info(self, model="plumb_bob", lens=(0.0,) * 5, **changes):
-        roi = self.new(
-            "sensor_msgs/msg/RegionOfInterest",
-            x_offset=0,
-            y_offset=0,
-            height=0,
-            width=0,
-            do_rectify=False,
-        )
-        matrices = {
-            "k": np.array([60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1]),
-            "r": np.eye(3).ravel(),
-            "p": np.zeros(12),
-            "d": np.array(lens),
-        }
+        matrices = {"k": np.array([60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1]), "d": np.array(lens)}
         if self.ros1:
             matrices = {name.upper(): value for name, value in matrices.items()}
         fields = {
@@ -91,86 +78,40 @@ class Messages:
             "width": WIDTH,
             "distortion_model": model,
             **matrices,
-            "binning_x": 0,
-            "binning_y": 0,
-            "roi": roi,
         }
         return self.new("sensor_msgs/msg/CameraInfo", **(fields | changes))
 
     def imu(self, time_ns, turn, known=True):
         nine = np.zeros(9)
         nine[0] = 0.0 if known else -1.0
-        return self.new(
-            "sensor_msgs/msg/Imu",
-            header=self.header(time_ns, "base_link"),
-            orientation=turn,
-            orientation_covariance=nine,
-            angular_velocity=self.vector(),
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=self.vector(),
-            linear_acceleration_covariance=np.zeros(9),
-        )
+        header = self.header(time_ns)
+        name = "sensor_msgs/msg/Imu"
+        return self.new(name, header=header, orientation=turn, orientation_covariance=nine)
 
     def odometry(self, time_ns, turn, forward=5.0, left=0.0):
-        pose = self.new(
-            "geometry_msgs/msg/Pose",
-            position=self.new("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0),
-            orientation=turn,
-        )
-        twist = self.new(
-            "geometry_msgs/msg/Twist", linear=self.vector(forward, left), angular=self.vector()
-        )
-        return self.new(
-            "nav_msgs/msg/Odometry",
-            header=self.header(time_ns, "odom"),
-            child_frame_id="base_link",
-            pose=self.new(
-                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
-            ),
-            twist=self.new(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
-            ),
-        )
+        odometry = self.new("nav_msgs/msg/Odometry", header=self.header(time_ns))
+        odometry.pose.pose.orientation = turn
+        odometry.twist.twist.linear = self.new("geometry_msgs/msg/Vector3", x=forward, y=left)
+        return odometry
 
     def fix(self, time_ns, lat=46.5, lon=2.5, alt=400.0, status=0):
         return self.new(
             "sensor_msgs/msg/NavSatFix",
-            header=self.header(time_ns, "gps"),
+            header=self.header(time_ns),
             status=self.new("sensor_msgs/msg/NavSatStatus", status=status, service=1),
             latitude=lat,
             longitude=lon,
             altitude=alt,
-            position_covariance=np.zeros(9),
-            position_covariance_type=0,
         )
 
     def range(self, time_ns, metres):
-        more = {} if self.ros1 or "variance" not in self._fields("Range") else {"variance": 0.0}
-        return self.new(
-            "sensor_msgs/msg/Range",
-            header=self.header(time_ns),
-            radiation_type=1,
-            field_of_view=0.1,
-            min_range=0.2,
-            max_range=120.0,
-            range=metres,
-            **more,
-        )
-
-    def _fields(self, name):
-        return self.store.types[f"sensor_msgs/msg/{name}"].__dataclass_fields__
+        header, limits = self.header(time_ns), {"min_range": 0.2, "max_range": 120.0}
+        return self.new("sensor_msgs/msg/Range", header=header, **limits, range=metres)
 
     def altitude(self, time_ns, relative, clearance):
-        return self.new(
-            "mavros_msgs/msg/Altitude",
-            header=self.header(time_ns),
-            monotonic=0.0,
-            amsl=400.0,
-            local=0.0,
-            relative=relative,
-            terrain=0.0,
-            bottom_clearance=clearance,
-        )
+        header, heights = self.header(time_ns), {"amsl": 400.0, "relative": relative}
+        name = "mavros_msgs/msg/Altitude"
+        return self.new(name, header=header, **heights, bottom_clearance=clearance)
 
     def number(self, value):
         return self.new("std_msgs/msg/Float64", data=value)

@@ -183,16 +183,16 @@ def quaternion_wxyz(yaw, pitch, roll):
 
 
 def ulog(path, topics):
-    """A ULog by pyulog's own writer. `topics`: name -> (fields {name: type}, rows of tuples)."""
+    """A ULog by pyulog's own writer. `topics`: name -> (fields as its format has them, rows)."""
     from pyulog.core import ULog
 
     log = ULog(None)
     codes = ULog._UNPACK_TYPES
-    for number, (name, (fields, rows)) in enumerate(topics.items()):
-        text = ";".join(f"{kind} {field}" for field, kind in fields.items())
+    for number, (name, (text, rows)) in enumerate(topics.items()):
         log._message_formats[name] = ULog.MessageFormat(f"{name}:{text};".encode(), None)
         flat = {}
-        for field, kind in fields.items():
+        for part in text.split(";"):
+            kind, field = part.split()
             base, _, size = kind.partition("[")
             names = [f"{field}[{i}]" for i in range(int(size[:-1]))] if size else [field]
             flat.update(dict.fromkeys(names, base))
@@ -211,52 +211,35 @@ def ulog(path, topics):
     return path
 
 
+PLACE = "uint64_t timestamp;double lat;double lon;float alt"
+
+
 def px4_topics(seconds=10, boot_us=5_000_000, sensor=True):
     """A flight as PX4 logs it."""
     attitude, local, place, gps = [], [], [], []
     for t, yaw, pitch, roll in flown(seconds):
         stamp = boot_us + round(t * 1e6)
         attitude.append((stamp, *quaternion_wxyz(yaw, pitch, roll)))
-        local.append((stamp, 3.0, -1.0, -100.0 - t, 90.0 + t, t < 8, 1))
+        # Without a sensor the estimator guesses a height and calls it valid.
+        bottom = (90.0 + t, t < 8, 1) if sensor else (0.1, True, 0)
+        local.append((stamp, 3.0, -1.0, -100.0 - t, *bottom))
         place.append((stamp, 46.5, 2.5, 400.0 + t))
         gps.append((stamp, START_S * 10**6 + round(t * 1e6), 465_000_000, 25_000_000, 400_000, 3))
-    stamp, double, single = "uint64_t", "double", "float"
-    topics = {
-        "vehicle_attitude": ({"timestamp": stamp, "q": "float[4]"}, attitude),
+    return {
+        "vehicle_attitude": ("uint64_t timestamp;float[4] q", attitude),
         "vehicle_local_position": (
-            {
-                "timestamp": stamp,
-                "vx": single,
-                "vy": single,
-                "z": single,
-                "dist_bottom": single,
-                "dist_bottom_valid": "bool",
-                "dist_bottom_sensor_bitfield": "uint8_t",
-            },
-            # Without a sensor the estimator guesses a height and calls it valid.
-            local if sensor else [(*row[:4], 0.1, True, 0) for row in local],
+            "uint64_t timestamp;float vx;float vy;float z;float dist_bottom;bool dist_bottom_valid"
+            ";uint8_t dist_bottom_sensor_bitfield",
+            local,
         ),
-        "vehicle_global_position": (
-            {"timestamp": stamp, "lat": double, "lon": double, "alt": single},
-            place,
-        ),
-        "home_position": (
-            {"timestamp": stamp, "lat": double, "lon": double, "alt": single},
-            [(boot_us, 46.5, 2.5, 280.0)],
-        ),
+        "vehicle_global_position": (PLACE, place),
+        "home_position": (PLACE, [(boot_us, 46.5, 2.5, 280.0)]),
         "vehicle_gps_position": (
-            {
-                "timestamp": stamp,
-                "time_utc_usec": stamp,
-                "lat": "int32_t",
-                "lon": "int32_t",
-                "alt": "int32_t",
-                "fix_type": "uint8_t",
-            },
+            "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt"
+            ";uint8_t fix_type",
             gps,
         ),
     }
-    return topics
 
 
 DATAFLASH = {

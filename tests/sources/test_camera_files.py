@@ -9,7 +9,7 @@ import pytest
 import yaml
 from recorders import camera_file
 
-from orthonav.core.errors import CameraError, MissingFileError
+from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 
@@ -83,13 +83,6 @@ def test_opencv(tmp_path, name):
     assert read_camera_file(long) == expected(BROWN)
 
 
-def test_opencv_of_before_version_5(tmp_path):
-    path = opencv(tmp_path / "camera.yaml")
-    path.write_text(path.read_text().replace("%YAML 1.2", "%YAML:1.0"))
-    assert path.read_text().startswith("%YAML:1.0")
-    assert read_camera_file(path) == expected(BROWN)
-
-
 def test_ros(tmp_path):
     assert read_camera_file(ros(tmp_path / "a.yaml")) == expected(BROWN)
     rational = ros(tmp_path / "b.yaml", "rational_polynomial", [*BROWN, 0, 0, 0])
@@ -126,14 +119,6 @@ def test_one_camera_of_a_file_that_is_no_chain(tmp_path, made):
         read_camera_file(tmp_path / "a.yaml#cam1")
 
 
-def test_our_own(tmp_path):
-    path = camera_file(tmp_path / "flight.json", distortion=FISHEYE, model="fisheye")
-    camera = read_camera_file(path)
-    assert (camera.model, camera.distortion) == ("fisheye", tuple(FISHEYE))
-    assert camera.cx_px == 32.0
-    assert read_camera_file(camera_file(tmp_path / "old.json")).model == "brown"
-
-
 def written(text):
     def write(path):
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -167,8 +152,3 @@ def test_invalid_camera_files_are_rejected(tmp_path, name, capfd):
     with pytest.raises(CameraError, match=message) as caught:
         read_camera_file(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(MissingFileError, match="camera file"):
-        read_camera_file(tmp_path / "none.yaml")

@@ -10,7 +10,7 @@ import pytest
 from bags import Messages, record
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from recorders import START_S, camera_file, dji, packet, photo, place, tlog, video
+from recorders import START_S, camera_file, packet, photo, place, tlog, video
 
 from orthonav.core.flight import FlightWriter, open_flight, read_image
 from orthonav.core.flight.fixes import read_results
@@ -159,35 +159,6 @@ def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
     assert code == 0 and "2 views: 2 confident" in out and "ground truth is ignored: line 2" in err
 
 
-def test_doubtful_input_causes_a_warning(run, tmp_path):
-    for index in range(3):
-        photo(tmp_path / f"photos/{index}.jpg", f"2023:11:14 22:13:2{index}", seed=index)
-    data = (tmp_path / "photos/1.jpg").read_bytes()
-    (tmp_path / "photos/1.jpg").write_bytes(data[:-200])
-    code, out, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight")
-    assert code == 0 and "2 views, 0 with heading" in out
-    assert "good to 3 %: 35 mm equivalent of EXIF" in err
-    assert "1 views left out, the first" in err and "1.jpg" in err
-    assert "2 of 2 views lack heading, pitch, roll or height" in err
-    note = json.loads((tmp_path / "flight/flight.json").read_text())["note"]
-    assert "35 mm equivalent of EXIF" in note
-    assert not (tmp_path / "flight/truth.csv").exists()
-    quiet = run("import", tmp_path / "photos", "--out", tmp_path / "quiet", "-q")
-    assert quiet[0] == 0 and quiet[2] == ""
-    located = run("localize", MAP, tmp_path / "photos", "--out", tmp_path / "fixes.jsonl")
-    assert located[0] == 1 and "1.jpg" in located[2] and not (tmp_path / "fixes.jsonl").exists()
-    skipped = ("localize", MAP, tmp_path / "photos", "--out", tmp_path / "f", "--skip-bad-images")
-    assert run(*skipped)[0] == 0
-    reasons = [result.outcome.reason for result in read_results(tmp_path / "f")]
-    assert reasons == ["missing_telemetry", "bad_image", "missing_telemetry"]
-
-
-def test_verbose_says_nothing_of_every_tag(run, tmp_path):
-    photographs(tmp_path / "photos")
-    code, _, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight", "-v")
-    assert code == 0 and "tag:" not in err and len(err.splitlines()) < 20
-
-
 def truncated(path):
     path.write_bytes(path.read_bytes()[:700])
     return path
@@ -227,30 +198,6 @@ def test_damaged_input_is_one_line_and_nothing_is_written(run, how, tmp_path, ca
     assert names_in(tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    "options",
-    [["--topic", "image"], ["--jpeg-quality", "101"], ["--kind", "film"], ["--mount-deg", "1"]],
-)
-def test_wrong_usage(run, tmp_path, options):
-    code, out, err = run("import", tmp_path, "--out", tmp_path / "flight", *options)
-    assert code == 2 and out == "" and "usage: orthonav import" in err
-
-
-def test_the_kind_may_be_given(run, tmp_path, camera):
-    source = folder_of(tmp_path / "recorded")
-    code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "ros")
-    assert code == 1 and err.count("\n") == 1
-    code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "video")
-    assert code == 1 and "expected a file" in err
-
-
-def test_an_existing_output_is_not_replaced(run, tmp_path, names_in):
-    source = folder_of(tmp_path / "recorded")
-    before = names_in(tmp_path)
-    code, _, err = run("import", source, "--out", source)
-    assert code == 1 and "not empty" in err and names_in(tmp_path) == before
-
-
 def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
     source, camera = photographs(tmp_path / "photos"), ["--camera", camera]
     for index in range(2):
@@ -261,24 +208,6 @@ def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
         add_gps(source / f"{index}.png", place(*PLACE))
     _, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
     assert "from the map" not in err
-
-
-def test_a_photograph_that_was_turned_in_an_editor_is_placed(run, tmp_path, camera):
-    """It keeps its old angles, and is named by its software."""
-    xmp = dji(yaw=20.0, height=160.0)
-    path = photo(tmp_path / "photos/a.png", xmp=xmp, first={0x0131: "Windows Photo Viewer 10"})
-    with Image.open(path) as written:
-        tags, text = written.getexif(), written.info["XML:com.adobe.xmp"]
-    info = PngInfo()
-    info.add_itxt("XML:com.adobe.xmp", text)
-    Image.fromarray(seen(0)[::-1, ::-1].copy()).save(path, exif=tags, pnginfo=info)
-    out = tmp_path / "a.jsonl"
-    code, _, err = run("localize", MAP, tmp_path / "photos", "--camera", camera, "--out", out)
-    assert code == 0 and "1 of 1 photographs were written by an editor" in err
-    (result,) = read_results(out)
-    off = np.subtract((result.outcome.lat_deg, result.outcome.lon_deg), PLACE)
-    assert np.abs(off * [111e3, 76e3]).max() < 2
-    assert result.outcome.heading_deg == pytest.approx(200, abs=1)
 
 
 def test_one_photograph_is_placed_and_printed(run, tmp_path):

@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 import struct
 import time
 import tracemalloc
@@ -17,8 +16,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from orthonav.core.errors import FlightError, OrthonavError
-from orthonav.core.flight import open_flight, read_image
-from orthonav.core.flight import png as png_module
+from orthonav.core.flight import logged as png_module
 from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
     PROFILE,
@@ -27,13 +25,13 @@ from orthonav.core.flight.logged import (
     VIEW,
     LoggedView,
     camera_plain,
+    lossless_png,
     picture_message,
     telemetry_message,
     to_json,
     view_of,
 )
 from orthonav.core.flight.mount import Bias, Mount, write_mount
-from orthonav.core.flight.png import lossless_png
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
@@ -44,9 +42,8 @@ from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings import SourceOptions, open_source, source_kind
 from orthonav.ground.recordings import flightlog as flightlog_module
 from orthonav.onboard import log as log_module
-from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.log import FlightLog
-from orthonav.onboard.run import locate_view
+from orthonav.onboard.run import MountCorrected, locate_view, model_of
 from orthonav.onboard.segment import Segment
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -219,17 +216,6 @@ def test_invalid_options_are_rejected(map_path, tmp_path, run, options):
     assert done.code == 1 and done.err.count("\n") == 1 and "flight log: invalid" in done.err
 
 
-def test_an_import_has_the_same_pictures(tmp_path, run):
-    path = short_log(tmp_path / "log")
-    done = run("import", path, "--out", tmp_path / "flight")
-    assert done.code == 0
-    views = open_flight(tmp_path / "flight").views
-    assert [view.frame for view in views] == [f"{index:06d}.png" for index in range(5)]
-    for index, view in enumerate(views):
-        assert np.array_equal(read_image(view.path), picture(index))
-        assert view.telemetry.time_ns == telemetry(index).time_ns
-
-
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 known = st.floats(allow_nan=False, allow_infinity=False)
 NAMED = ("time_ns", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "prior", "vel_en_mps", "below")
@@ -283,15 +269,6 @@ def test_two_flights_in_a_folder(tmp_path):
         open_source(tmp_path)
 
 
-@pytest.mark.parametrize("views", ["none", "thumbnails"])
-def test_a_log_without_images_is_an_error(tmp_path, run, views):
-    path = short_log(tmp_path, views=views)
-    with pytest.raises(FlightError, match=f"no full images \\(views: {views}\\)"):
-        open_source(path)
-    done = run("import", path, "--out", tmp_path / "flight")
-    assert done.code == 1 and done.err.count("\n") == 1
-
-
 def test_an_image_unusable_in_flight_is_unusable_again(tmp_path):
     log = FlightLog(tmp_path / "flight.mcap", CAMERA, {})
     log.view(0, "0.png", picture(0), telemetry(0))
@@ -342,24 +319,6 @@ def test_a_log_may_end_anywhere(tmp_path, content):
         assert (len(opened.warnings) == 1) == (cut < ends[-1][0] + 9)
 
 
-def test_flipped_bits_are_detected(tmp_path, content):
-    data, _ = content
-    path = tmp_path / "flight_0001.mcap"
-    rng = np.random.default_rng(1)
-    for at, bit in zip(rng.integers(0, len(data), 120), rng.integers(0, 8, 120), strict=True):
-        broken = bytearray(data)
-        broken[at] ^= 1 << int(bit)
-        path.write_bytes(broken)
-        try:
-            views = list(open_source(path).views)
-            for view in views:
-                index = int(view.frame[:6])
-                assert np.array_equal(view.grey(), picture(index))
-                assert repr(view.telemetry) == repr(telemetry(index))
-        except OrthonavError:
-            continue
-
-
 @given(st.data())
 @settings(max_examples=100, deadline=None)
 def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, content, data):
@@ -371,7 +330,7 @@ def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, co
     path.write_bytes(whole[:first] + middle + whole[last:])
     try:
         for view in open_source(path, SourceOptions(kind="log")).views:
-            view.grey()
+            assert np.array_equal(view.grey(), picture(int(view.frame[:6])))
     except OrthonavError:
         pass
 
@@ -605,14 +564,3 @@ def test_results_that_are_broken_are_passed_over(tmp_path):
     assert result.outcome.reason == "blank"
     messages = [session(), reported(), shown(), (log_module.RESULT, 0, b"{}")]
     assert list(open_source(crafted(tmp_path / "a.mcap", messages)).results()) == []
-
-
-def test_it_may_lie_in_a_read_only_place(tmp_path, content):
-    shutil.rmtree(tmp_path / "log", ignore_errors=True)
-    (tmp_path / "log").mkdir()
-    path = tmp_path / "log" / "flight_0001.mcap"
-    path.write_bytes(content[0])
-    path.chmod(0o444)
-    (tmp_path / "log").chmod(0o555)
-    assert open_source(tmp_path / "log").expected == 5
-    (tmp_path / "log").chmod(0o755)

@@ -4,7 +4,6 @@ import math
 from types import SimpleNamespace
 
 import cv2
-import numpy as np
 import pytest
 from recorders import dji, photo, picture, place
 
@@ -117,11 +116,6 @@ def test_what_is_missing_is_named(images):
     assert math.isnan(zero.by["a.png"].telemetry.agl_m), "0 was not measured"
 
 
-def test_units_and_decimal_commas(images):
-    found = views_of(images, "file;yaw;height (ft)\na.png;20,5;1.000,0\n".replace("1.000", "1000"))
-    assert angles(found.by["a.png"]) == pytest.approx((20.5, 0, 0, 304.8))
-
-
 @pytest.mark.parametrize(
     "table, message",
     [
@@ -190,9 +184,6 @@ def test_single_photographs(images):
         open_source([images / "a.png", images / "a.txt"], options)
 
 
-def test_a_height_that_is_given_replaces_the_recorded_one(tmp_path):
-    path = photo(tmp_path / "a.jpg", xmp=dji(height=80.0))
-    recording = open_source(path, SourceOptions(agl_m=120.0))
-    (view,) = recording.views
-    assert view.telemetry.agl_m == 120 and not any("level" in each for each in recording.warnings)
-    assert np.array_equal(view.grey(), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+def test_units_and_decimal_commas(images):
+    found = views_of(images, "file;yaw;height (ft)\na.png;20,5;1.000,0\n".replace("1.000", "1000"))
+    assert angles(found.by["a.png"]) == pytest.approx((20.5, 0, 0, 304.8))

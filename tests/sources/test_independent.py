@@ -25,7 +25,6 @@ from recorders import (
     photo,
     place,
     px4_topics,
-    subtitles,
     tlog,
     ulog,
 )
@@ -33,9 +32,8 @@ from recorders import (
 from orthonav.core.errors import FlightError
 from orthonav.ground.recordings import open_source
 from orthonav.ground.recordings.exif import read_photo
-from orthonav.ground.recordings.logs import read_log
-from orthonav.ground.recordings.photo_poses import poses_of
-from orthonav.ground.recordings.subtitles import read_srt
+from orthonav.ground.recordings.logs import read_log, read_srt
+from orthonav.ground.recordings.photos import posed
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = (
@@ -125,7 +123,8 @@ def compare(path):
 
 def compare_pose(ours, tags):
     """Heading and tilt: of the gimbal, of the body where a camera has none."""
-    (pose,), _ = poses_of([ours])
+    (photo,), _ = posed([ours])
+    pose = photo.pose
     heading = first(tags, "XMP-drone-dji:GimbalYawDegree", "DJI:CameraYaw", "XMP-sensefly:Heading")
     pitch = first(tags, "XMP-drone-dji:GimbalPitchDegree", "DJI:CameraPitch")
     ahead = pitch + 90 if math.isfinite(pitch) else first(tags, "XMP-sensefly:PitchAngle")
@@ -251,12 +250,6 @@ def test_recorded_subtitles_are_in_their_country(path):
     if heights:
         seen = {round(float(value), 2) for value in track.home.values[:, 0]}
         assert seen <= {float(height) for height in heights}
-
-
-def test_latitude_and_longitude_of_subtitles_are_not_swapped(tmp_path):
-    first_latitude = "2022.06.21 16:06:17\nGPS(36.6146,-6.1120,0.0M) BAROMETER:0.3M"
-    path = subtitles(tmp_path / "a.srt", [first_latitude] * 3)
-    assert read_srt(path).position.values[0, :2] == pytest.approx((36.6146, -6.112))
 
 
 @pytest.mark.parametrize("path", recorded("bags", ".mcap"))

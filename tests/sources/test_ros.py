@@ -1,12 +1,17 @@
 """ROS 1 and ROS 2 recordings and MCAP files: topics, images, cameras, and what is broken."""
 
+import bz2
 import math
+import struct
 import tracemalloc
+from dataclasses import dataclass
 from io import BytesIO
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from bags import FORMATS, Messages, flight, record
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
@@ -17,8 +22,9 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.ros_images import camera_of_info, grey_of_image
-from orthonav.ground.recordings import SourceOptions, import_flight, open_source
+from orthonav.core.flight.ros_messages import camera_of_info, grey_of_image
+from orthonav.ground.recordings import SourceOptions, import_flight, open_source, ros_files
+from orthonav.ground.recordings.ros_files import bound_inflation, check_held
 
 MIDDLE = (START_S * 2 + 1) * 5 * 10**8  # of the first image: half a second
 
@@ -54,25 +60,6 @@ def test_every_format(tmp_path, form):
     for view, step in zip(written.views, (5, 15, 25, 35), strict=True):
         assert np.array_equal(view.grey(), picture(step))
     assert read_truth(tmp_path / "out/truth.csv")["000001.png"] == (46.5015, 2.5)
-
-
-def test_the_velocity_between_distant_images_is_the_mean(tmp_path, messages, topics):
-    """The heading turns from 355 to 15 deg in 2 s, at 5 m/s."""
-    topics["/cam/image_raw"] = topics["/cam/image_raw"][:3:2]
-    first, second = open_source(record(tmp_path / "flight", topics, messages)).views
-    assert second.telemetry.time_ns - first.telemetry.time_ns == 2 * 10**9
-    speed, course = 5 * math.sin(math.radians(10)) / math.radians(10), math.radians(5)
-    expected = speed * math.sin(course), speed * math.cos(course)
-    assert second.telemetry.vel_en_mps == pytest.approx(expected, abs=0.01)
-
-
-@pytest.mark.parametrize("form", [*FORMATS, "file"])
-def test_the_kind_is_found_by_content(tmp_path, form):
-    messages = Messages(ros1=form == "bag")
-    path = record(tmp_path / "flight", flight(messages), messages, form)
-    if path.is_file():
-        path = path.rename(tmp_path / "recorded.dat")
-    assert len(list(open_source(path).views)) == 4
 
 
 def test_compressed_images_are_copied(tmp_path, messages, topics):
@@ -238,12 +225,6 @@ def test_without_attitude_nothing_is_made_up(tmp_path, messages, topics):
     )
 
 
-def test_no_fix_is_no_position(tmp_path, messages, topics):
-    topics["/fix"] = [(t, messages.fix(t, status=-1)) for t, _ in topics["/fix"]]
-    recording = open_source(record(tmp_path / "flight", topics, messages))
-    assert next(recording.views).truth_latlon_deg is None
-
-
 @pytest.mark.parametrize("form", FORMATS)
 def test_one_broken_message_does_not_end_it(tmp_path, form):
     messages = Messages(ros1=form == "bag")
@@ -375,17 +356,6 @@ def test_a_database_that_was_cut_short_names_the_tool(tmp_path, messages, topics
         open_source(path)
 
 
-def test_a_bag_without_an_index_names_the_tool(tmp_path):
-    messages = Messages(ros1=True)
-    path = record(tmp_path / "flight", flight(messages), messages, "bag")
-    data = bytearray(path.read_bytes())
-    at = data.index(b"index_pos=") + len(b"index_pos=")
-    data[at : at + 8] = bytes(8)
-    path.write_bytes(data)
-    with pytest.raises(FlightError, match="rosbag reindex"):
-        open_source(path)
-
-
 def test_pictures_are_not_held(tmp_path, messages):
     """Peak memory is that of a few pictures, not of all 60 (18 MB)."""
     image = picture(0, 640, 480)
@@ -403,12 +373,6 @@ def test_pictures_are_not_held(tmp_path, messages):
         assert tracemalloc.get_traced_memory()[1] < 20 * image.nbytes
     finally:
         tracemalloc.stop()
-
-
-def test_a_bag_without_images_is_rejected(tmp_path, messages, topics):
-    del topics["/cam/image_raw"]
-    with pytest.raises(FlightError, match="expected one topic of images, found none"):
-        open_source(record(tmp_path / "flight", topics, messages))
 
 
 EVENT = """service_msgs/ServiceEventInfo info
@@ -449,3 +413,121 @@ def test_topics_that_cannot_be_parsed_are_passed_over(tmp_path, messages, kind, 
             writer.write(made, START_S * 10**9, raw)
     (view,) = open_source(path).views
     assert view.grey().shape == picture().shape
+
+
+MB = 2**20
+
+
+def zeros(size, compressor):
+    """`size` zeros in a few kilobytes, made in pieces."""
+    pieces = [compressor.compress(bytes(MB)) for _ in range(size // MB)]
+    return b"".join(pieces) + compressor.flush()
+
+
+def frame_of_zeros(size):
+    writer = lz4.frame.LZ4FrameCompressor()
+    return writer.begin() + zeros(size, writer)
+
+
+BOMBS = {
+    "zstd": zeros(512 * MB, zstandard.ZstdCompressor().compressobj(size=512 * MB)),
+    "zstd without a stated size": zeros(512 * MB, zstandard.ZstdCompressor().compressobj()),
+    "lz4": frame_of_zeros(512 * MB),
+}
+
+
+def text(data):
+    return struct.pack("<I", len(data)) + data
+
+
+def line(opcode, body):
+    return bytes([opcode]) + struct.pack("<Q", len(body)) + body
+
+
+def unindexed(path, data, claimed, kind):
+    """An MCAP of one chunk, without an index."""
+    body = struct.pack("<QQQI", 0, 1, claimed, 0) + text(kind) + struct.pack("<Q", len(data)) + data
+    magic = b"\x89MCAP0\r\n"
+    head = line(1, text(b"ros2") + text(b""))
+    end = line(15, bytes(4)) + line(2, bytes(20))
+    path.write_bytes(magic + head + line(6, body) + end + magic)
+    return path
+
+
+@pytest.mark.parametrize("how", BOMBS)
+@pytest.mark.parametrize("claimed", [100, 512 * MB, 2**62])
+def test_chunks_of_mcap(tmp_path, how, claimed):
+    path = unindexed(tmp_path / "a.mcap", BOMBS[how], claimed, how.split()[0].encode())
+    tracemalloc.start()
+    try:
+        with pytest.raises(FlightError, match=r"more than|mismatch") as caught:
+            open_source(path)
+        assert tracemalloc.get_traced_memory()[1] < 30e6
+    finally:
+        tracemalloc.stop()
+    assert str(path) in str(caught.value)
+
+
+def test_chunks_of_ros_1(monkeypatch):
+    bound_inflation()
+    from rosbags.rosbag1 import reader
+
+    monkeypatch.setattr(ros_files, "MAX_CHUNK_BYTES", MB)
+    for name, pack in (("bz2", bz2.compress), ("lz4", lz4.frame.compress)):
+        inflate = reader.decompressors[name]
+        for size in (0, 1, MB):
+            assert inflate(pack(bytes(size))) == bytes(size)
+        with pytest.raises(ValueError, match="more than the 1048576 bytes"):
+            inflate(pack(bytes(MB + 1)))
+        with pytest.raises(ValueError, match="cut"):
+            inflate(pack(bytes(100))[:-4])
+
+
+@dataclass
+class Claim:
+    """What the index of an MCAP says of a chunk."""
+
+    message_start_time: int
+    message_end_time: int
+    uncompressed_size: int
+
+
+@dataclass
+class Reader:
+    """A reader of rosbags, as far as chunks go."""
+
+    storage: object
+    chunks: object = ()
+
+
+@pytest.mark.parametrize(
+    "claims, message",
+    [
+        ([(0, 1, 129 * MB)], "a chunk states"),
+        ([(0, 9, 100 * MB)] * 11, "chunks of the same time state"),
+        ([(k, 20 - k, 100 * MB) for k in range(11)], "chunks of the same time state"),
+        ([(5, 5, 100 * MB)] * 11 + [(9, 0, 100 * MB)] * 11, "chunks of the same time state"),
+        ([(k, k, 100 * MB) for k in range(50)], None),
+        ([(k, k + 1, 100 * MB) for k in range(50)], None),
+        ([], None),
+    ],
+)
+def test_chunks_that_are_held_at_once(claims, message):
+    storage = Reader(None, [Claim(*each) for each in claims])
+    folder = Reader(None)
+    folder.storages = [Reader(None), storage]
+    for reader in (Reader(storage), Reader(folder)):
+        if message is None:
+            check_held([reader, object()])
+        else:
+            with pytest.raises(ValueError, match=message):
+                check_held([reader])
+
+
+def test_a_recording_whose_chunks_are_too_large(tmp_path, monkeypatch):
+    messages = Messages()
+    path = record(tmp_path / "flight", flight(messages), messages, "file")
+    assert import_flight(open_source(path), tmp_path / "out").views == 4
+    monkeypatch.setattr(ros_files, "MAX_HELD_BYTES", 1000)
+    with pytest.raises(FlightError, match=r"more than 1000\): .*mcap"):
+        open_source(path)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.flight.telemetry_track import (
     GAP_NS,
     RecordedTrack,
@@ -24,15 +23,11 @@ from orthonav.core.geo.attitude import (
     ned_from_angles,
 )
 from orthonav.core.geo.camera import enu_from_camera
-from orthonav.core.records import Prior
 from orthonav.ground.recordings.recording import (
-    LEVEL_GROUND_IN_GAPS,
+    SourceOptions,
     SourceView,
-    check_overlap,
-    fitted,
     warnings_of,
     with_mean_velocities,
-    with_options,
 )
 
 S = 10**9
@@ -170,13 +165,6 @@ def test_the_height_above_a_given_ground_is_of_one_reference():
     assert math.isnan(both.telemetry(S, ground_alt_m=290.0).agl_m)
 
 
-def test_take_off_heights_in_gaps_of_a_distance_sensor_are_said():
-    series = Samples(1)
-    series.add(0, 50.0)
-    track = RecordedTrack(None, (series.series(),), home=series.series())
-    assert warnings_of(track, SourceOptions()) == [LEVEL_GROUND_IN_GAPS]
-
-
 def test_tilt_has_a_standard_deviation_by_the_kind_of_the_source():
     """Or as reported; never 0, and unknown where pitch and roll are."""
     attitude, stated = attitudes((0, 10.0, 1.0, -2.0), (2, 10.0, 1.0, -2.0)), Samples(1)
@@ -189,16 +177,6 @@ def test_tilt_has_a_standard_deviation_by_the_kind_of_the_source():
     assert reported.telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
     assert RecordedTrack(None).telemetry(0).tilt_std_deg is None
     assert 0 < GIMBAL_TILT_STD_DEG < AUTOPILOT_TILT_STD_DEG < ASSUMED_TILT_STD_DEG
-
-
-def test_what_the_options_add():
-    telemetry = RecordedTrack(None).telemetry(0)
-    options = SourceOptions(prior_std_m=30.0, looks_down=True)
-    changed = with_options(telemetry, (46.0, 2.0), options)
-    assert changed.prior == Prior(46.0, 2.0, 30.0)
-    assert (changed.pitch_deg, changed.roll_deg) == (0, 0) and math.isnan(changed.yaw_deg)
-    assert changed.tilt_std_deg == ASSUMED_TILT_STD_DEG
-    assert with_options(telemetry, None, SourceOptions(prior_std_m=30.0)).prior is None
 
 
 @pytest.mark.parametrize(
@@ -214,25 +192,6 @@ def test_what_the_options_add():
 def test_impossible_options_are_refused(change, message):
     with pytest.raises(FlightError, match=message):
         SourceOptions(**change)
-
-
-def test_recordings_that_do_not_overlap_are_an_error(tmp_path):
-    track = RecordedTrack(attitudes((10, 0, 0, 0), (20, 0, 0, 0)))
-    check_overlap(track, 15 * S, 30 * S, tmp_path)
-    with pytest.raises(FlightError, match=r"30\.000 to 40\.000 s, telemetry 10\.000 to 20\.000"):
-        check_overlap(track, 30 * S, 40 * S, tmp_path)
-
-
-def test_cameras_fit_images_of_the_same_aspect_ratio():
-    from orthonav.core.errors import CameraError
-    from orthonav.core.geo.camera import Camera
-
-    camera = Camera(4000, 3000, 3000.0, 3000.0, 2010.0, 1490.0)
-    assert fitted(camera, 2000, 1500, "x").cx_px == 1005.0
-    assert fitted(camera, 4000, 3000, "x") is camera
-    assert fitted(camera, 1333, 1000, "x").width_px == 1333  # a third, rounded
-    with pytest.raises(CameraError, match="another aspect ratio"):
-        fitted(camera, 4000, 2250, "x")
 
 
 def with_velocities(*samples):
@@ -259,12 +218,6 @@ def test_between_distant_views_the_velocity_is_the_mean():
         (-5.0, 2.0),
         (0.0, 4.0),
     ]
-
-
-def test_a_log_with_a_row_for_each_view_is_used_as_it_is():
-    """Its velocities are means since the view before, as those of a flight folder."""
-    track = with_velocities((0, 10, 0), (1.5, 0, 10), (5, -10, 0))
-    assert seen_at(track, 0, 1.5, 5) == [(10.0, 0.0), (0.0, 10.0), (-10.0, 0.0)]
 
 
 def test_a_mean_over_a_gap_is_not_known():

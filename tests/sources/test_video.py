@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from recorders import camera_file, dji_subtitle, picture, subtitles, video
 
-from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight import open_flight, read_image, read_truth
+from orthonav.core.errors import FlightError
+from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.subtitles import blocks, read_srt
+from orthonav.ground.recordings.logs import blocks
 
 
 @pytest.fixture
@@ -54,11 +53,6 @@ def test_other_containers(tmp_path, name, code):
     assert np.abs(views[1].grey().astype(int) - picture(10)).mean() < 6
 
 
-def test_the_kind_is_found_by_content(recorded, tmp_path):
-    path = recorded.rename(tmp_path / "DJI_0001.txt")
-    assert open_source(path, options(path)).kind == "video"
-
-
 @pytest.mark.parametrize("quality", [None, 95])
 def test_import(recorded, tmp_path, quality):
     recording = open_source(recorded, options(recorded))
@@ -90,22 +84,6 @@ def test_a_table_beside_the_video(tmp_path):
     (tmp_path / "a.csv").write_text("time_s,pitch_deg,roll_deg\n0,0,0\n1,0,0\nx,0,0\n")
     with pytest.raises(FlightError, match=r"line 4: time_s"):
         open_source(path, options(path))
-
-
-def test_the_velocity_between_distant_views_is_the_mean(tmp_path):
-    path = video(tmp_path / "a.mkv")
-    camera_file(tmp_path / "camera.json")
-    rows = [f"{t},0,0,0,100,{east},0\n" for t, east in ((0, 5), (1, 5), (2, 0), (3, 0))]
-    header = "time_s,yaw_deg,pitch_deg,roll_deg,agl_m,vel_east_mps,vel_north_mps\n"
-    (tmp_path / "a.csv").write_text(header + "".join(rows))
-    views = list(open_source(path, options(path, rate_hz=0.5)).views)
-    assert [view.telemetry.vel_en_mps for view in views] == [(5.0, 0.0), (3.75, 0.0)]
-
-
-def test_the_offset_is_added_to_the_times_of_the_video(recorded):
-    view = next(open_source(recorded, options(recorded, time_offset_s=0.9)).views)
-    assert view.telemetry.time_ns == 900_000_000
-    assert view.telemetry.yaw_deg == pytest.approx(355 + 9 - 360)
 
 
 DIALECTS = {
@@ -202,17 +180,6 @@ def test_windows_lines_and_long_times(tmp_path):
     assert block.start_ns == 3_723_500_000_000 and block.lat_deg == 1.5
 
 
-def test_one_block_a_second_holds_until_the_next(tmp_path):
-    """Older drones write one block a second; the last one holds until it ends."""
-    path = video(tmp_path / "a.mkv")
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=10 * n) for n in range(3)], spacing_s=1)
-    camera_file(tmp_path / "camera.json")
-    views = list(open_source(path, options(path, rate_hz=2)).views)
-    yaws = [view.telemetry.yaw_deg for view in views]
-    assert yaws == pytest.approx([0, 5, 10, 15, 20, 20])
-    assert {view.telemetry.tilt_std_deg for view in views} == {GIMBAL_TILT_STD_DEG}
-
-
 def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
     path = video(tmp_path / "a.mkv")
     texts = ["GPS(2.5,46.5,16) BAROMETER:91.9"] * 30
@@ -272,23 +239,3 @@ def test_views_after_the_end_of_the_subtitles_have_no_telemetry(recorded, tmp_pa
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.complete, done.with_truth) == (6, 3, 3)
     assert {lon for _, lon in read_truth(tmp_path / "flight/truth.csv").values()} == {2.5}
-
-
-def test_a_video_needs_a_camera(recorded, tmp_path):
-    with pytest.raises(CameraError, match="give --camera"):
-        open_source(recorded)
-    camera_file(tmp_path / "camera.json", height_px=36)
-    with pytest.raises(CameraError, match="another aspect ratio"):
-        open_source(recorded, options(recorded))
-
-
-def test_read_srt_of_what_is_not_text(tmp_path):
-    (tmp_path / "a.srt").write_bytes(bytes(range(256)) * 40)
-    with pytest.raises(FlightError, match="hold no telemetry"):
-        read_srt(tmp_path / "a.srt")
-
-
-def test_frames_are_read_back_as_they_were(recorded, tmp_path):
-    import_flight(open_source(recorded, options(recorded)), tmp_path / "flight")
-    grey = read_image(tmp_path / "flight/frames/000010.png")
-    assert np.abs(grey.astype(int) - picture(10)).max() <= 1

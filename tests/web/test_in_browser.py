@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
-from benchmarks.view_page import write_long_run
 from browsing import LAPTOP, TABLET, Visit, painted
+from long_run import write_long_run
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 

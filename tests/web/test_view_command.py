@@ -9,8 +9,7 @@ from dataclasses import replace
 import pytest
 from small_run import NO_FIX, WRONG, result
 
-from orthonav.core.flight.fixes import write_results
-from orthonav.core.flight.identity import Identity
+from orthonav.core.flight.fixes import Identity, write_results
 from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.view.run import ViewRequest, open_run
 

@@ -143,7 +143,7 @@ def _environment() -> dict[str, str]:
 
 def _link_checkout(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    parts = {name: ROOT / name for name in ("benchmarks", "examples", "experiments")}
+    parts = {name: ROOT / name for name in ("benchmarks", "examples", "experiments", "lab")}
     for name, target in {".venv": Path(sys.prefix), **parts}.items():
         link = folder.parent / name
         if not link.exists():

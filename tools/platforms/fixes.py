@@ -49,10 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.make:
         make(STORED)
     against = options.against or (None if options.map else STORED / "fixes.json")
-    made = {
-        "machine": machine(),
-        "runs": _localized(options),
-    }
+    made = {"machine": machine(), "runs": _localized(options)}
     if options.out:
         write_text(options.out, json.dumps(made, indent=1) + "\n")
     if options.make:
@@ -142,7 +139,8 @@ def build(ortho: Path, out: Path) -> None:
 
 def _imagery(folder: Path) -> list[Path]:
     """Orthophotos of the generated area at two dates."""
-    from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
+    sys.path.append(str(STORED.parents[2]))
+    from lab.landscape import DEFAULT_DATES, generate_area
 
     return generate_area(folder, size_m=(600.0, 600.0), dates=DEFAULT_DATES[:2], seed=4)
 

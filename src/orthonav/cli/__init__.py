@@ -89,8 +89,7 @@ GROUPS = {
         ),
     },
     "try it without data": {
-        "demo": ("generate an area, build a map, simulate a flight, localize it and report", ""),
-        "landscape": ("generate orthophotos of a landscape at several dates", "--out landscape"),
+        "demo": ("build a map, simulate a flight over other imagery, localize it and report", ""),
         "simulate": (
             "simulate a flight over an orthophoto of another year",
             "--ortho other-year.tif --route route.kml --agl-m 120 --out flight",

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from orthonav.core.flight.recording import RecordedView
     from orthonav.core.records import ViewResult
-    from orthonav.onboard.calibrate import MountCalibration
+    from orthonav.ground.recordings.calibrate_mount import MountCalibration
 
 EVERYDAY = (
     *("--latency", "--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry"),
@@ -102,8 +102,13 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     from orthonav.core.records import Prior
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.evaluate.metrics import check_truth
-    from orthonav.onboard.calibrate import MIN_VIEWS, calibrate_mount, confident_views
-    from orthonav.onboard.calibrate_views import RecordedSingleViews, calibrate_mount_by_views
+    from orthonav.ground.recordings.calibrate_mount import (
+        MIN_VIEWS,
+        RecordedSingleViews,
+        calibrate_mount,
+        calibrate_mount_by_views,
+        confident_views,
+    )
     from orthonav.onboard.run import Locator, localize_flight, smoothed_track
 
     dem, opened = dem_of(options), open_map(options.map)
@@ -148,7 +153,7 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
 
 def _run_latency(options: argparse.Namespace) -> None:
     """Estimate the latency of the camera and write it."""
-    from orthonav.core.flight.latency import write_latency
+    from orthonav.core.flight.mount import write_latency
     from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
 
     flight = open_source(options.flight, options)

@@ -10,7 +10,7 @@ from orthonav.core.errors import MapFileError
 if TYPE_CHECKING:
     from orthonav.cli.common import Progress
     from orthonav.core.flight.recording import Flight
-    from orthonav.core.localize.registration import RegistrationLocalizer
+    from orthonav.core.localize.localizer import RegistrationLocalizer
     from orthonav.core.mapfile.reader import MapFile
     from orthonav.core.records import ViewResult
     from orthonav.ground.changes.record import ChangedGround

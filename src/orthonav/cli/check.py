@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from orthonav.ground.check.outcome import CheckedInputs
     from orthonav.ground.check.request import CheckRequest
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.planning.terrain import LegProfile
+    from orthonav.ground.planning.spacing import LegProfile
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -181,7 +181,7 @@ def run(options: argparse.Namespace) -> int:
 def _accepted(text: str) -> float:
     """The least confidence of `--accept`; raises `VariantError`."""
     from orthonav.core.errors import VariantError
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
 
     accept = Acceptance.parse(text)
     if accept.criterion != "confidence":
@@ -253,7 +253,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
     from orthonav.core.errors import CheckError
-    from orthonav.ground.planning.terrain import LANDING_M
+    from orthonav.ground.planning.spacing import LANDING_M
 
     if options.dem_datum is not None and options.dem is None:
         raise CheckError("--dem-datum needs a terrain model: give --dem too")
@@ -290,7 +290,7 @@ def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProf
     from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
-    from orthonav.ground.planning.terrain import profile
+    from orthonav.ground.planning.spacing import profile
 
     dem = dem_for_route(options, route)
     terrain = TerrainLayer.of(open_map(options.map)) if dem is None else dem

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 if TYPE_CHECKING:
-    from orthonav.core.localize.plan import SearchPlan
+    from orthonav.core.localize.policy import SearchPlan
 
 MAX_THREADS = 64
 
@@ -129,7 +129,7 @@ def add_search(parser: argparse._ActionsContainer) -> None:
 def search_plan(options: argparse.Namespace) -> "SearchPlan":
     """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
     from orthonav.core.errors import VariantError
-    from orthonav.core.localize.plan import DEFAULT_PLAN
+    from orthonav.core.localize.policy import DEFAULT_PLAN
 
     budget_ms = math.inf if options.budget_ms is None else options.budget_ms
     if not budget_ms > 0:

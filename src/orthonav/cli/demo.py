@@ -1,4 +1,4 @@
-"""`orthonav demo`: generate an area, build, check, fly, localize and report."""
+"""`orthonav demo`: build, check, fly, localize and report, over two orthophotos of the package."""
 
 import argparse
 import json
@@ -16,6 +16,8 @@ from orthonav.cli.simulate import HORIZON_STD_DEG, MOUNT_STD_DEG
 if TYPE_CHECKING:
     from orthonav.ground.evaluate.metrics import Metrics
 
+IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
+"""Two dates of a generated area of 2 x 2 km; `lab/demo_imagery.py` makes them."""
 MARKER = "demo.json"
 """File that marks a folder as an earlier demo, which may be replaced."""
 HEIGHT_M = 270.0
@@ -48,7 +50,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder to write (default ./orthonav-demo)",
     )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the flight (default 1)")
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
 
 
@@ -109,8 +111,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
     from orthonav.core.flight import open_flight, read_truth
-    from orthonav.core.flight.fixes import write_results
-    from orthonav.core.flight.identity import Identity, flight_digest
+    from orthonav.core.flight.fixes import Identity, flight_digest, write_results
     from orthonav.core.localize import Localizer
     from orthonav.core.mapfile import open_map
     from orthonav.ground.build import BuildRequest, build_map
@@ -119,28 +120,21 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-    from orthonav.ground.simulate.landscape import DEFAULT_DATES, generate_area
     from orthonav.onboard.run import SingleViews, localize_flight
 
-    _say(options, f"1/5 generating 2 x 2 km at two dates (seed {options.seed})")
-    past, present = generate_area(
-        folder,
-        dates=DEFAULT_DATES[:2],
-        seed=options.seed,
-        progress=lambda share: shown("landscape", share),
-    )
-    _say(options, f"2/5 building the map from {past.name}")
+    past, present = (Path(shutil.copy(path, folder)) for path in sorted(IMAGERY.glob("*.tif")))
+    _say(options, f"1/4 building the map from {past.name}")
     map_path = folder / "area.onav"
     built = build_map(BuildRequest([past], map_path), shown)
     opened = open_map(map_path)
     frame = opened.manifest.sheets[0].frame
     route = folder / "route.geojson"
     _write_route(route, frame.latlon_from_en(WAYPOINTS_EN_M))
-    _say(options, f"3/5 checking from {past.name} alone where along the route fixes are expected")
+    _say(options, f"2/4 checking from {past.name} alone where along the route fixes are expected")
     checked = _checked(folder, map_path, route, shown)
     _say(
         options,
-        f"4/5 simulating a flight over {present.name}, heading error 5 deg, height error 5 %, "
+        f"3/4 simulating a flight over {present.name}, heading error 5 deg, height error 5 %, "
         "unreported tilt of mount and horizon 1 deg each",
     )
     request = SimulateRequest(
@@ -158,7 +152,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
         seed=options.seed,
     )
     simulate_flight(request, lambda share: shown("simulate", share))
-    _say(options, "5/5 localizing every view, searching the whole map")
+    _say(options, "4/4 localizing every view, searching the whole map")
     results = []
     flight = open_flight(request.out)
     for result in localize_flight(SingleViews(Localizer(opened), use_prior=False), flight):

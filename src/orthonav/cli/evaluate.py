@@ -221,7 +221,7 @@ def _warn_of_another_run(
     """
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
-    from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity
 
     if flight is None and (truth.parent / "telemetry.csv").is_file():
         with suppress(OrthonavError):

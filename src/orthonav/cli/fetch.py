@@ -76,7 +76,6 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
         help="width of the service's tiles (xyz, tms) or images (wms)",
     )
     group.add_argument("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
-    group.add_argument("--subdomains", help="values of {s} (default abc)")
     group.add_argument("--collection", help="collection of a STAC")
     group.add_argument("--asset", help="asset of each STAC item")
     group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
@@ -113,12 +112,6 @@ def _add_requests(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--parallel", type=int, default=4, help="most requests at the same time (default 4)"
-    )
-    group.add_argument(
-        "--per-second",
-        type=float,
-        metavar="N",
-        help="most requests per second to one host (default 10)",
     )
     group.add_argument(
         "--retries", type=int, default=5, help="most repetitions of a failed request (default 5)"
@@ -175,16 +168,13 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":
-    from orthonav.ground.fetch.politeness import RequestLimits
+    from orthonav.ground.fetch.mosaic import Packing
+    from orthonav.ground.fetch.presets import parse_source
     from orthonav.ground.fetch.run import FetchRequest
-    from orthonav.ground.fetch.sources import parse_source
-    from orthonav.ground.fetch.write import Packing
+    from orthonav.ground.fetch.web import RequestLimits
 
     if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
         raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
-    rate = options.per_second if options.per_second is not None else 10.0
-    if not 0 < rate <= 50:
-        raise FetchError(f"--per-second is above 0 and at most 50, got {rate:g}")
     spec = parse_source(
         options.source,
         _imagery(options),
@@ -203,9 +193,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
         max_tiles=options.max_tiles,
         max_mb=options.max_mb,
         allow_holes=options.allow_holes,
-        limits=RequestLimits(
-            parallel=options.parallel, per_second=rate, attempts=options.retries + 1
-        ),
+        limits=RequestLimits(parallel=options.parallel, attempts=options.retries + 1),
     )
 
 
@@ -230,7 +218,6 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
         asset=options.asset,
         bands=_bands(options.bands),
         version=options.wms_version,
-        subdomains=options.subdomains,
     )
 
 
@@ -266,26 +253,25 @@ def _area(options: argparse.Namespace) -> "Area":
 
 
 def _run_package(options: argparse.Namespace) -> None:
-    from orthonav.ground.fetch.client import Client
     from orthonav.ground.fetch.package import (
         ATTRIBUTION,
-        LIMITS,
         download_package,
         find_package,
         package_files,
         parse_package,
     )
+    from orthonav.ground.fetch.web import Web
 
     zone, year, kind = parse_package(options.source.removeprefix(PACKAGE))
-    with Client(LIMITS) as client:
-        package = find_package(client, zone, year, kind)
-        files = package_files(client, package)
+    with Web() as web:
+        package = find_package(web, zone, year, kind)
+        files = package_files(web, package)
         megabytes = sum(file.size_bytes or 0 for file in files) / 1e6
         _say(options, f"{package.name}: {len(files)} files, {megabytes:.0f} MB")
         paths = []
         if not options.dry_run:
             with progress(options) as shown:
-                paths = download_package(client, files, options.out, shown)
+                paths = download_package(web, files, options.out, shown)
     if options.json:
         print_json(
             {
@@ -310,8 +296,8 @@ def _summary(out: Path, result: "FetchResult") -> str:
     lines = {
         "file": out,
         "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
-        "tiles": f"{estimate.tiles}, {result.cells.from_cache} of them from the cache",
-        "missing": result.holes() or "none",
+        "tiles": estimate.tiles,
+        "missing": result.cells.holes() or "none",
         "layer": terms.layer,
         "date": terms.date or "unknown",
         "licence": terms.licence or "unknown: ask the service before you pass imagery on",

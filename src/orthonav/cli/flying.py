@@ -1,47 +1,58 @@
 """The parts of `orthonav fly`, made from its options. Loaded for a flight, not for `--help`."""
 
 import argparse
+import hashlib
 import importlib
 import logging
 import math
+import sys
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import search_plan
-from orthonav.cli.flying_console import awaited, camera_line, opened_console, plan_lines
-from orthonav.cli.flying_start import start_of
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
-from orthonav.core.errors import CameraError, OutputError, VariantError
+from orthonav.cli.source import FAR_M, distance_from_map, far_text
+from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
-from orthonav.core.flight.identity import Identity
-from orthonav.core.flight.latency import MOST_MS, CameraLatency, read_latency
-from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.flight.fixes import Identity
+from orthonav.core.flight.gnss import FILE, GnssSample, read_gnss
+from orthonav.core.flight.mount import MOST_MS, CameraLatency, Mount, read_latency, read_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import MapFile, open_map
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
-from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread, NewestImage
-from orthonav.onboard.fly import FlyOptions, LogSink, Runner
+from orthonav.onboard.console import Console, Inputs, Narrator
+from orthonav.onboard.fly import FlyOptions, Runner
+from orthonav.onboard.gnss.biases import Biases
+from orthonav.onboard.gnss.learner import Resumed
+from orthonav.onboard.gnss.watch import (
+    GnssSource,
+    GnssWatch,
+    LiveSolutions,
+    RecordedSolutions,
+)
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.local import Origin
 from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
+from orthonav.onboard.messages.mavlink_local import Origin
 from orthonav.onboard.messages.nmea import Quality
-from orthonav.onboard.narrator import Inputs, Narrator
 from orthonav.onboard.outputs import (
     KINDS,
     LOCAL,
@@ -50,19 +61,33 @@ from orthonav.onboard.outputs import (
     MessageOptions,
     Messenger,
     NmeaOut,
+    PositionOutput,
+    Publisher,
+    ViewOutput,
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
-from orthonav.onboard.publisher import PositionOutput, Publisher, ViewOutput
-from orthonav.onboard.run import Locator
-from orthonav.onboard.serials import require_newest
-from orthonav.onboard.state import load
+from orthonav.onboard.run import Locator, MountCorrected, model_of
+from orthonav.onboard.state import (
+    before_the_flight,
+    boot_id,
+    learnt_biases,
+    load,
+    prior_of,
+    require_newest,
+)
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
+
+if TYPE_CHECKING:
+    from orthonav.onboard.log import FlightLog
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0
 """Narrower views (pixels of the map across) are seldom confident and take the longest, which makes
 the next ones late. An aircraft climbs through them."""
+START_OFF_M, START_SIGMAS = 3000.0, 3.0
+"""A start farther off the map than this distance and so many of its deviations ends the program: a
+flight that comes from there gives the place where it reaches the map, or a larger deviation."""
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
@@ -93,11 +118,10 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     console.say(camera_line(options, camera))
     digest = opened.manifest.sha256
     gnss = None
-    if options.gnss != "off":  # only where it is asked for
-        made = importlib.import_module("orthonav.cli.flying_gnss").gnss_watch
+    if options.gnss != "off":
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
-        gnss = made(options, localizer.sheet.frame, digest, used, queue, least, clocks)
+        gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     newest = NewestImage()
     sends = not options.dry_run and (link is not None or graph is not None)
     is_live = options.ros2 or cameras.is_live(options.source)
@@ -236,14 +260,14 @@ def _source(
             clocks,
             size_px=(camera.width_px, camera.height_px),
         )
-    if not (options.pace > 0 and (options.rate_hz is None or options.rate_hz > 0)):
-        raise VariantError("--pace and --rate-hz must be above 0")
+    if not options.pace > 0:
+        raise VariantError("--pace must be above 0")
     due_ns: Callable[[int], int | None] = cameras.own_pace(clocks, options.pace)
     if options.file_clock == "autopilot":
         if link is None:
             raise VariantError("--file-clock autopilot needs --autopilot")
         due_ns = cameras.autopilot_pace(link.boot_ns, clocks, options.pace)
-    images = cameras.recorded_images(Path(options.source), options.rate_hz)
+    images = cameras.recorded_images(Path(options.source))
     return cameras.Playback(images, due_ns, clocks, stopping.is_set)
 
 
@@ -255,7 +279,6 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
         clocks,
         system_id=options.system_id,
-        component_id=options.component_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
         stamp=Clock(options.stamp),
@@ -339,28 +362,24 @@ def _publisher(
 def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
     """Warn of local messages at a rate at which PX4 does not fuse them."""
     local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
-    rates = [hz for hz in (options.send_rate_hz, options.rate_hz) if hz is not None]
-    if local and rates and min(rates) * PX4_VISION_S <= 1:
+    if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
         log.warning(
             "PX4 fuses %s only at more than %g Hz, got %g Hz: send global-position to PX4, or "
             "raise the rate",
             " and ".join(local),
             1 / PX4_VISION_S,
-            min(rates),
+            options.send_rate_hz,
         )
 
 
-def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> LogSink | None:
+def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
     if options.log is None:
         return None
+    from orthonav.onboard.log import FlightLog  # only where it is asked for
 
-    module = importlib.import_module("orthonav.onboard.log")  # only where it is asked for
     info = {"name": options.map.name, "manifest_sha256": digest}
     most = None if options.log_max_mb is None else round(options.log_max_mb * 1e6)
-    made: LogSink = module.FlightLog(
-        options.log, camera, info, views=options.log_views, max_bytes=most
-    )
-    return made
+    return FlightLog(options.log, camera, info, views=options.log_views, max_bytes=most)
 
 
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
@@ -382,3 +401,194 @@ def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[st
         "mount": None if mount is None else asdict(mount),
         "fly": line,
     }
+
+
+def opened_console(options: argparse.Namespace, clocks: Clocks, stack: ExitStack) -> Console:
+    """Console on stderr, which `stack` closes; it takes the log records of stderr."""
+    console = Console(sys.stderr, clocks, quiet=options.quiet)
+    stack.callback(console.close)
+    stack.enter_context(console.in_place_of_stderr())
+    return console
+
+
+def awaited(options: argparse.Namespace) -> str | None:
+    """The images that are waited for; None for those of ROS 2, whose reader says so."""
+    if options.ros2:
+        return None
+    clock = " (times of the autopilot's clock)" if options.file_clock == "autopilot" else ""
+    return f"images from {options.source}{clock}"
+
+
+def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> list[str]:
+    """What the flight uses and sends, one line each. `least`: confidence from which it sends."""
+    lines = [
+        f"map: {_map_text(options.map, opened)}",
+        f"autopilot: {_telemetry_text(options)}",
+        f"sends: {_sends_text(options, least)}",
+        f"start: {_start_text(options)}",
+        f"GNSS: {'not used' if options.gnss == 'off' else options.gnss}",
+    ]
+    if options.log is not None:
+        lines.append(f"log: {options.log}, views: {options.log_views}")
+    return lines
+
+
+def camera_line(options: argparse.Namespace, camera: Camera) -> str:
+    """Size and field of view of the camera, and where its images come from."""
+    width_deg, height_deg = (_view_deg(each, camera.model) for each in camera.extent)
+    given = options.camera or ("camera_info" if options.ros2 else "flight.json")
+    source, pace = "ROS 2" if options.ros2 else str(options.source), ""
+    if not options.ros2 and not cameras.is_live(source):
+        pace = f", played at {options.pace:g} times real time" if options.pace != 1 else ", played"
+    return (
+        f"camera: {camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg "
+        f"({given}); images from {source}{pace}"
+    )
+
+
+def _view_deg(extent: float, model: str) -> float:
+    """Field of view along one side, without distortion."""
+    half = extent / 2
+    return math.degrees(2 * (half if model == "fisheye" else math.atan(half)))
+
+
+def _map_text(path: Path, opened: MapFile) -> str:
+    sheet = opened.manifest.sheets[0]
+    terrain = sheet.terrain
+    ground = "level ground"
+    if terrain is not None:
+        ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
+    return f"{path}, {opened.manifest.area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}"
+
+
+def _telemetry_text(options: argparse.Namespace) -> str:
+    if options.ros2:
+        return "telemetry from ROS 2"
+    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
+    return ", ".join(each for each in (options.autopilot, recorded) if each)
+
+
+def _sends_text(options: argparse.Namespace, least: float) -> str:
+    kinds = dict.fromkeys(options.send or ["global-position"])
+    messages = [KINDS[kind] for kind in kinds] if options.autopilot else []
+    messages += ["ROS 2 topics"] if options.ros2 else []
+    if options.dry_run and messages:
+        messages = ["nothing to the autopilot (--dry-run)"]
+    others = [f"NMEA to {url}" for url in options.nmea]
+    others += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
+    text = ", ".join([*messages, *others])
+    return f"{text}; positions of confidence {least:g} or more" if text else "nothing"
+
+
+def _start_text(options: argparse.Namespace) -> str:
+    given = "anywhere on the map"
+    if options.start:
+        lat_deg, lon_deg, std_m = options.start
+        given = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
+    if options.state is None:
+        return given
+    return f"position saved in {options.state}, if it is recent, else {given}"
+
+
+def gnss_watch(
+    options: argparse.Namespace,
+    frame: LocalFrame,
+    digest: str,
+    used: tuple[Any, ...],
+    queue: deque[GnssSample] | None,
+    min_confidence: float,
+    clocks: Clocks,
+) -> GnssWatch:
+    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder.
+
+    `digest`: of the map. `used`: camera, its mount and stated latency; after a change of them,
+    what they add to the difference is learnt again. Raises `VariantError` where GNSS has no source,
+    or `correct` no state.
+    """
+    if options.gnss == "correct" and options.state is None:
+        raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
+    recorded = options.recorded_telemetry and not options.ros2
+    source: GnssSource
+    if recorded:
+        source = RecordedSolutions(read_gnss(Path(options.source) / FILE))
+    elif queue is None:
+        raise VariantError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
+    else:
+        source = LiveSolutions(queue)
+
+    known, resumed = _learnt_before(options, digest, clocks)
+    return GnssWatch(
+        frame,
+        source,
+        digest=digest,
+        known=known,
+        resumed=resumed,
+        setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
+        correct=options.gnss == "correct",
+        recorded=recorded,
+        min_confidence=min_confidence,
+        utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
+    )
+
+
+def _learnt_before(
+    options: argparse.Namespace, digest: str, clocks: Clocks
+) -> tuple[Mapping[str, Biases], Resumed | None]:
+    """What was learnt before this flight, and by it, where it was interrupted.
+
+    A state is that of this flight if the program that saved it stopped no longer than
+    `--state-max-age-s` ago, or at an unknown time because a clock was set back.
+    """
+    if options.state is None:
+        return {}, None
+    saved = load(options.state)
+    if saved is not None:
+        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        if stopped_s > options.state_max_age_s:
+            return learnt_biases(options.state), None
+    return before_the_flight(options.state, digest)
+
+
+def start_of(
+    options: argparse.Namespace, clocks: Clocks, localizer: Localizer
+) -> Callable[[], Prior | None]:
+    """Function that gives the prior of the first view.
+
+    It is the saved position if that is recent, but once only, else `--start`, else None.
+    """
+    given = given_start(options, localizer)
+    saved = [load(options.state)] if options.state else []
+
+    def prior() -> Prior | None:
+        last = saved.pop() if saved else None
+        if last is None:
+            return given
+        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        return prior_of(last, age_s, options.state_max_age_s) or given
+
+    return prior
+
+
+def given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
+    """The position of `--start`; a warning where it is off the map. Raises `UsageError` where it is
+    none, or where the aircraft cannot be over the map by it."""
+    if not options.start:
+        return None
+    start = Prior(*options.start)
+    place = start.lat_deg, start.lon_deg
+    if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and start.std_m > 0):
+        raise UsageError(
+            "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
+            f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
+            f"{swapped_hint(*place)}"
+        )
+    far_m, hint = distance_from_map(place, localizer)
+    most_m = START_OFF_M + START_SIGMAS * start.std_m
+    if far_m > most_m:
+        raise UsageError(
+            f"--start is {far_m / 1000:,.1f} km from the map, more than {START_OFF_M / 1000:g} "
+            f"km and {START_SIGMAS:g} times its deviation; check the map and the position{hint}"
+        )
+    if far_m > FAR_M:
+        log.warning("%s", far_text("--start is", far_m, hint))
+    return start

@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
     """Open the map, which checks its contents, and print a summary."""
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.build.shown import footprint_geojson, write_preview
+    from orthonav.core.mapfile.shown import footprint_geojson, write_preview
 
     opened = open_map(options.map)
     if options.footprint is not None:

@@ -28,7 +28,7 @@ from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
     from orthonav.core.localize import Localizer
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import MapFile
     from orthonav.core.records import ViewResult
     from orthonav.ground.changes.record import ChangedGround
@@ -188,15 +188,21 @@ def run(options: argparse.Namespace) -> None:
 
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.errors import VariantError
-    from orthonav.core.flight.identity import FlightDigest, Identity
+    from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.core.flight.mount import MountedFlight
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.calibrate import MountCorrected, model_of
-    from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
+    from orthonav.onboard.run import (
+        Locator,
+        MountCorrected,
+        SingleViews,
+        localize_flight,
+        model_of,
+        smoothed_track,
+    )
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
@@ -275,12 +281,11 @@ def _on_atlas(options: argparse.Namespace) -> None:
     """Localize on an atlas without a prior; a fix needs the agreement of several views."""
     require_extras("localize --atlas")
     from orthonav.core.errors import VariantError
-    from orthonav.core.flight.identity import FlightDigest, Identity
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.flight.fixes import FlightDigest, Identity
+    from orthonav.core.localize.confidence import Acceptance
     from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.locate import AtlasLocator
-    from orthonav.ground.atlas.sheet_registration import SheetRegistrar
-    from orthonav.ground.atlas.tile_search import TileSearch
+    from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
     from orthonav.ground.recordings.export import export_all, export_of
     from orthonav.onboard.run import localize_flight
 

@@ -54,12 +54,10 @@ def run(options: argparse.Namespace) -> None:
     """Locate and print."""
     from orthonav.core.errors import FlightError
     from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import read_results
-    from orthonav.core.flight.identity import Identity, flight_digest, read_identity
+    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
     from orthonav.core.flight.mount import read_mount
     from orthonav.core.records import Fix
-    from orthonav.ground.recordings.pixel import locate_pixel
-    from orthonav.onboard.messages.estimate import ellipse_95
+    from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 
     results = {each.frame: each for each in read_results(options.fixes)}
     if options.frame not in results and Path(options.frame).name in results:

@@ -6,7 +6,6 @@ from orthonav.core.extras import require
 
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": ("geo", "report", "web"),
-    "landscape": ("geo",),
     "simulate": ("geo",),
     "fetch --source": ("fetch",),
     "build": ("geo",),

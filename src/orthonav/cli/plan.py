@@ -4,18 +4,19 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, add_dem, beside, print_json
+from orthonav.cli.common import add_area, add_dem, beside, counted, print_json
 
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
     *("--out", "--json"),
 )
+MAX_SHOWN = 12
+"""Sheets and legs named in the text."""
 
 if TYPE_CHECKING:
     from orthonav.ground.planning.area import Area, Extent
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.planning.spacing import Caution, ViewPlan
-    from orthonav.ground.planning.terrain import LegProfile
+    from orthonav.ground.planning.spacing import Caution, LegProfile, ViewPlan
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -65,11 +66,16 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Compute and print the plan."""
-    from orthonav.cli.plan_text import plan_text
     from orthonav.core.errors import RouteError
+    from orthonav.core.files import write_text
     from orthonav.ground.planning.route import read_route
-    from orthonav.ground.planning.spacing import default_band_m, rate_cautions, view_cautions
-    from orthonav.ground.planning.terrain import terrain_cautions
+    from orthonav.ground.planning.routes.geojson import to_geojson
+    from orthonav.ground.planning.spacing import (
+        default_band_m,
+        rate_cautions,
+        terrain_cautions,
+        view_cautions,
+    )
 
     route = read_route(options.route) if options.route else None
     if options.dem_datum is not None and options.dem is None:
@@ -98,7 +104,7 @@ def run(options: argparse.Namespace) -> None:
         "cautions": [{"code": each.code, "text": each.text} for each in cautions],
     }
     if options.out is not None:
-        _write(options.out, [sheet for sheet in sheets if not isinstance(sheet, tuple)])
+        write_text(options.out, to_geojson([x for x in sheets if not isinstance(x, tuple)]))
         plain["out"] = str(options.out)
     with beside(options.out):
         if options.json:
@@ -143,7 +149,7 @@ def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | Non
 
 def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
     """Lowest height above ground along the route, without take-off and landing; None: unknown."""
-    from orthonav.ground.planning.terrain import LANDING_M
+    from orthonav.ground.planning.spacing import LANDING_M
 
     if options.dem is not None and route.heights:
         heights_m = [height for leg in _profile(options, route, None) for height in leg.agl_m]
@@ -175,7 +181,7 @@ def _profile(
     options: argparse.Namespace, route: "Route", view: "ViewPlan | None"
 ) -> list["LegProfile"]:
     from orthonav.cli.heights import dem_for_route
-    from orthonav.ground.planning.terrain import profile
+    from orthonav.ground.planning.spacing import profile
 
     bands_m = route.bands_m(options.band_m) or ()
     view_m = 0.0 if view is None else view.short_m
@@ -220,7 +226,7 @@ def _map_plain(
     gsd_m: float,
     tile_px: int,
 ) -> dict[str, Any]:
-    from orthonav.ground.planning.estimate import estimate_map
+    from orthonav.ground.planning.spacing import estimate_map
 
     made = [
         estimate_map(
@@ -268,8 +274,103 @@ def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
     }
 
 
-def _write(path: Path, sheets: list["Route"]) -> None:
-    from orthonav.core.files import write_text
-    from orthonav.ground.planning.routes.geojson import to_geojson
+def plan_text(plain: dict[str, Any]) -> str:
+    """Lines of text for a plan as `orthonav plan --json` prints it."""
+    lines = []
+    if plain["route"] is not None:
+        lines.append(_row("route", _route_text(plain["route"])))
+    if plain["view"] is not None:
+        lines += _view_lines(plain["view"])
+    out = None if plain.get("out") == "-" else plain.get("out")
+    lines += _map_lines(plain["map"], None if plain["route"] is None else out or "FILE")
+    if plain["terrain"] is not None:
+        lines += _leg_lines(plain["terrain"])
+    for caution in plain["cautions"]:
+        lines.append(_row("caution", caution["text"]))
+    if "out" in plain:
+        lines.append(_row("written", out or "to stdout"))
+    return "\n".join(lines)
 
-    write_text(path, to_geojson(sheets))
+
+def _row(name: str, text: str) -> str:
+    return f"{name:<9}{text}"
+
+
+def _route_text(route: dict[str, Any]) -> str:
+    name = f"{route['name']}, " if route["name"] else ""
+    text = f"{name}{counted(route['waypoints'], 'waypoint')}, {route['length_m'] / 1000:.2f} km"
+    if route["duration_s"] is not None:
+        seconds = route["duration_s"]
+        text += f", {seconds:.0f} s" if seconds < 300 else f", {seconds / 60:.0f} min"
+    if route["heights_above"]:
+        text += f", heights above {' and '.join(map(_reference, route['heights_above']))}"
+    if route["legs_with_own_band"]:
+        text += f", {counted(route['legs_with_own_band'], 'leg')} with a band of its own"
+    if route["legs_with_own_band"] < max(1, route["waypoints"] - 1):
+        text += f", search band {route['band_m']:.0f} m"
+    return text
+
+
+def _reference(name: str) -> str:
+    return {"agl": "ground", "unknown": "an unknown reference"}.get(name, name)
+
+
+def _view_lines(view: dict[str, Any]) -> list[str]:
+    first = (
+        f"{view['width_m']:.0f} x {view['height_m']:.0f} m from {view['agl_m']:.0f} m, "
+        f"{view['gsd_m']:.3g} m per pixel, {view['across_px']:.0f} map pixels across"
+    )
+    second = f"overlapping views at most {view['spacing_m']:.0f} m apart"
+    if view["rate_hz"] is not None:
+        second += f": {view['rate_hz']:.2g} views per second"
+    return [_row("view", first), _row("", second)]
+
+
+def _map_lines(made: dict[str, Any], route: str | None) -> list[str]:
+    low, high = made["map_mb"]
+    size = f"{low:.1f} to {high:.1f} MB" if high - low > 0.05 else f"{high:.1f} MB"
+    lines = [
+        _row(
+            "build",
+            f"--gsd-m {made['gsd_m']:g} --tile-px {made['tile_px']} --overlap {made['overlap']:g}"
+            f"{'' if made['registration'] else ' --no-registration'} "
+            f"(a tile is {made['tile_m']:g} m wide)",
+        ),
+        _row(
+            "map",
+            f"{made['area_km2']:,.2f} km2, {made['tiles']:,} tiles, {size}, "
+            f"built in about {made['build_minutes']:,.0f} min on one core; "
+            f"imagery needed: {made['imagery_km2']:,.1f} km2",
+        ),
+    ]
+    sheets = made["sheets"]
+    if len(sheets) > 1:
+        lines.append(
+            _row("sheets", f"{len(sheets)}: a map holds one sheet; build one map per sheet")
+        )
+        if route == "FILE":
+            lines.append(_row("", "write the sheets with --out FILE"))
+        for sheet in sheets[:MAX_SHOWN]:
+            where = f"--route {route}#{sheet['name']}"
+            if route is None:
+                where = f"--bounds={','.join(map(_degrees, sheet['bounds_deg']))}"
+            lines.append(_row("", f"{where}  {sheet['area_km2']:,.0f} km2"))
+        if len(sheets) > MAX_SHOWN:
+            lines.append(_row("", f"and {len(sheets) - MAX_SHOWN} more (--json)"))
+    return lines
+
+
+def _leg_lines(legs: list[dict[str, Any]]) -> list[str]:
+    lines = [_row("terrain", "leg  length m   ground m      above ground m  relief in a view")]
+    for leg in legs[:MAX_SHOWN]:
+        ground = "{:.0f}..{:.0f}".format(*leg["ground_m"])
+        over = "{:.0f}..{:.0f}".format(*leg["agl_m"])
+        text = f"{leg['leg']:>3}  {leg['length_m']:>8.0f}   {ground:<12}  {over:<14}"
+        lines.append(_row("", f"{text}  {leg['relief']:.1%}"))
+    if len(legs) > MAX_SHOWN:
+        lines.append(_row("", f"and {len(legs) - MAX_SHOWN} more (--json)"))
+    return lines
+
+
+def _degrees(value: float) -> str:
+    return f"{value:.6f}".rstrip("0").rstrip(".")

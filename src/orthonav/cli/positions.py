@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from orthonav.core.flight.identity import Identity
+    from orthonav.core.flight.fixes import Identity
     from orthonav.core.records import Fix, ViewResult
 
 _HINTS = (
@@ -22,7 +22,7 @@ def check_destination(options: argparse.Namespace) -> None:
     """Raise `VariantError` where positions have no place to go, or share it with the summary."""
     from orthonav.core.errors import VariantError
     from orthonav.core.files import is_stdout
-    from orthonav.ground.recordings.photo_files import is_photo
+    from orthonav.ground.recordings.photos import is_photo
 
     if options.out is not None and is_stdout(options.out) and options.json:
         raise VariantError("--out - and --json both write to stdout: give one of them")

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.flight.mount import Mount
     from orthonav.core.localize import Localizer
-    from orthonav.core.localize.accept import Acceptance
+    from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.records import Telemetry, ViewResult
     from orthonav.ground.recordings import Recording, SourceView
-    from orthonav.onboard.setups import Tried
+    from orthonav.ground.recordings.setups import Tried
 
 BUDGET_S = 15.0
 """After so long no further view is localized: the search for the cause takes at most 20 s."""
@@ -65,7 +65,7 @@ class Counts:
     @property
     def few(self) -> bool:
         """Whether so few views are confident that the configuration may be wrong."""
-        from orthonav.onboard.setups import FEW
+        from orthonav.ground.recordings.setups import FEW
 
         return self.confident < FEW * self.views
 
@@ -81,7 +81,7 @@ class SetupAdvice:
         mount: "Mount | None",
         heights: "FlownHeights | None",
     ) -> None:
-        from orthonav.onboard.setups import LowConfidenceViews
+        from orthonav.ground.recordings.setups import LowConfidenceViews
 
         self._options, self._flight, self._localizer = options, flight, localizer
 
@@ -141,7 +141,7 @@ class SetupAdvice:
 
     def _tried(self, accept: "Acceptance", shown: "Progress") -> "tuple[list[Tried], bool]":
         """The configurations that were tried, and whether the time for it ran out."""
-        from orthonav.onboard.setups import try_setups
+        from orthonav.ground.recordings.setups import try_setups
 
         options, end_s = self._options, time.monotonic() + BUDGET_S
         reporter(options)(

@@ -29,5 +29,4 @@ def run(options: argparse.Namespace) -> None:
     found = require_signature(options.map, options.public_key, options.not_before)
     open_map(options.map, found.manifest_sha256)
     print(f"signature and contents are valid: {options.map}\nmanifest  {found.manifest_sha256}")
-    if found.serial is not None:
-        print(f"serial    {found.serial}\nsigned    {found.signed_utc}")
+    print(f"serial    {found.serial}\nsigned    {found.signed_utc}")

@@ -15,7 +15,7 @@ from typing import Any
 from orthonav.core.errors import MissingExtraError
 
 NAME = "orthonav"
-_REQUIREMENT = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?([^;]*)(?:;(.*))?")
+_REQUIREMENT = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?[^;]*(?:;(.*))?")
 _OF_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 _CONDITION = re.compile(r"""(python_version|platform_machine)\s*(==|<)\s*["']([^"']+)["']""")
 """Of environment markers, what pyproject.toml uses: such comparisons, joined by `and`."""
@@ -34,36 +34,25 @@ _MODULES = {
 class RequiredPackage:
     """A package that orthonav or one of its extras asks for.
 
-    `name`: as pyproject.toml writes it. `asked`: version range, such as `>=1.4`. `version`: the one
-    that is installed; empty where its module cannot be found. `available`: whether its
-    environment marker lets it be installed on this machine with this Python.
+    `name`: as pyproject.toml writes it. `version`: the one that is installed; empty where its
+    module cannot be found. `available`: whether its environment marker lets it be installed on this
+    machine with this Python.
     """
 
     name: str
-    asked: str
     version: str
     available: bool
 
 
 @lru_cache(maxsize=1)
-def _requirements() -> dict[str, list[tuple[str, str, str, str]]]:
-    """(package, its extras, range, marker) by extra, "" for the core; {} if not installed."""
+def _requirements() -> tuple[str, ...]:
+    """Requirements of the installed orthonav; none where it is run from its sources."""
     from importlib import metadata  # takes as long as the rest of the command line to import
 
     try:
-        lines = metadata.requires(NAME) or []
-    except metadata.PackageNotFoundError:  # run from its sources
-        return {}
-    found: dict[str, list[tuple[str, str, str, str]]] = {"": []}
-    for extra in metadata.metadata(NAME).get_all("Provides-Extra") or []:
-        found[extra] = []
-    for line in lines:
-        match = _REQUIREMENT.match(line)
-        assert match is not None, line
-        name, extras, asked, marker = (part or "" for part in match.groups())
-        of = _OF_EXTRA.search(marker)
-        found.setdefault(of[1] if of else "", []).append((name, extras, asked.strip(" ()"), marker))
-    return found
+        return tuple(metadata.requires(NAME) or ())
+    except metadata.PackageNotFoundError:
+        return ()
 
 
 def _holds(marker: str) -> bool:
@@ -85,12 +74,18 @@ def _numbers(version: str) -> list[int]:
 def packages(extra: str = "") -> tuple[RequiredPackage, ...]:
     """Packages of an extra, those of the extras that it includes too, each once; "" is the core."""
     found: dict[str, RequiredPackage] = {}
-    for name, included, asked, marker in _requirements().get(extra, []):
+    for line in _requirements():
+        match = _REQUIREMENT.match(line)
+        assert match is not None, line
+        name, included, marker = (part or "" for part in match.groups())
+        of = _OF_EXTRA.search(marker)
+        if (of[1] if of else "") != extra:
+            continue
         if name == NAME:
             for each in included.split(","):
                 found.update({package.name: package for package in packages(each.strip())})
         else:
-            found[name] = RequiredPackage(name, asked, _version(name), _holds(marker))
+            found[name] = RequiredPackage(name, _version(name), _holds(marker))
     return tuple(found.values())
 
 

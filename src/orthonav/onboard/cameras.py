@@ -5,12 +5,13 @@ carries its time of exposure by our monotonic clock.
 """
 
 import logging
-import math
 import threading
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any, Protocol
 
 import cv2
@@ -21,13 +22,15 @@ from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.files import require_file
 from orthonav.core.flight import decode_image, open_flight
 from orthonav.core.records import NoFix, Telemetry
-from orthonav.onboard.arrival import Arrival, ArrivalWatch
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+GAP_S, GAP_INTERVALS = 0.5, 3.0
+"""A longer time without images, also in usual intervals, may change the latency. Shorter ones are
+usual on a busy computer."""
 FROZEN_LEVELS = 0.25
 """Mean difference in grey levels below which two images are the same: noise alone is four times
 as large."""
@@ -51,7 +54,8 @@ class CameraImage:
     `problem`: reason why it could not be decoded.
     `telemetry`: telemetry that came with the image, from a recording or from ROS.
     `vehicle`: state of the aircraft that `telemetry` was made of, from ROS.
-    `arrival`: of an image of a live camera, whose time of exposure is not known otherwise.
+    `interruptions`: of a live camera: how often images stopped for a while, or the camera was
+    opened again; the latency may have changed. None where the time of exposure is known.
     """
 
     number: int
@@ -62,7 +66,7 @@ class CameraImage:
     problem: NoFix | None = None
     telemetry: Telemetry | None = None
     vehicle: VehicleState | None = None
-    arrival: Arrival | None = None
+    interruptions: int | None = None
 
 
 class CameraGoneError(CameraError):
@@ -97,7 +101,9 @@ class LiveCamera:
         self._opener = capture or _capture
         self._capture: Any = None
         self._number = 0
-        self._arrivals = ArrivalWatch()
+        self._interruptions = 0
+        self._last_ns: int | None = None
+        self._intervals_s: deque[float] = deque([GAP_S / GAP_INTERVALS], maxlen=31)
         # UTC may be set in flight; the times of views must not jump with it.
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
@@ -105,12 +111,11 @@ class LiveCamera:
         """See `ImageSource.read`."""
         if self._capture is None:  # first image, or after the camera was gone
             self._capture = self._open()
-            self._arrivals.opened()
         if not self._capture.grab():
             self.close()
             raise CameraGoneError(f"camera delivers no images: {self._name}")
         arrived_ns = self._clocks.mono_ns()
-        arrival = self._arrivals.arrived(arrived_ns, self._stamp_s())
+        self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
         self._number += 1
         grey = _grey(frame) if found else None
@@ -122,7 +127,7 @@ class LiveCamera:
             arrived_ns + self._utc_minus_mono_ns,
             grey,
             problem,
-            arrival=arrival,
+            interruptions=self._interruptions,
         )
 
     def close(self) -> None:
@@ -130,11 +135,15 @@ class LiveCamera:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+            self._interruptions += 1
 
-    def _stamp_s(self) -> float:
-        """Timestamp of the image in the stream; NaN where there is none."""
-        stamp_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3
-        return stamp_s if stamp_s > 0 else math.nan
+    def _count_interruptions(self, arrived_ns: int) -> None:
+        before_ns, self._last_ns = self._last_ns, arrived_ns
+        if before_ns is None:
+            return
+        gap_s = (arrived_ns - before_ns) / 1e9
+        self._interruptions += gap_s > max(GAP_S, GAP_INTERVALS * median(self._intervals_s))
+        self._intervals_s.append(gap_s)
 
     def _open(self) -> Any:
         capture = self._opener(self._name)
@@ -242,10 +251,9 @@ def live_name(name: str) -> int | str:
     return int(tail) if tail.isdigit() else name
 
 
-def recorded_images(path: Path, rate_hz: float | None) -> Iterator[RecordedImage]:
-    """Images of a flight folder (at its own times), a folder of images (by name) or a video.
+def recorded_images(path: Path) -> Iterator[RecordedImage]:
+    """Images of a flight folder or a video at their times, or of a folder at `FOLDER_RATE_HZ`.
 
-    `rate_hz`: views per second; by default every frame of a video and `FOLDER_RATE_HZ` of a folder.
     Raises `FlightError` or `MissingFileError` at once where `path` is none of these.
     """
     if (path / "telemetry.csv").is_file():
@@ -254,17 +262,17 @@ def recorded_images(path: Path, rate_hz: float | None) -> Iterator[RecordedImage
             [RecordedImage(v.frame, v.telemetry.time_ns, v.grey, v.telemetry) for v in views]
         )
     if path.is_dir():
-        return _images(path, rate_hz or FOLDER_RATE_HZ)
+        return _images(path)
     if not path.is_file():
         raise MissingFileError(f"no such camera, stream, folder or file: {path}")
     require_file(path, "video")
     capture = _capture(str(path.resolve()))
     if not capture.isOpened():
         raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")
-    return _video(capture, rate_hz or math.inf)
+    return _video(capture)
 
 
-def _images(folder: Path, rate_hz: float) -> Iterator[RecordedImage]:
+def _images(folder: Path) -> Iterator[RecordedImage]:
     paths = sorted(each for each in folder.iterdir() if each.suffix.lower() in SUFFIXES)
     if not paths:
         raise FlightError(f"no images ({', '.join(SUFFIXES)}) in the folder: {folder}")
@@ -273,21 +281,16 @@ def _images(folder: Path, rate_hz: float) -> Iterator[RecordedImage]:
         return lambda: decode_image(path.read_bytes(), str(path))
 
     return iter(
-        [RecordedImage(p.name, round(i / rate_hz * 1e9), loader(p)) for i, p in enumerate(paths)]
+        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), loader(path))
+        for number, path in enumerate(paths)
     )
 
 
-def _video(capture: Any, rate_hz: float) -> Iterator[RecordedImage]:
-    number = due = 0
+def _video(capture: Any) -> Iterator[RecordedImage]:
+    number = 0
     try:
         while capture.grab():
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            if math.isfinite(
-                rate_hz
-            ):  # the same frames as `orthonav.ground.recordings.video` takes
-                if time_ns < due / rate_hz * 1e9 - 1:
-                    continue
-                due = math.floor(time_ns / 1e9 * rate_hz + 1e-6) + 1
             found, frame = capture.retrieve()
             grey = _grey(frame) if found else None
             yield RecordedImage(f"{number:06d}", time_ns, _loaded(grey, number))

@@ -1,20 +1,58 @@
-"""Lines on stderr, written by a thread of their own.
+"""What `orthonav fly` says while it flies: inputs that come and go, states of the track with their
+reason, faults, a status line every few seconds, and a summary at the end.
 
-A flight must not wait for its terminal: a closed stderr is ignored, and where nobody reads a pipe,
-lines are dropped.
+An output of `Publisher` like the lines of JSON: it takes every view, and the health once a second.
 """
 
 import contextlib
 import logging
+import math
 import os
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from typing import TextIO
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TextIO
 
+import numpy as np
+
+from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.onboard.cameras import NewestImage
+from orthonav.onboard.health import IMAGE_AGE_S, LINK_AGE_S, STATUSTEXT_INTERVAL_NS, Level
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.mavlink_local import Autopilot
 from orthonav.onboard.telemetry import Clocks
 
+TERMINAL_S, FILE_S = 5.0, 30.0
+"""Interval of the status line on a terminal, and elsewhere."""
+REMIND_S = 10.0
+"""Interval of lines about a missing input."""
+RATE_S = 2.0
+"""The rate of a camera is counted over so much time."""
+LOST_S = IMAGE_AGE_S
+"""A camera without an image for so long is lost."""
+_MOST_AGES = 100_000
+_KINDS = {Autopilot.PX4: " PX4", Autopilot.ARDUPILOT: " ArduPilot", None: ""}
+_STATES = {
+    "searching": "no place has been recognized yet",
+    "coasting": "views do not show the map; the position is dead reckoned",
+    "lost": "the track does not fit the map any more",
+}
+_FAULTS = {
+    "no_telemetry": "no attitude; set the stream rates of the autopilot",
+    "wrong_camera": "images do not fit --camera",
+    "motion_mismatch": "check the camera, --mount-deg, height and heading",
+    "heading_mismatch": "check the compass and --mount-deg, or use --heading unknown",
+    "height_mismatch": "check --height and the focal length",
+    "start_mismatch": "the ground contradicts the start position",
+    "not_synchronized": "TIMESYNC is not answered",
+    "no_origin": "the autopilot has no local origin; give --origin on the ground",
+    "slow": "positions are late; see --budget-ms and --threads",
+}
+"""What a reason of the health means, where its name does not say so."""
+_SAID_BY_OTHERS = {*_STATES, "no_camera", "camera_lost", "link_down"}
 MOST_LINES = 1000
 """Lines that wait for a slow reader; later ones are dropped."""
 CLOSE_S = 1.0
@@ -103,6 +141,249 @@ class _Records(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
         self._put(self.format(record))
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a flight waits for.
+
+    `newest`: images of the camera. `images`: where they come from; None: their source says itself
+    what it waits for. `is_live`: whether they come from a camera, which can be lost.
+    `link`, `url`: connection to the autopilot, where there is one.
+    `sends`: whether positions are sent to an autopilot or to ROS 2.
+    """
+
+    newest: NewestImage
+    images: str | None
+    is_live: bool
+    link: AutopilotLink | None
+    url: str | None
+    sends: bool
+
+
+class Narrator:
+    """Turns views and health into lines on a console. Mutable; for one thread."""
+
+    def __init__(self, console: Console, clocks: Clocks, inputs: Inputs) -> None:
+        self._console, self._clocks, self._inputs = console, clocks, inputs
+        self._interval_ns = round((TERMINAL_S if console.is_terminal else FILE_S) * 1e9)
+        self._status_ns = clocks.mono_ns() + self._interval_ns
+        self._reminded: dict[str, int] = {}
+        self._camera, self._autopilot = _CameraWatch(console), _AutopilotWatch(console)
+        self._faults: tuple[str, ...] = ()
+        self._faults_ns, self._is_faulty = 0, False
+        self._result: ViewResult | None = None
+        self._counts, self._before = Counter[str](), Counter[str]()
+        self._explained: set[str] = set()
+        self._meant: set[str] = set()
+        self._ages_ms: deque[float] = deque(maxlen=_MOST_AGES)
+        self._begun_ns: int | None = None
+        self._first_s: float | None = None
+        self._dropped = 0
+
+    def view(
+        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
+    ) -> None:
+        """Note one view, and say where the state of the track changed."""
+        now_ns = self._clocks.mono_ns()
+        self._watch(now_ns)
+        self._begun_ns = self._begun_ns or now_ns
+        reason = self._reason(result, sent, withheld)
+        self._counts["views"] += 1
+        self._counts["" if reason is None else f"withheld {reason}"] += 1
+        if math.isfinite(result.latency_ms):
+            self._ages_ms.append(age_ms)
+        if reason is None and self._first_s is None:
+            self._first_s = (now_ns - self._begun_ns) / 1e9
+        self._explain(result)
+        before, self._result = self._result, result
+        if before is None or before.state != result.state:
+            self._say_state(None if before is None else before.state, result)
+
+    def health(self, plain: Mapping[str, Any]) -> None:
+        """Say what changed since the last second, and the status where it is due."""
+        now_ns = self._clocks.mono_ns()
+        self._watch(now_ns)
+        self._say_faults(plain, now_ns)
+        counts = plain["counts"]
+        self._dropped = counts.get("late", 0) + counts.get("replaced", 0)
+        if now_ns >= self._status_ns:
+            self._status_ns = now_ns + self._interval_ns
+            self._console.say(self._status(plain))
+
+    def close(self) -> None:
+        """Say the summary of the flight."""
+        self._console.say(self._summary())
+
+    def _reason(self, result: ViewResult, sent: Sequence[str], withheld: str | None) -> str | None:
+        """Why a view gave no position; None where it gave one."""
+        if sent:
+            return None
+        if isinstance(result.outcome, NoFix) and withheld in (None, "no_fix"):
+            return result.outcome.reason
+        return withheld or ("not_sent" if self._inputs.sends else None)
+
+    def _explain(self, result: ViewResult) -> None:
+        """Say the reason of a view without a position in full, once for each reason."""
+        outcome = result.outcome
+        if isinstance(outcome, NoFix) and outcome.reason not in {*self._explained, "searching"}:
+            self._explained.add(outcome.reason)
+            self._console.say(f"view {result.frame}: {outcome.reason}: {outcome.detail}")
+
+    def _say_state(self, before: str | None, now: ViewResult) -> None:
+        change = f"{before} -> {now.state}" if before else f"{now.state}"
+        text = _STATES.get(now.state or "") or _place_text(now.outcome)
+        say = self._console.warn if before == "tracking" else self._console.say
+        say(f"{change}: {text}")
+
+    def _watch(self, now_ns: int) -> None:
+        """Say which inputs came or went, and which are missing."""
+        if self._inputs.link is not None:
+            self._remind(self._autopilot.waits(self._inputs.link, self._inputs.url), now_ns)
+        self._remind(self._camera.waits(self._inputs, now_ns), now_ns)
+
+    def _remind(self, waits: str | None, now_ns: int) -> None:
+        """Say what is missing, and again while it is."""
+        if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
+            self._reminded[waits] = now_ns + round(REMIND_S * 1e9)
+            self._console.say(f"waiting for {waits}")
+
+    def _say_faults(self, plain: Mapping[str, Any], now_ns: int) -> None:
+        """Say a change of the health, apart from what other lines say."""
+        hidden = _SAID_BY_OTHERS
+        if self._inputs.link is not None and not self._autopilot.is_heard:
+            hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
+        shown = tuple(each for each in plain["reasons"] if each not in hidden)
+        if self._is_faulty and plain["health"] == Level.OK.name:
+            self._is_faulty = False
+            self._console.say("health OK")
+        is_new = not self._meant.issuperset(shown)
+        if shown == self._faults or not (is_new or now_ns >= self._faults_ns):
+            return
+        self._faults, self._faults_ns = shown, now_ns + STATUSTEXT_INTERVAL_NS
+        self._is_faulty |= bool(shown)
+        if shown:
+            self._console.warn(f"{plain['health']}: {', '.join(self._fault(plain, shown))}")
+
+    def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
+        """The reasons of the health, each with its meaning when it comes for the first time."""
+        for reason in shown:
+            meaning = "" if reason in self._meant else _meaning(reason, plain)
+            self._meant.add(reason)
+            yield f"{reason} ({meaning})" if meaning else reason
+
+    def _status(self, plain: Mapping[str, Any]) -> str:
+        since = self._counts - self._before
+        self._before = self._counts.copy()
+        if self._result is None:
+            return f"no view yet; health {plain['health']}"
+        outcome, is_place = self._result.outcome, self._result.state in ("tracking", "coasting")
+        place = f" {_place_text(outcome)}" if is_place and isinstance(outcome, Fix) else ""
+        parts = [f"{plain['state']}{place}", _counted(since, self._inputs.sends)]
+        if plain["age_p50_ms"]:
+            parts.append(f"latency {plain['age_p50_ms']:.0f} ms, p95 {plain['age_p95_ms']:.0f} ms")
+        return "; ".join([*parts, f"health {plain['health']}"])
+
+    def _summary(self) -> str:
+        parts = [_counted(self._counts, self._inputs.sends)]
+        if self._dropped:
+            parts.append(f"images dropped as too late: {self._dropped}")
+        if self._ages_ms:
+            median, p99 = np.percentile(list(self._ages_ms), [50, 99])
+            parts.append(f"latency median {median:.0f} ms, p99 {p99:.0f} ms")
+        if self._first_s is not None:
+            parts.append(f"first position {self._first_s:.1f} s after the first view")
+        elif self._counts["views"]:
+            parts.append("no position in the whole flight")
+        return "end: " + "; ".join(parts)
+
+
+class _CameraWatch:
+    """Says when a camera comes and goes. Mutable."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._taken = self._outages = self._seen_ns = 0
+        self._since: tuple[int, int] | None = None
+        self._size: tuple[int, int] | None = None
+
+    def waits(self, inputs: Inputs, now_ns: int) -> str | None:
+        """Note the images so far; what is waited for, None where images come."""
+        newest = inputs.newest
+        taken, outages, size = newest.taken, newest.outages, newest.size_px
+        is_gone = outages > self._outages or now_ns - self._seen_ns > LOST_S * 1e9
+        if self._since is not None and is_gone and inputs.is_live:
+            self._console.warn("camera lost: no image any more")
+            self._since = self._size = None
+        self._outages = outages
+        if taken == self._taken:
+            return inputs.images if self._since is None else None
+        self._taken, self._seen_ns = taken, now_ns
+        if self._since is None:
+            self._since = now_ns, taken
+        seconds = (now_ns - self._since[0]) / 1e9
+        if size is not None and size != self._size and seconds >= RATE_S:
+            rate_hz = (taken - self._since[1]) / seconds
+            self._console.say(f"camera {size[0]}x{size[1]}, {rate_hz:.1f} Hz")
+            self._size = size
+        return None
+
+
+class _AutopilotWatch:
+    """Says when an autopilot comes and goes. Mutable."""
+
+    def __init__(self, console: Console) -> None:
+        self._console, self.is_heard, self._others = console, False, 0
+
+    def waits(self, link: AutopilotLink, url: str | None) -> str | None:
+        """Note the status of the link; what is waited for, None where telemetry comes."""
+        status = link.status()
+        for each in status.others[self._others :]:
+            ids = f"{each.system_id}/{each.component_id}"
+            self._console.say(f"autopilot {ids} heard on {url}, not used (see --system-id)")
+        self._others = len(status.others)
+        if status.target is None:
+            why = "" if status.is_open else ", which cannot be opened"
+            if status.damaged:
+                why += "; messages are damaged, or not signed with this key"
+            return f"heartbeat on {url}{why}"
+        ids = f"{status.target.system_id}/{status.target.component_id}"
+        is_heard = status.heard_age_s <= LINK_AGE_S
+        if self.is_heard and not is_heard:
+            self._console.warn(f"heartbeat lost: nothing heard from autopilot {ids} on {url}")
+        elif is_heard and not self.is_heard:
+            self._console.say(f"autopilot {ids}{_KINDS[status.kind]} heard on {url}")
+        self.is_heard = is_heard
+        if not is_heard:
+            return f"autopilot {ids} on {url}"
+        return None if math.isfinite(status.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
+
+
+def _meaning(reason: str, plain: Mapping[str, Any]) -> str:
+    """What a reason of the health means; empty where its name says so."""
+    if reason == "start_mismatch":
+        return f"{_FAULTS[reason]}, {plain['start_off_m']:,.0f} m from the place found"
+    of_camera = str(plain.get("latency"))
+    if of_camera.startswith(f"{reason}: "):
+        return of_camera.removeprefix(f"{reason}: ")
+    return _FAULTS.get(reason, "")
+
+
+def _place_text(outcome: Fix | NoFix) -> str:
+    if isinstance(outcome, NoFix):
+        return f"{outcome.reason}: {outcome.detail}"
+    return f"{outcome.lat_deg:.6f}, {outcome.lon_deg:.6f} +- {outcome.std_m:.1f} m"
+
+
+def _counted(counts: Counter[str], sends: bool) -> str:
+    """Views, and what became of them."""
+    reasons = {name[9:]: n for name, n in counts.most_common() if name.startswith("withheld ")}
+    good = f"{counts['']} sent" if sends else f"{counts['']} with a position (none is sent)"
+    text = f"{counts['views']} view{'' if counts['views'] == 1 else 's'}, {good}"
+    if not reasons:
+        return text
+    named = ", ".join(f"{name} {number}" for name, number in reasons.items())
+    return f"{text}, {sum(reasons.values())} withheld: {named}"
 
 
 def _descriptor(stream: TextIO | None) -> int | None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.accept import Acceptance
-from orthonav.core.localize.checks import check_picture
+from orthonav.core.localize.confidence import Acceptance
+from orthonav.core.localize.view import check_picture
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
@@ -34,6 +34,7 @@ from orthonav.onboard.health import (
     HealthReporter,
     Notifier,
     Snapshot,
+    StartCheck,
     TelemetryDiagnosis,
     judge,
     mismatch,
@@ -41,56 +42,25 @@ from orthonav.onboard.health import (
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.mavlink import dialect, status_texts
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
-from orthonav.onboard.start_check import StartCheck
 from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
+
+if TYPE_CHECKING:
+    from orthonav.onboard.log import FlightLog
 
 log = logging.getLogger(__name__)
 TICK_NS = 10**9
 """Interval of health and state."""
 UTC_JUMP_NS = 200_000_000
 """UTC that moves by more than this against the monotonic clock within a tick has been set."""
+WITHHELD_NS = 80_000_000
+"""Views that are withheld are logged at most so often, for `orthonav calibrate --latency`."""
 JUMP_NS = 10**9
 """Recorded images that are earlier than the one before by more belong to another run."""
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
 Velocity = tuple[float, float]
-
-
-class LogSink(Protocol):
-    """Writes a flight log. An exception degrades the health; the flight continues."""
-
-    @property
-    def lost(self) -> Mapping[str, int]:
-        """Number of messages that could not be written, by kind."""
-
-    def options(self, options: dict[str, Any]) -> None:
-        """Log the options of the flight."""
-
-    def view(
-        self,
-        number: int,
-        frame: str,
-        grey: Grey,
-        telemetry: Telemetry,
-        latency_ms: float | None,
-        withheld: bool,
-    ) -> None:
-        """Log a view, its telemetry, and the latency that was subtracted from its arrival, before
-        it is located, or `withheld`."""
-
-    def result(self, result: ViewResult) -> None:
-        """Log the result of an image."""
-
-    def health(self, health: dict[str, Any]) -> None:
-        """Log the health of the flight."""
-
-    def gnss(self, time_ns: int, cdr: bytes) -> None:
-        """Log a `sensor_msgs/NavSatFix` (CDR) of a GNSS receiver, as received."""
-
-    def close(self) -> None:
-        """Finish the log."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +112,7 @@ class Runner:
         clocks: Clocks,
         *,
         link: AutopilotLink | None = None,
-        sink: LogSink | None = None,
+        sink: "FlightLog | None" = None,
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
@@ -169,6 +139,7 @@ class Runner:
         self._tick_ns = 0
         self._image_taken_ns: int | None = None
         self._tracked_ns: int | None = None
+        self._withheld_ns = 0
         self._travelled: Travelled | None = None
         self._heights_said = False
         self._last: states.SavedState | None = None
@@ -215,17 +186,15 @@ class Runner:
         now_ns = self._image_taken_ns = self._clocks.mono_ns()
         self._count("taken")
         latency = None
-        if self._latency is not None and image.arrival is not None:
-            latency = self._latency.latency(image.arrival)
-        arrived_ns = image.exposed_ns
-        if now_ns - arrived_ns > self.options.deadline_s * 1e9:
+        if self._latency is not None and image.interruptions is not None:
+            latency = self._latency.latency(image.exposed_ns, image.interruptions)
+        if now_ns - image.exposed_ns > self.options.deadline_s * 1e9:
             self._count("late")
             return None
-        if latency is not None and math.isfinite(latency.delay_s):
+        if latency is not None:
             delay_ns = round(latency.delay_s * 1e9)
-            image = replace(
-                image, exposed_ns=arrived_ns - delay_ns, time_ns=image.time_ns - delay_ns
-            )
+            exposed_ns, time_ns = image.exposed_ns - delay_ns, image.time_ns - delay_ns
+            image = replace(image, exposed_ns=exposed_ns, time_ns=time_ns)
         self._restart_after_jump(image.time_ns)
         vehicle, camera = VehicleState(None), self._camera
         refused = self._map_changed() or self._bad_image(image)
@@ -236,21 +205,22 @@ class Runner:
             except CameraError as error:
                 refused = self._refusal("wrong_camera", "wrong_camera", str(error))
         if refused is not None or image.grey is None:
-            frozen = refused is not None and refused.reason == "frozen_image"
-            if frozen and self._latency is not None and image.arrival is not None:
-                self._latency.frozen(image.arrival)
-            return self._refused(image, refused or NoFix("bad_image", "no image"), vehicle)
+            refused = refused or NoFix("bad_image", "no image")
+            is_frozen = refused.reason == "frozen_image"
+            if is_frozen and latency is not None and self._latency is not None:
+                self._latency.frozen(latency.arrived_ns)
+            return self._refused(image, refused, vehicle)
         try:
             vehicle, telemetry = self._telemetry(image)
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._unusable(telemetry) or self._before_the_last(image)
+            refused = self._unusable(telemetry)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
         finally:
-            self._observe(image, camera)
+            self._observe(image.grey, camera, latency)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Forget the track where time goes back: a bag or a simulation that begins again."""
@@ -277,7 +247,8 @@ class Runner:
         reason = latency.reason or ""
         self._count(reason)
         result = self._result(image, NoFix(reason, latency.detail), math.nan)
-        if self._latency is not None and self._latency.wants(_arrived_ns(image)):
+        if latency.arrived_ns - self._withheld_ns >= WITHHELD_NS:
+            self._withheld_ns = latency.arrived_ns
             self._log_view(image, view, latency, withheld=True)
             self._log(lambda sink: sink.result(result))
         self._publisher.publish(
@@ -285,28 +256,17 @@ class Runner:
         )
         return result
 
-    def _before_the_last(self, image: CameraImage) -> NoFix | None:
-        """Reason not to locate a view whose exposure is not later than that of the one before, as
-        after growth of the latency: a track cannot go back."""
-        if self._latency is None or self._tracked_ns is None:
-            return None
-        if image.exposed_ns > self._tracked_ns:
-            return None
-        return self._refusal("out_of_order", "out_of_order", "exposed before the last view")
-
-    def _observe(self, image: CameraImage, camera: Camera) -> None:
-        """Measure the latency of a live camera with one more image."""
-        link, arrival, grey = self._link, image.arrival, image.grey
-        if self._latency is None or link is None or arrival is None or grey is None:
-            return
-        self._latency.observe(arrival, grey, camera, link.state_at, link.covered_ns)
+    def _observe(self, grey: Grey, camera: Camera, latency: Latency | None) -> None:
+        """Compare an image of a live camera with the telemetry."""
+        if latency is not None and self._latency is not None and self._link is not None:
+            reported = self._link.state_at, self._link.covered_ns
+            self._latency.observe(latency.arrived_ns, grey, camera, *reported)
 
     def _log_view(
         self, image: CameraImage, view: View, latency: Latency | None, *, withheld: bool
     ) -> None:
-        used_ms = None
-        if latency is not None:  # where it is not known, the telemetry is that of the arrival
-            used_ms = latency.delay_s * 1e3 if math.isfinite(latency.delay_s) else 0.0
+        # Where the latency is not stated, the telemetry is that of the arrival.
+        used_ms = None if latency is None else latency.delay_s * 1e3
         self._log(
             lambda sink: sink.view(
                 image.number, image.frame, view.grey, view.telemetry, used_ms, withheld
@@ -335,9 +295,8 @@ class Runner:
         vehicle = self._with_altitude(vehicle, outcome, known)
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, reported, latency.std_s)
-        as_stated = latency is None or latency.stated
-        result = self._result(image, outcome, latency_ms, as_stated=as_stated)
-        doubt = self._doubt(image, result)
+        result = self._result(image, outcome, latency_ms)
+        doubt = self._doubt(result, latency)
         if doubt is not None:
             self._count(doubt)
             self._log(lambda sink: sink.result(result))
@@ -347,7 +306,7 @@ class Runner:
             self.options.heights.observe(telemetry.time_ns, outcome, result.state)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
         if self._gnss is not None:
-            accepted = self._gnss.corrected(accepted, as_stated=as_stated)
+            accepted = self._gnss.corrected(accepted)
         self._publisher.publish(
             replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
         )
@@ -413,14 +372,12 @@ class Runner:
             outcome = _at_exposure(outcome, view.telemetry.vel_en_mps, reported.vel_en_mps)
         return outcome, latency_ms
 
-    def _doubt(self, image: CameraImage, result: ViewResult) -> str | None:
+    def _doubt(self, result: ViewResult, latency: Latency | None) -> str | None:
         """Reason to doubt the time of exposure by the position of a view; None without one."""
-        fix, arrival = self._confident_fix(result), image.arrival
-        if self._latency is None or arrival is None or fix is None:
+        fix = self._confident_fix(result)
+        if self._latency is None or latency is None or fix is None:
             return None
-        std_m = fix.std_m
-        place = fix.lat_deg, fix.lon_deg
-        return self._latency.located(arrival, image.exposed_ns, place, std_m).reason
+        return self._latency.located(latency, (fix.lat_deg, fix.lon_deg), fix.std_m)
 
     def _confident_fix(self, result: ViewResult) -> Fix | None:
         fix = result.outcome
@@ -447,15 +404,13 @@ class Runner:
             fix.lat_deg, fix.lon_deg, std_m, utc_ns, exposed_ns, self._boot_id
         )
 
-    def _result(
-        self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float, *, as_stated: bool = True
-    ) -> ViewResult:
+    def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
         state = self._locator.state_name
         accepted = self._accepts(outcome) if isinstance(outcome, Fix) else None
         result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted)
         if self._gnss is None:
             return result
-        return self._gnss.view(result, image.exposed_ns, as_stated=as_stated)
+        return self._gnss.view(result, image.exposed_ns)
 
     def _accepts(self, fix: Fix) -> bool:
         """Whether a fix meets the criterion of this flight."""
@@ -544,7 +499,7 @@ class Runner:
     def _count(self, name: str) -> None:
         self.counter.add(self._clocks.mono_ns(), name)
 
-    def _log(self, call: Callable[[LogSink], None]) -> None:
+    def _log(self, call: "Callable[[FlightLog], None]") -> None:
         """Write to the log; a failure is counted for the health."""
         if self._sink is None:
             return
@@ -654,7 +609,7 @@ class Runner:
         """Reason why the latency of the camera cannot be used."""
         if self._latency is None or self._image_taken_ns is None:
             return None
-        return self._latency.current().reason
+        return self._latency.reason
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
         total = self.counter.total
@@ -698,10 +653,6 @@ class Runner:
             if self.counter.total["state_failed"] == 0:
                 log.warning("state cannot be saved: %s", error)
             self._count("state_failed")
-
-
-def _arrived_ns(image: CameraImage) -> int:
-    return image.exposed_ns if image.arrival is None else image.arrival.arrived_ns
 
 
 def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> Fix:

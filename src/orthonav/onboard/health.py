@@ -1,4 +1,4 @@
-"""Health of a flight: OK, DEGRADED or FAILED, with reasons.
+"""Health of a flight: OK, DEGRADED or FAILED, with reasons; diagnosis of telemetry and start.
 
 `judge` is a pure function of counts over the last seconds. docs/onboard.md lists the reasons and
 their causes.
@@ -16,18 +16,37 @@ from enum import Enum
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.records import Fix, Telemetry, View
+from orthonav.core.records import Fix, Prior, Telemetry, View
+from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.onboard.state import SPEED_MPS
 
 log = logging.getLogger(__name__)
 WINDOW_S = 10.0
 """Counts cover so many seconds."""
+IMAGE_AGE_S, TELEMETRY_AGE_S, LINK_AGE_S = 3.0, 3.0, 5.0
+"""Longest time without an image, an attitude, a message."""
+LOW_CONFIDENCE_S, COASTING_S = 10.0, 2.0
+"""Longest time without a confident position, in general and by views that do not show the map."""
+LATENCY_S, SHARE = 0.5, 0.2
+"""95th percentile of the time from exposure to message; share of the images in the window that are
+unusable, late or lack telemetry."""
+HEADING_DEG, LOG_SCALE = 20.0, 0.2
+"""Difference of estimated and reported heading, and of the logarithm of the height."""
+GRACE_S = 5.0
+"""Missing inputs are no reason for so long after the start."""
 STATUSTEXT_INTERVAL_NS = 5 * 10**9
 DIAGNOSIS_INTERVAL_S = 5.0
 DIAGNOSIS_VALID_S = 30.0
 """A finding of `TelemetryDiagnosis` expires after this time."""
+SIGMAS = 3.0
+"""A place farther from the start than this many deviations contradicts it."""
+SHOWN_S = 30.0
+"""Time for which a contradiction is reported."""
 
 
 class Level(Enum):
@@ -54,32 +73,6 @@ class Health:
         """Text for a ground station."""
         text = f"orthonav {self.level.name}"
         return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
-
-
-@dataclass(frozen=True)
-class HealthLimits:
-    """Thresholds of `judge`; exceeding one is a reason.
-
-    `image_age_s`, `telemetry_age_s`, `link_age_s`: time without an image, an attitude, a message.
-    `low_confidence_s`, `coasting_s`: time without a confident position, in general and by views
-    that do not show the map.
-    `latency_s`: 95th percentile of the time from exposure to message.
-    `share`: share (0 to 1) of the images in the window that are unusable, late or lack telemetry.
-    `heading_deg`: difference of estimated and reported heading.
-    `log_scale`: natural logarithm of the ratio of estimated and reported height.
-    `grace_s`: time after the start during which missing inputs are no reason.
-    """
-
-    image_age_s: float = 3.0
-    telemetry_age_s: float = 3.0
-    link_age_s: float = 5.0
-    low_confidence_s: float = 10.0
-    coasting_s: float = 2.0
-    latency_s: float = 0.5
-    share: float = 0.2
-    heading_deg: float = 20.0
-    log_scale: float = 0.2
-    grace_s: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -124,36 +117,35 @@ class Snapshot:
     latency: str | None = None
 
 
-def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
+def judge(seen: Snapshot) -> Health:
     """Level and reasons."""
-    limits = limits or HealthLimits()
     count = Counter(seen.counts)
-    many = limits.share * max(count["taken"], 1)
-    settled = seen.running_s > limits.grace_s
+    many = SHARE * max(count["taken"], 1)
+    settled = seen.running_s > GRACE_S
     failed = {
-        "no_camera": settled and seen.image_age_s > limits.image_age_s,
-        "link_down": settled and seen.link_age_s > limits.link_age_s,
-        "no_telemetry": settled and seen.telemetry_age_s > limits.telemetry_age_s,
+        "no_camera": settled and seen.image_age_s > IMAGE_AGE_S,
+        "link_down": settled and seen.link_age_s > LINK_AGE_S,
+        "no_telemetry": settled and seen.telemetry_age_s > TELEMETRY_AGE_S,
         "wrong_camera": count["wrong_camera"] > 0,
         "map_file_changed": not seen.map_intact,
         "internal_errors": count["internal_error"] > 0.5 * max(count["processed"], 1),
     }
     degraded = {
-        "heading_mismatch": abs(seen.heading_mismatch_deg) > limits.heading_deg,
-        "height_mismatch": abs(seen.log_scale_mismatch) > limits.log_scale,
+        "heading_mismatch": abs(seen.heading_mismatch_deg) > HEADING_DEG,
+        "height_mismatch": abs(seen.log_scale_mismatch) > LOG_SCALE,
         "start_mismatch": seen.start_off_m > 0,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
-        "coasting": seen.state == "coasting" and seen.low_confidence_s > limits.coasting_s,
+        "coasting": seen.state == "coasting" and seen.low_confidence_s > COASTING_S,
         "low_confidence": seen.state not in ("lost", "searching", "coasting")
-        and seen.low_confidence_s > limits.low_confidence_s,
+        and seen.low_confidence_s > LOW_CONFIDENCE_S,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
-        "slow": seen.latency_s > limits.latency_s or count["late"] > many,
-        "slow_vision": count["slow_vision"] > limits.share * WINDOW_S,
+        "slow": seen.latency_s > LATENCY_S or count["late"] > many,
+        "slow_vision": count["slow_vision"] > SHARE * WINDOW_S,
         "no_origin": settled and not seen.has_origin,
-        "incomplete_message": count["incomplete"] > limits.share * WINDOW_S and seen.has_origin,
+        "incomplete_message": count["incomplete"] > SHARE * WINDOW_S and seen.has_origin,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not seen.synced and not failed["link_down"],
@@ -325,3 +317,72 @@ class TelemetryDiagnosis:
 
 def _in_a_thread(work: Callable[[], None]) -> None:
     threading.Thread(target=work, name="telemetry diagnosis", daemon=True).start()
+
+
+class StartCheck:
+    """Compares the places where a flight was recognized with its start. Mutable."""
+
+    def __init__(self, start: Prior, time_ns: int) -> None:
+        """`time_ns`: time of the first view, for which the start holds."""
+        self._start, self._time_ns = start, time_ns
+        self._moved_en_m, self._free_m = np.zeros(2), 0.0
+        self._diagnosed: _Place | None = None
+        self._confirmed: _Place | None = None
+
+    def moved(self, telemetry: Telemetry) -> None:
+        """Pass the telemetry of every view."""
+        seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
+        self._time_ns = max(telemetry.time_ns, self._time_ns)
+        velocity = telemetry.vel_en_mps
+        if velocity is None or not np.isfinite(velocity).all():
+            self._free_m += SPEED_MPS * seconds
+            return
+        std_mps = telemetry.vel_std_mps or usual_velocity_std_mps(math.hypot(*velocity))
+        self._moved_en_m += np.array(velocity) * seconds
+        self._free_m += SIGMAS * std_mps * seconds
+
+    def diagnosed(self, fix: Fix, seen_ns: int, now_ns: int) -> None:
+        """Pass the last place that the diagnosis found, in a view taken at `seen_ns`."""
+        if self._diagnosed is None or self._diagnosed.fix is not fix:
+            self._diagnosed = self._place(fix, seen_ns, now_ns)
+
+    def confirmed(self, fix: Fix, now_ns: int) -> None:
+        """Pass the confident fixes of the track; the first one decides."""
+        if self._confirmed is None:
+            self._confirmed = self._place(fix, now_ns, now_ns)
+
+    def off_m(self, now_ns: int) -> float:
+        """Distance of the start from that which the last place implies, metres; 0 where it is
+        within the deviations, and `SHOWN_S` after that place."""
+        last = self._confirmed or self._diagnosed
+        return last.off_m if last is not None and now_ns - last.seen_ns < SHOWN_S * 1e9 else 0.0
+
+    def _place(self, fix: Fix, seen_ns: int, now_ns: int) -> "_Place":
+        """A place and what it says of the start. With time an aircraft may have come to any place
+        from the start: where it may have come from the last place, that one decides."""
+        off_m = float(np.hypot(*(_from(fix, self._start) + self._moved_en_m)))
+        std_m = math.hypot(self._start.std_m, fix.radius_m)
+        free_m = self._free_m + SPEED_MPS * (now_ns - seen_ns) / 1e9
+        if off_m <= SIGMAS * std_m + free_m:
+            before = self._diagnosed
+            off_m = before.off_m if before is not None and before.reaches(fix, seen_ns) else 0.0
+        return _Place(seen_ns, fix, off_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A confident fix, and the distance by which it contradicts the start, 0 if it does not."""
+
+    seen_ns: int
+    fix: Fix
+    off_m: float
+
+    def reaches(self, fix: Fix, seen_ns: int) -> bool:
+        """Whether the aircraft can have flown from here to a later fix."""
+        free_m = SPEED_MPS * (seen_ns - self.seen_ns) / 1e9
+        return float(np.hypot(*_from(fix, self.fix))) <= free_m + self.fix.radius_m + fix.radius_m
+
+
+def _from(fix: Fix, other: Fix | Prior) -> NDArray[np.float64]:
+    """Metres east and north (2,) of another place from a fix."""
+    return LocalFrame(fix.lat_deg, fix.lon_deg).en_from_latlon(other.lat_deg, other.lon_deg)

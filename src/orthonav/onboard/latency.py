@@ -1,12 +1,12 @@
-"""Decides which delay of a live camera is used, and when it is not known well enough.
+"""Whether the stated latency of a live camera, from exposure to arrival, can be used.
 
-The delay is known where it was stated or measured in flight. It is not known after a sign of a
-change (in the arrivals, `orthonav.onboard.arrival`, or in the positions,
-`orthonav.onboard.position_check`) until it has been measured again, while measurements contradict
-it, and while the pictures do not move as the autopilot reports.
+Nothing is estimated in flight. A latency that is wrong, or that changed, shows in two ways: images
+do not move as the autopilot reports, or the position jumps along the path of the aircraft. Fixes
+are then withheld until images move as reported again.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,87 +15,71 @@ import numpy as np
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.onboard.arrival import GAP_S, Arrival
-from orthonav.onboard.delay import EXPLAINED, UNEXPLAINED, DelayEstimate, DelayEstimator
-from orthonav.onboard.delay_check import DelayCheck
-from orthonav.onboard.history import StateHistory
-from orthonav.onboard.motion import Grey, PictureOdometry
-from orthonav.onboard.position_check import PositionCheck
+from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.onboard.motion import (
+    SHIFT_STD,
+    TURN_STD_RAD,
+    Array,
+    Grey,
+    ImageMotion,
+    PictureOdometry,
+    StateHistory,
+    explained_share,
+)
 from orthonav.onboard.telemetry import VehicleState
 
 UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
-EVERY_NS, DOUBT_EVERY_NS = 10**9, 5 * 10**8
-"""Interval of estimates; the same while nothing can be sent."""
+STATED_STD_S = 0.03
+"""Least standard deviation of a stated latency: one image at 30 Hz."""
 FIRST_NS = 5 * 10**9
-"""A stated delay is used after images agreed with it, or after this time without enough motion to
+"""A latency is used after images agreed with it, or after this time without enough motion to
 tell."""
-RECENT_S = 5.0
-"""Pictures of so many seconds show a change that the whole window hides. With 8 s instead, growth
-by 0.1 s/s made errors of 18 m before it showed, 9 m with 5 s (flights with computed pictures)."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back, at the start and after a time
-without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.BufferLimits`)."""
-LARGEST_M, USUAL_MPS, LEAST_MPS = 4.0, 20.0, 5.0
-"""A measured delay is known where its standard deviation times the speed is at most so many metres;
-speed where none is reported, and least speed."""
-STATED_STD_S = 0.03
-"""Standard deviation of a stated delay: one image at 30 Hz."""
-AGREE_S, AGREE_SIGMAS = 0.08, 3.0
-"""Delays agree within the larger of both."""
-WALK_S, LARGEST_WALK_S = 0.01, 0.1
-"""Growth of the standard deviation since the measurement, per square root of a second, and its
-limit: a delay without a sign of change stays in use, as a stated one does."""
-DRIFTS, TOO_FAST = 0.008, 0.05
-"""Drift (s/s) above which a delay is extrapolated, and above which it is not steady."""
-EXTRAPOLATED_S = 15.0
-"""Longest time for which a drifting delay is extrapolated."""
-GROWN_S, GROWN_RATE = 0.15, 0.002
-"""Growth of the delay by timestamps that counts as a change, and what clocks may add to it each
-second."""
-UNLIKE = "images do not move as reported at the latency in use"
-SETTLED_S = 8.0
-"""Images that moved unlike the report for a moment, without another sign of a change: the delay in
-use is in doubt until they have not contradicted it for so long."""
-BEFORE_S = 0.1
-"""An exposure that is later than the arrival by more than this shows clocks that disagree."""
+without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_S`)."""
+GAP_S = 0.5
+"""A latency is compared again after an image was frozen for longer."""
+SETTLED_NS = 8 * 10**9
+"""After images or positions contradicted the latency, nothing may contradict it for so long."""
+EXPLAINED, UNEXPLAINED = 0.6, 0.3
+"""Share of the motion that is common to images and report from which they agree, and below which
+they contradict each other."""
+SECONDS, LEAST_PAIRS = 4.0, 12
+"""Images of so many seconds are compared, at least so many pairs."""
+LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
+"""Shift per second by the velocity from which it is compared (3 m/s from 100 m), and the range of
+the seen over the reported one: height and heading may be off."""
+SUMMED, STANDS_OUT = 4, 3.0
+"""Successive pairs that are summed; their motion counts from so many least standard deviations."""
+OUTLIER, OUTLIER_SHARE, MAD_TO_STD = 6.0, 0.1, 1.4826
+"""Pairs that differ by more than so many standard deviations are left out, the worst ones, up to
+this share: one false motion of the picture is in four sums."""
+KEEP_S, LONGEST_GAP_S = 5.0, 30.0
+"""Earlier positions with which one is compared: a track moves to a new place within seconds. The
+last one counts for longer: a track may have been coasting or lost since."""
+SIGMAS = 3.0
+LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
+"""Changes of the latency that are looked for."""
 
 
 @dataclass(frozen=True)
 class Latency:
-    """The delay to use for one image.
+    """The latency to use for one image.
 
-    `delay_s`, `std_s`: exposure to arrival and its standard deviation; NaN where not known.
-    `reason`: why it must not be used; None if it can be used. `detail`: one sentence about it.
-    `stated`: whether it is the stated delay, not one that was measured in flight.
+    `arrived_ns`: its arrival by our clock. `delay_s`, `std_s`: exposure to arrival and its standard
+    deviation; 0 and NaN where not stated. `reason`: why the latency must not be used; None if it
+    can be used. `detail`: one sentence about it.
     """
 
+    arrived_ns: int
     delay_s: float
     std_s: float
     reason: str | None = None
     detail: str = ""
-    stated: bool = False
-
-
-@dataclass(frozen=True)
-class _Known:
-    """A delay that is used; `measured_ns`: arrival of the last picture of the measurement."""
-
-    delay_s: float
-    std_s: float
-    drift: float = 0.0
-    measured_ns: int | None = None
-
-    def at(self, arrived_ns: int) -> tuple[float, float]:
-        """Delay and standard deviation for an arrival."""
-        if self.measured_ns is None:
-            return self.delay_s, self.std_s
-        age_s = max(0.0, (arrived_ns - self.measured_ns) / 1e9)
-        walk_s = min(WALK_S * math.sqrt(age_s), LARGEST_WALK_S)
-        return self.delay_s + self.drift * age_s, math.hypot(self.std_s, walk_s)
 
 
 class LatencyMonitor:
-    """Measures and judges the delay of a live camera. Mutable; for one thread."""
+    """Judges the stated latency of a live camera. Mutable; for one thread."""
 
     def __init__(
         self,
@@ -105,85 +89,55 @@ class LatencyMonitor:
         mount_deg: Angles = LOOKS_DOWN,
         heading_known: bool = True,
     ) -> None:
-        """`stated_s`: delay as stated by the user, None: not stated."""
-        self._stated = None if stated_s is None else _Known(stated_s, stated_std_s)
-        self._known = self._stated
+        """`stated_s`: latency as stated by the user, None: not stated. `heading_known`: whether the
+        reported heading gives the direction of the velocity."""
+        self._is_stated, self._delay_s = stated_s is not None, stated_s or 0.0
+        self._std_s = stated_std_s if self._is_stated else math.nan
         self._mount_deg = mount_deg
         self._odometry, self._history = PictureOdometry(), StateHistory()
-        self._estimator = DelayEstimator(heading_known=heading_known)
-        self._check = DelayCheck(heading_known=heading_known)
+        self._check = MotionCheck(self._delay_s, heading_known=heading_known)
         self._positions = PositionCheck()
         self._frame: LocalFrame | None = None
         self._sampled_ns: int | None = None
-        self._due_ns: int | None = None
-        self._pending: DelayEstimate | None = None
-        self._suspicion = ""
-        self._disputed = False
-        self._unlike_ns = 0
-        self._contradictions = 0
-        self._changes: int | None = None
-        self._anchor: tuple[int, float] | None = None
-        self._grown = False
-        self._arrival: Arrival | None = None
+        self._doubted_ns = 0
+        self._interruptions = 0
         self._frozen_ns: int | None = None
         self._first_ns: int | None = None
-        self._compared = False
+        self._compared = self._contradicted = False
+        self._jump_s: float | None = None
 
-    def wants(self, arrived_ns: int) -> bool:
-        """Whether an image that arrived then is compared with the one before."""
-        return self._odometry.wants(arrived_ns)
+    def latency(self, arrived_ns: int, interruptions: int = 0) -> Latency:
+        """The latency to use for an image. Pass every image, in the order of arrival.
 
-    def latency(self, arrival: Arrival) -> Latency:
-        """The delay to use for an image. Pass every image, in the order of arrival."""
-        self._watch(arrival)
-        return self._judged(arrival.arrived_ns)
+        `interruptions`: how often images stopped for a while. The latency is then compared again,
+        as at the start; positions from before show whether it grew."""
+        frozen_ns = arrived_ns if self._frozen_ns is None else self._frozen_ns
+        if interruptions != self._interruptions or arrived_ns - frozen_ns > GAP_S * 1e9:
+            self._interruptions = interruptions
+            self._compare_again()
+        return Latency(arrived_ns, self._delay_s, self._std_s, *self._doubt())
 
-    def located(
-        self, arrival: Arrival, exposed_ns: int, latlon_deg: tuple[float, float], std_m: float
-    ) -> Latency:
-        """The delay after the position by an image: in doubt where that jumped to a place where the
-        aircraft was earlier or later.
+    def frozen(self, arrived_ns: int) -> None:
+        """Note an image that repeats the one before: the stream may be stalled."""
+        if self._frozen_ns is None:
+            self._frozen_ns = arrived_ns
 
-        `exposed_ns`: its time of exposure by the delay in use. `std_m`: standard deviation of the
-        position.
-        """
+    def located(self, used: Latency, latlon_deg: tuple[float, float], std_m: float) -> str | None:
+        """Reason to doubt the latency that was used after the position by an image, with its
+        standard deviation: it jumped to a place where the aircraft was earlier or later."""
         if self._frame is None:
             self._frame = LocalFrame(*latlon_deg)
         en_m = np.asarray(self._frame.en_from_latlon(*latlon_deg), np.float64)
-        change_s = self._positions.change_s(exposed_ns, en_m, std_m, self._history)
-        if change_s is not None:
-            why = f"the position jumped as by a change of the latency of {change_s:+.1f} s"
-            self._suspect(why, arrival.arrived_ns)
-        return self._judged(arrival.arrived_ns)
-
-    def frozen(self, arrival: Arrival) -> None:
-        """Note an image that repeats the one before: the stream may be stalled."""
-        if self._frozen_ns is None:
-            self._frozen_ns = arrival.arrived_ns
-
-    def _judged(self, arrived_ns: int) -> Latency:
-        if self._known is None:
-            advice = "fly turns until it is measured, or give --camera-latency-ms"
-            return Latency(math.nan, math.nan, UNKNOWN, f"camera latency not known: {advice}")
-        delay_s, std_s = self._known.at(arrived_ns)
-        reason, detail = None, ""
-        if self._contradictions >= 2:
-            detail = "images do not move as the autopilot reports: check the camera, --mount-deg"
-            reason, detail = MISMATCH, f"{detail}, the height and the heading"
-        elif self._suspicion:
-            reason = UNSTEADY
-            detail = f"{self._suspicion}: the camera latency must be measured again, in turns"
-        elif not self._compared:
-            reason, detail = UNKNOWN, "the stated camera latency is compared with the first images"
-        elif self._drifted_away(arrived_ns):
-            reason, detail = UNSTEADY, "the camera latency drifts and is not observable now"
-        elif std_s * self._speed_mps() > 2 * LARGEST_M:
-            reason, detail = UNKNOWN, f"camera latency known to {std_s * 1e3:.0f} ms only"
-        return Latency(delay_s, std_s, reason, detail, self._known is self._stated)
+        exposed_ns = used.arrived_ns - round(used.delay_s * 1e9)
+        jump_s = self._positions.jump_s(exposed_ns, en_m, std_m, self._history)
+        if jump_s is not None:
+            self._jump_s, self._doubted_ns = jump_s, used.arrived_ns
+            self._compare_again()
+        return self.reason
 
     def observe(
         self,
-        arrival: Arrival,
+        arrived_ns: int,
         grey: Grey,
         camera: Camera,
         state_at: Callable[[int], VehicleState],
@@ -193,45 +147,54 @@ class LatencyMonitor:
 
         `state_at` gives the state at a time of our clock, known up to `covered_ns`.
         """
+        if not self._is_stated:
+            return
         self._frozen_ns = None  # this image is not frozen
         if self._first_ns is None:
-            self._first_ns = arrival.arrived_ns
-        self._compared |= arrival.arrived_ns - self._first_ns > FIRST_NS
+            self._first_ns = arrived_ns
         self._sample(state_at, covered_ns)
-        motion = self._odometry.motion(grey, camera, arrival.arrived_ns)
-        self._estimator.add(motion, self._history)
-        if self._known is not None:
-            delay_s, _ = self._known.at(arrival.arrived_ns)
-            self._check.add(motion, self._history, delay_s)
-        if self._due_ns is None or arrival.arrived_ns >= self._due_ns:
-            doubt = self._judged(arrival.arrived_ns).reason is not None
-            self._due_ns = arrival.arrived_ns + (DOUBT_EVERY_NS if doubt else EVERY_NS)
-            recent = self._estimator.estimate(RECENT_S)
-            decided = recent.found or recent.contradicted
-            self._judge(recent if decided else self._estimator.estimate())
-            self._compare(arrival.arrived_ns)
+        self._check.add(self._odometry.motion(grey, camera, arrived_ns), self._history)
+        share = self._check.share()
+        agree = share >= EXPLAINED
+        self._compared |= agree or arrived_ns - self._first_ns > FIRST_NS
+        if share < UNEXPLAINED:
+            self._contradicted, self._doubted_ns = True, arrived_ns
+        elif arrived_ns - self._doubted_ns > SETTLED_NS:  # steady turns look alike at any latency
+            self._contradicted &= not self._check.is_filled
+            self._jump_s = None if agree else self._jump_s
 
-    def current(self) -> Latency:
-        """The delay that was used last, or why it was not."""
-        return self._judged(0 if self._arrival is None else self._arrival.arrived_ns)
+    @property
+    def reason(self) -> str | None:
+        """Reason why the latency cannot be used; None where it can."""
+        return self._doubt()[0]
 
     def plain(self) -> dict[str, float | str | None]:
-        """What is known, for logs: `latency_ms`, `latency_std_ms`, and `latency`, where it comes
-        from or why it is not used."""
-        found = self.current()
-        source = "stated" if found.stated else "measured"
-        rounded = (
-            None if math.isnan(each) else round(each * 1e3, 1)
-            for each in (found.delay_s, found.std_s)
-        )
-        delay_ms, std_ms = rounded
+        """What is known, for logs: `latency_ms`, `latency_std_ms`, and `latency`, "stated" or why
+        it is not used."""
+        reason, detail = self._doubt()
         return {
-            "latency_ms": delay_ms,
-            "latency_std_ms": std_ms,
-            "latency": f"{found.reason}: {found.detail}" if found.reason else source,
+            "latency_ms": round(self._delay_s * 1e3, 1) if self._is_stated else None,
+            "latency_std_ms": round(self._std_s * 1e3, 1) if self._is_stated else None,
+            "latency": f"{reason}: {detail}" if reason else "stated",
         }
 
+    def _doubt(self) -> tuple[str | None, str]:
+        """Reason why the latency cannot be used, and one sentence about it; None where it can."""
+        if not self._is_stated:
+            advice = "give --camera-latency-ms, as `orthonav calibrate --latency` measures it"
+            return UNKNOWN, f"camera latency not known: {advice}"
+        if self._contradicted:
+            causes = "--camera-latency-ms, --mount-deg, the height and the heading"
+            return MISMATCH, f"images do not move as the autopilot reports: check {causes}"
+        if self._jump_s is not None:
+            jumped = f"the position jumped as by a change of the latency of {self._jump_s:+.1f} s"
+            return UNSTEADY, f"{jumped}: it is withheld until images move as reported, in turns"
+        if not self._compared:
+            return UNKNOWN, "the stated camera latency is compared with the first images"
+        return None, ""
+
     def _sample(self, state_at: Callable[[int], VehicleState], covered_ns: int | None) -> None:
+        """Store the reported states up to a time."""
         if covered_ns is None:
             return
         if self._sampled_ns is None or covered_ns - self._sampled_ns > REACH_NS:
@@ -242,144 +205,164 @@ class LatencyMonitor:
             turn = state.ned_from_body
             attitude = None if turn is None else enu_from_body_camera(turn, self._mount_deg)
             north, east, down = state.velocity_ned_mps
-            velocity = north + east + down
-            known = (east, north, -down) if math.isfinite(velocity) else None
+            known = (east, north, -down) if math.isfinite(north + east + down) else None
             self._history.add(self._sampled_ns, attitude, known, state.height_m)
 
-    def _watch(self, arrival: Arrival) -> None:
-        """Notice changes in the arrivals."""
-        self._arrival = arrival
-        if self._changes is None:
-            self._changes = arrival.changes
-        if arrival.changes != self._changes:
-            self._changes, self._anchor, self._grown = arrival.changes, None, False
-            self._interrupted(arrival.why, arrival.arrived_ns)
-        if self._frozen_ns is not None:
-            stalled_s = (arrival.arrived_ns - self._frozen_ns) / 1e9
-            if stalled_s > GAP_S:
-                self._interrupted(f"the image was frozen for {stalled_s:.1f} s", arrival.arrived_ns)
-        if math.isnan(arrival.grown_s):
-            return
-        if self._anchor is None:
-            self._anchor = arrival.arrived_ns, arrival.grown_s
-        since_ns, grown_s = self._anchor
-        allowed_s = GROWN_S + GROWN_RATE * (arrival.arrived_ns - since_ns) / 1e9
-        grown = abs(arrival.grown_s - grown_s) > allowed_s
-        if grown and not self._grown:
-            change_ms = (arrival.grown_s - grown_s) * 1e3
-            self._suspect(f"images arrive {change_ms:+.0f} ms later", arrival.arrived_ns)
-        elif self._grown and not grown:  # as late as before
-            self._suspicion = ""
-            self._start_again(arrival.arrived_ns)
-        self._grown = grown
-
-    def _interrupted(self, why: str, arrived_ns: int) -> None:
-        """Note that images stopped for a while. A stated delay holds; it is compared with the
-        images again, as at the start. Positions from before the gap show whether it grew."""
-        if self._known is not self._stated:
-            self._suspect(why, arrived_ns)
-            return
+    def _compare_again(self) -> None:
+        """Forget the images so far."""
         self._compared, self._first_ns = False, None
-        self._forget_images(arrived_ns)
-
-    def _suspect(self, why: str, arrived_ns: int) -> None:
-        self._suspicion, self._disputed = why, False
-        self._start_again(arrived_ns)
-
-    def _start_again(self, arrived_ns: int) -> None:
-        """Forget what is from before a change."""
-        self._positions.clear()
-        self._forget_images(arrived_ns)
-
-    def _forget_images(self, arrived_ns: int) -> None:
-        self._estimator.forget_before(arrived_ns)
         self._odometry.reset()
         self._check.clear()
-        self._pending, self._contradictions = None, 0
 
-    def _judge(self, found: DelayEstimate) -> None:
-        if found.contradicted:
-            self._contradictions += 1
-            return
-        if found.found:
-            self._contradictions = 0
-        if not found.found or found.std_s * self._speed_mps() > LARGEST_M:
-            return
-        if found.delay_s < -BEFORE_S or abs(found.drift) > TOO_FAST:
-            before = found.delay_s < -BEFORE_S
-            why = "images seem to arrive before exposure" if before else "the latency drifts fast"
-            self._dispute(why, found)
-            return
-        # After a change, an estimate is not compared with the delay from before.
-        known = None if self._suspicion and not self._disputed else self._known
-        if known is not None:
-            delay_s, std_s = known.at(found.last_ns)
-            if _near(found.delay_s - delay_s, found.std_s, std_s):
-                self._adopt(found)
-                return
-        if self._pending is not None and _agree(found, self._pending):
-            self._adopt(found)
-        elif known is None:
-            self._pending = found
-        else:
-            delay_ms = known.at(found.last_ns)[0] * 1e3
-            measured = f"measured {found.delay_s * 1e3:.0f} ms, used {delay_ms:.0f} ms"
-            self._dispute(measured, found)
 
-    def _compare(self, arrived_ns: int) -> None:
-        """Dispute the delay in use where the last seconds do not fit it."""
-        share = self._check.share()
-        if share >= UNEXPLAINED:
-            self._contradictions = 0
-            self._compared |= share >= EXPLAINED  # a delay that is a little off explains some
-        if share < UNEXPLAINED:
-            self._unlike_ns = arrived_ns
-            if not self._suspicion:
-                self._suspicion, self._disputed, self._pending = UNLIKE, True, None
-        elif self._suspicion == UNLIKE and self._check.is_filled:
-            # Not at once: steady turns look alike at many delays.
-            settled = arrived_ns - self._unlike_ns > SETTLED_S * 1e9
-            self._suspicion = "" if settled else UNLIKE
+class MotionCheck:
+    """Whether the images of the last seconds move as the autopilot reports. Mutable."""
 
-    def _dispute(self, why: str, found: DelayEstimate) -> None:
-        """Withhold until the next estimate agrees with this one or with what was known."""
-        self._suspicion, self._disputed, self._pending = why, True, found
+    def __init__(self, delay_s: float, *, heading_known: bool = True) -> None:
+        """`delay_s`: exposure to arrival of the images."""
+        self._delay_ns = round(delay_s * 1e9)
+        self._heading_known = heading_known
+        self._waiting: deque[ImageMotion] = deque(maxlen=100)
+        self._rows: deque[tuple[int, Array]] = deque(maxlen=100)
 
-    def _adopt(self, found: DelayEstimate) -> None:
-        stated = self._stated
-        changed = self._known is None or not _near(
-            found.delay_s - self._known.at(found.last_ns)[0], found.std_s, 0.0
+    def clear(self) -> None:
+        """Forget all images."""
+        self._waiting.clear()
+        self._rows.clear()
+
+    def add(self, motion: ImageMotion | None, history: StateHistory) -> None:
+        """Add the motion of a pair of images; it counts once the report reaches beyond it."""
+        if motion is not None:
+            self._waiting.append(motion)
+        while self._waiting and self._waiting[0].end_ns - self._delay_ns <= history.newest_ns:
+            one = self._waiting.popleft()
+            times = (np.array([each - self._delay_ns]) for each in (one.start_ns, one.end_ns))
+            moved = history.motion(*times)
+            velocity = moved.velocity_shift[0]
+            turn, tilt = moved.turn_rad[0], moved.tilt_shift[0]
+            row = np.array([one.seconds, one.turn_rad, *one.shift, turn, *tilt, *velocity])
+            if np.isfinite(row[:7]).all():
+                self._rows.append((one.end_ns, row))
+
+    def share(self) -> float:
+        """Share of the seen and the reported motion of the last seconds that is common to both; NaN
+        where little moved."""
+        while self._rows and self._rows[0][0] < self._rows[-1][0] - SECONDS * 1e9:
+            self._rows.popleft()
+        if not self.is_filled:
+            return math.nan
+        pairs = np.array([row for _, row in self._rows])
+        if not np.isfinite(pairs).all():  # without the velocity only turns can be compared
+            pairs[:, [2, 3, 5, 6, 7, 8]] = 0.0
+        pairs = _sound(pairs)
+        # Sums over successive pairs: jitter of the attitudes cancels, motion adds up.
+        rows = np.lib.stride_tricks.sliding_window_view(pairs, SUMMED, axis=0).sum(axis=-1)
+        seconds = rows[:, :1]
+        # The constant part of the shift depends on height and heading, which may be off.
+        velocity = rows[:, 7:9]
+        seen_by_velocity = rows[:, 2:4] - rows[:, 5:7]
+        if self._contradicts(seen_by_velocity / seconds, velocity / seconds):
+            return 0.0
+        shift_off = seen_by_velocity - velocity
+        shift_off = shift_off - np.median(shift_off / seconds, axis=0) * seconds
+        turn_off = rows[:, 1] - rows[:, 4]
+        return explained_share(
+            rows[:, 0], rows[:, 1], rows[:, 2:4], turn_off, shift_off, STANDS_OUT
         )
-        if stated is not None and _near(found.delay_s - stated.delay_s, found.std_s, stated.std_s):
-            self._known = stated
-        else:
-            drift = found.drift if abs(found.drift) > DRIFTS else 0.0
-            self._known = _Known(found.delay_s, found.std_s, drift, found.last_ns)
-        if changed:  # older pictures belong to another delay
-            self._estimator.forget_before(found.last_ns - round(RECENT_S * 1e9))
-            self._check.clear()
-            self._positions.clear()
-        self._suspicion, self._disputed, self._pending, self._grown = "", False, None, False
-        self._compared = True
-        if self._arrival is not None and math.isfinite(self._arrival.grown_s):
-            self._anchor = self._arrival.arrived_ns, self._arrival.grown_s
 
-    def _drifted_away(self, arrived_ns: int) -> bool:
-        known = self._known
-        if known is None or known.measured_ns is None or known.drift == 0.0:
+    @property
+    def is_filled(self) -> bool:
+        """Whether there are enough pairs to compare."""
+        return len(self._rows) >= LEAST_PAIRS
+
+    def _contradicts(self, seen: Array, reported: Array) -> bool:
+        """Whether shifts per second (N, 2) by the velocity differ beyond errors of height."""
+        seen, reported = np.median(seen, axis=0), np.median(reported, axis=0)
+        size = float(np.hypot(*reported))
+        if size < LEAST_PER_S:
             return False
-        return arrived_ns - known.measured_ns > EXTRAPOLATED_S * 1e9
-
-    def _speed_mps(self) -> float:
-        speed = self._history.speed_mps()
-        return max(LEAST_MPS, speed) if math.isfinite(speed) else USUAL_MPS
+        along = float(seen @ reported) / size if self._heading_known else float(np.hypot(*seen))
+        return not SCALES[0] < along / size < SCALES[1]
 
 
-def _near(off_s: float, std_s: float, other_std_s: float) -> bool:
-    return abs(off_s) <= max(AGREE_S, AGREE_SIGMAS * math.hypot(std_s, other_std_s))
+def _sound(pairs: Array) -> Array:
+    """The rows (N, 9) without outliers."""
+    off = np.concatenate([pairs[:, 1:2] - pairs[:, 4:5], pairs[:, 2:4] - pairs[:, 5:7]], axis=1)
+    off[:, 1:] -= pairs[:, 7:9]
+    off = np.abs(off - np.median(off, axis=0))
+    least = np.array([TURN_STD_RAD, SHIFT_STD, SHIFT_STD])
+    worst = (off / np.maximum(least, MAD_TO_STD * np.median(off, axis=0))).max(axis=1)
+    count = math.ceil(OUTLIER_SHARE * len(pairs))
+    limit = max(OUTLIER, float(np.sort(worst)[-count - 1]))
+    return np.asarray(pairs[worst <= limit])
 
 
-def _agree(one: DelayEstimate, other: DelayEstimate) -> bool:
-    """Whether two estimates agree; False where one of them was not found."""
-    moved_s = other.drift * (one.last_ns - other.last_ns) / 1e9
-    return _near(one.delay_s - other.delay_s - moved_s, one.std_s, other.std_s)
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A position (2,), metres east and north, and its standard deviation."""
+
+    exposed_ns: int
+    en_m: Array
+    std_m: float
+
+
+class PositionCheck:
+    """Whether the position jumped along the path of the aircraft. Mutable."""
+
+    def __init__(self) -> None:
+        self._places: deque[_Place] = deque(maxlen=100)
+
+    def jump_s(
+        self, exposed_ns: int, en_m: Array, std_m: float, history: StateHistory
+    ) -> float | None:
+        """Growth of the latency (s) by which the position jumped; None where it did not jump, or to
+        a place that no change of the latency explains. One that jumped does not count later.
+
+        `exposed_ns`: time of exposure by the latency in use. `en_m` (2,): metres east and north,
+        `std_m` their standard deviation.
+        """
+        now = _Place(exposed_ns, en_m, std_m)
+        while len(self._places) > 1 and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
+            self._places.popleft()
+        if self._places:
+            ago_s, path = _path(exposed_ns, history)
+            jumps = (_jump_s(each, now, ago_s, path) for each in self._places)
+            found = next((each for each in jumps if each is not None), None)
+            if found is not None:
+                return found
+        self._places.append(now)
+        return None
+
+
+def _path(exposed_ns: int, history: StateHistory) -> tuple[Array, Array]:
+    """Times before an exposure (N,) (s, negative: after it), and where the aircraft was then
+    (N, 2), metres from where it was at the exposure; NaN where the velocity is not known."""
+    after, before = round(LONGEST_S / STEP_S), round(LONGEST_GAP_S / STEP_S)
+    ago_s = np.arange(-after, before + 1) * STEP_S
+    times_ns = exposed_ns - np.round(ago_s * 1e9).astype(np.int64)
+    velocity = history.velocity(np.minimum(times_ns, history.newest_ns))
+    velocity[times_ns > history.newest_ns + round(LEAST_S * 1e9)] = np.nan
+    steps = (velocity[1:] + velocity[:-1]) / 2 * STEP_S
+    later = np.cumsum(steps[:after][::-1], axis=0)[::-1]
+    earlier = -np.cumsum(steps[after:], axis=0)
+    return np.asarray(ago_s, np.float64), np.concatenate([later, np.zeros((1, 2)), earlier])
+
+
+def _jump_s(before: _Place, now: _Place, ago_s: Array, path: Array) -> float | None:
+    """Growth of the latency that explains a jump; None without a jump or an explanation."""
+    seconds = (now.exposed_ns - before.exposed_ns) / 1e9
+    if not 0 < seconds <= LONGEST_GAP_S:
+        return None
+    flown = -np.array([np.interp(seconds, ago_s, each) for each in path.T])
+    if not np.isfinite(flown).all():
+        return None
+    jump = now.en_m - before.en_m - flown
+    speed_std = usual_velocity_std_mps(float(np.hypot(*flown)) / seconds)
+    std_m = math.hypot(before.std_m, now.std_m)
+    if not np.hypot(*jump) > SIGMAS * math.hypot(std_m, speed_std * seconds):
+        return None
+    usual = (np.abs(ago_s) >= LEAST_S) & (np.abs(ago_s) <= LONGEST_S)
+    off = np.hypot(*(jump - path).T) / np.hypot(std_m, speed_std * (seconds + np.abs(ago_s)))
+    off[~usual | np.isnan(off)] = np.inf
+    best = int(np.argmin(off))
+    return float(ago_s[best]) if off[best] <= SIGMAS else None

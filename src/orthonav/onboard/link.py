@@ -15,12 +15,9 @@ from typing import Any
 
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
-from orthonav.onboard.aiding import Aiding
 from orthonav.onboard.gnss.mavlink import gnss_sample
 from orthonav.onboard.messages.estimate import Clock, EstimateError
-from orthonav.onboard.messages.local import Autopilot, Origin
 from orthonav.onboard.messages.mavlink import (
-    COMPONENT_ID,
     Message,
     Packer,
     Signing,
@@ -28,8 +25,10 @@ from orthonav.onboard.messages.mavlink import (
     dialect,
     signing_timestamp,
 )
+from orthonav.onboard.messages.mavlink_local import Autopilot, Origin
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import (
+    Aiding,
     Clocks,
     ClockSync,
     TelemetryBuffer,
@@ -92,7 +91,6 @@ class AutopilotLink:
         clocks: Clocks,
         *,
         system_id: int | None = None,
-        component_id: int = COMPONENT_ID,
         signing: Signing | None = None,
         silent: bool = False,
         stamp: Clock = Clock.UTC,
@@ -111,7 +109,7 @@ class AutopilotLink:
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
         self.aiding = Aiding(own_receiver)
         self._lock = threading.RLock()
-        self._wanted, self._component_id, self._silent = system_id, component_id, silent
+        self._wanted, self._silent = system_id, silent
         self._signing, self._stamp = signing, stamp
         self._incoming = _decoder(signing)
         self._transport: Transport | None = None
@@ -255,9 +253,7 @@ class AutopilotLink:
                 stamp = max(signing_timestamp(self._clocks.utc_ns()), before)
                 self._signing = replace(self._signing, timestamp_10us=stamp)
             system_id = self.target.system_id if self.target else self._wanted or 1
-            self._packer = Packer(
-                system_id, self._component_id, sequence=self._sequence, signing=self._signing
-            )
+            self._packer = Packer(system_id, sequence=self._sequence, signing=self._signing)
             self._packed, self._resign_ns = 0, now_ns + RESIGN_NS
         frame = self._packer.pack(message)
         self._sequence, self._packed = (self._sequence + 1) % 256, self._packed + 1

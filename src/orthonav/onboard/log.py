@@ -40,21 +40,22 @@ from orthonav.core.flight.logged import (
     THUMBNAIL,
     VIEW,
     LoggedView,
+    Message,
     calibration_message,
     camera_plain,
+    lossless_png,
     navsat_message,
     picture_message,
     position_message,
     telemetry_message,
     to_json,
 )
-from orthonav.core.flight.png import lossless_png
 from orthonav.core.flight.recording import fitted
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import CONFIDENT, Fix, Telemetry, ViewResult
 
 if TYPE_CHECKING:
-    from orthonav.onboard.segment import Message, Segment
+    from orthonav.onboard.segment import Segment
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ Grey = NDArray[np.uint8]
 class _WaitingMessage:
     """A message to be encoded; `size_bytes` is the memory that it holds in the queue."""
 
-    make: "Callable[[], list[Message]]"
+    make: Callable[[], list[Message]]
     size_bytes: int
     has_view: bool = False
 
@@ -257,7 +258,7 @@ class FlightLog:
             return size_bytes <= LARGEST_BYTES and waiting + size_bytes <= QUEUE_BYTES
 
     def _add(
-        self, make: "Callable[[], list[Message]]", size_bytes: int, *, has_view: bool = False
+        self, make: Callable[[], list[Message]], size_bytes: int, *, has_view: bool = False
     ) -> None:
         with self._change:
             room = self._queued_bytes + size_bytes <= QUEUE_BYTES + SPARE_BYTES
@@ -298,14 +299,14 @@ class FlightLog:
             if closing:
                 return
 
-    def _made(self, waiting: _WaitingMessage) -> "list[Message]":
+    def _made(self, waiting: _WaitingMessage) -> list[Message]:
         try:
             return waiting.make()
         except Exception as error:
             self._lose("views" if waiting.has_view else "messages", described(error))
             return []
 
-    def _write(self, messages: "list[Message]") -> None:
+    def _write(self, messages: list[Message]) -> None:
         """Write a chunk; without its images where that fails."""
         views = sum(message.is_view for message in messages)
         if views and time.monotonic() < self._no_views_until:
@@ -321,7 +322,7 @@ class FlightLog:
                 return
         self._lose("messages", "no room", len(messages))
 
-    def _put(self, messages: "list[Message]") -> bool:
+    def _put(self, messages: list[Message]) -> bool:
         from orthonav.onboard.segment import next_segment
 
         size = sum(len(message.data) + 100 for message in messages)
@@ -348,29 +349,27 @@ class FlightLog:
             except OSError as error:
                 log.debug("flight log ends without an index: %s", error)
 
-    def _head(self) -> "list[Message]":
+    def _head(self) -> list[Message]:
         """First messages of every file."""
         camera = _message(CAMERA, self._time_ns, calibration_message(self._camera, self._time_ns))
         return [self._session_message(self._session), camera]
 
-    def _session_message(self, session: dict[str, Any]) -> "Message":
+    def _session_message(self, session: dict[str, Any]) -> Message:
         return _message(SESSION, self._time_ns, to_json(session))
 
 
-def _message(topic: Any, time_ns: int, data: bytes, index: int = 0) -> "Message":
-    from orthonav.onboard.segment import Message
-
+def _message(topic: Any, time_ns: int, data: bytes, index: int = 0) -> Message:
     limit = MAX_PICTURE_BYTES if topic in (VIEW, THUMBNAIL) else MAX_JSON_BYTES
     if len(data) > limit:
         raise ValueError(f"{len(data)} bytes for {topic.name}")
     return Message(topic, time_ns, data, index)
 
 
-def _telemetry(seen: LoggedView, time_ns: int) -> "Message":
+def _telemetry(seen: LoggedView, time_ns: int) -> Message:
     return _message(TELEMETRY, time_ns, telemetry_message(seen), seen.index)
 
 
-def _full(seen: LoggedView, grey: Grey) -> "list[Message]":
+def _full(seen: LoggedView, grey: Grey) -> list[Message]:
     time_ns = seen.telemetry.time_ns
     data = picture_message(lossless_png(grey), "png", time_ns)
     picture = _message(VIEW, time_ns, data, seen.index)
@@ -383,7 +382,7 @@ def _thumbnail(grey: Grey) -> Grey:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _with_thumbnail(seen: LoggedView, small: Grey) -> "list[Message]":
+def _with_thumbnail(seen: LoggedView, small: Grey) -> list[Message]:
     time_ns = seen.telemetry.time_ns
     options = [int(cv2.IMWRITE_JPEG_QUALITY), THUMBNAIL_QUALITY]
     done, jpeg = cv2.imencode(".jpg", small, options)
@@ -392,7 +391,7 @@ def _with_thumbnail(seen: LoggedView, small: Grey) -> "list[Message]":
     return [telemetry, _message(THUMBNAIL, time_ns, data, seen.index)] if done else [telemetry]
 
 
-def _result(result: ViewResult, index: int) -> "list[Message]":
+def _result(result: ViewResult, index: int) -> list[Message]:
     line = result_to_json(result).encode("ascii")
     messages = [_message(RESULT, result.time_ns, line, index)]
     if isinstance(result.outcome, Fix):

@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from orthonav.core.geo.camera import Camera, undistort
 
@@ -31,7 +31,17 @@ SHORTEST_S, LONGEST_S = 0.08, 1.2
 """Images closer than this are skipped, and not compared if they are further apart."""
 FARTHEST_TILT_COS = 0.3
 """Cosine of the largest angle between optical axis and vertical for which motion is predicted."""
+TURN_STD_RAD, SHIFT_STD = 0.003, 0.004
+"""Least standard deviations of differences: attitudes of autopilots jitter by about 0.1 deg, and
+corners are found to 0.1 px where the focal length is 200 px."""
+TRIMMED = 0.2
+"""Share of the pairs, those that fit worst, that is left out of the explained share."""
+KEEP_S = 60.0
+"""States are kept for so long: the longest latency, 30 s of motion, and some more."""
+GAP_S = 0.3
+"""Longest interval between states that is interpolated, unless the history says otherwise."""
 Array = NDArray[np.float64]
+Times = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 Corners = NDArray[np.float32]
 _WINDOW = (17, 17)
@@ -199,3 +209,86 @@ def reported_motion(
         turn_of_both, shift = centre_motion(both)
     turn = np.where(np.isfinite(turn_of_both), turn_of_both, turn)
     return ReportedMotion(turn, tilt_shift, shift - tilt_shift)
+
+
+class StateHistory:
+    """Attitude, velocity and height of the camera over time. Mutable."""
+
+    def __init__(self, gap_s: float = GAP_S) -> None:
+        """`gap_s`: longest interval between states that is interpolated."""
+        self._gap_ns = round(gap_s * 1e9)
+        self._times: Times = np.zeros(0, np.int64)
+        self._rows: Array = np.zeros((0, 13))
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest state; a time before all where there is none."""
+        return int(self._times[-1]) if len(self._times) else -(2**62)
+
+    def add(
+        self,
+        time_ns: int,
+        enu_from_camera: ArrayLike | None,
+        velocity_enu_mps: ArrayLike | None,
+        height_m: float,
+    ) -> None:
+        """Add a state: rotation (3, 3) from camera axes to east, north, up, velocity (3,), height
+        above ground. None and NaN: not known. A time that is not newer than the last is ignored."""
+        if time_ns <= self.newest_ns:
+            return
+        row = np.full(13, math.nan)
+        if enu_from_camera is not None:
+            row[:9] = np.ravel(enu_from_camera)
+        if velocity_enu_mps is not None:
+            row[9:12] = velocity_enu_mps
+        row[12] = height_m if height_m > 0 else math.nan
+        first = int(np.searchsorted(self._times, time_ns - round(KEEP_S * 1e9)))
+        self._times = np.append(self._times[first:], time_ns)
+        self._rows = np.concatenate([self._rows[first:], row[None]])
+
+    def motion(self, start_ns: Times, end_ns: Times) -> ReportedMotion:
+        """Motion of the picture between N pairs of times (N,), all of one duration."""
+        start, end = self._at(start_ns), self._at(end_ns)
+        seconds = float(end_ns[0] - start_ns[0]) / 1e9
+        velocity, height = (start[:, 9:12] + end[:, 9:12]) / 2, start[:, 12]
+        before, after = (each[:, :9].reshape(-1, 3, 3) for each in (start, end))
+        return reported_motion(before, after, velocity, height, seconds)
+
+    def velocity(self, times_ns: Times) -> Array:
+        """Velocities (N, 2) east and north at N times; NaN where not known."""
+        return self._at(times_ns)[:, 9:11]
+
+    def _at(self, times_ns: Times) -> Array:
+        """Values (N, 13), linear between states; NaN where not known."""
+        if len(self._times) < 2:
+            return np.full((len(times_ns), 13), math.nan)
+        after = np.clip(np.searchsorted(self._times, times_ns), 1, len(self._times) - 1)
+        begin, until = self._times[after - 1], self._times[after]
+        weight = ((times_ns - begin) / (until - begin))[:, None]
+        values = (1 - weight) * self._rows[after - 1] + weight * self._rows[after]
+        known = (times_ns >= begin) & (times_ns <= until) & (until - begin <= self._gap_ns)
+        return np.asarray(np.where(known[:, None], values, math.nan))
+
+
+def explained_share(
+    seconds: Array, turn: Array, shift: Array, turn_off: Array, shift_off: Array, stands_out: float
+) -> float:
+    """Least share of the motion that is explained, of turn (N,) and of the varying part of shift
+    (N, 2), where it is at least `stands_out` least standard deviations; NaN where neither is.
+
+    `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.
+    """
+    varying = shift - np.median(shift / seconds[:, None], axis=0) * seconds[:, None]
+    parts = (
+        (turn[:, None], turn_off[:, None], TURN_STD_RAD),
+        (varying, shift_off, SHIFT_STD),
+    )
+    shares = []
+    for seen, off, least in parts:
+        seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
+        modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
+        used = np.argsort(off2)[: round((1 - TRIMMED) * len(off2))]
+        moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
+        if moved > (stands_out * least) ** 2:
+            shares.append(1 - float(off2[used].mean()) / moved)
+    return min(shares) if shares else float("nan")

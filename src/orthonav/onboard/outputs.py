@@ -1,5 +1,6 @@
 """Outputs of positions: MAVLink messages to the autopilot, NMEA sentences, lines of JSON."""
 
+import contextlib
 import errno
 import json
 import logging
@@ -9,16 +10,20 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import Any, Protocol, TextIO
 
 from orthonav.core.errors import VariantError
-from orthonav.core.flight.fixes import UNKNOWN, result_to_json
-from orthonav.core.flight.identity import Identity
+from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
 from orthonav.core.records import CONFIDENT, ViewResult
-from orthonav.onboard.messages.correlation import FilterCovariance
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.estimate import (
+    Clock,
+    EstimateError,
+    FilterCovariance,
+    NavigationEstimate,
+    estimate_from_result,
+)
 from orthonav.onboard.messages.gate import Gate
-from orthonav.onboard.messages.local import Autopilot, Origin
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Message,
@@ -29,13 +34,15 @@ from orthonav.onboard.messages.mavlink import (
     request_message,
 )
 from orthonav.onboard.messages.mavlink_local import (
+    Autopilot,
     LocalPose,
+    Origin,
     odometry,
     set_gps_global_origin,
     vision_position_estimate,
 )
 from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
-from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
+from orthonav.onboard.ports import Descriptor, Udp, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
@@ -250,26 +257,6 @@ class Sink(Protocol):
         """Close the output."""
 
 
-class UdpSink:
-    """Datagrams to one address."""
-
-    def __init__(self, address: tuple[str, int]) -> None:
-        self._address = address
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-
-    def write(self, data: bytes) -> None:
-        """Send one datagram; a receiver that does not listen is no error."""
-        try:
-            self._socket.sendto(data, self._address)
-        except (BlockingIOError, ConnectionRefusedError):
-            return
-
-    def close(self) -> None:
-        """See `Sink.close`."""
-        self._socket.close()
-
-
 class TcpSink:
     """TCP server that sends the same data to all clients; one that does not read is dropped."""
 
@@ -337,7 +324,7 @@ def open_sink(url: str) -> Sink:
     `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where it cannot be opened."""
     kind, _, rest = url.partition(":")
     if kind == "udp":
-        return UdpSink(host_port(rest, url))
+        return Udp(None, host_port(rest, url))
     if kind == "tcp-listen":
         return TcpSink(host_port(rest, url))
     if kind == "serial":
@@ -350,29 +337,16 @@ def open_sink(url: str) -> Sink:
 class NmeaOut:
     """GGA, RMC and GST of every view to one sink, including those without a position."""
 
-    def __init__(
-        self, sink: Sink, *, talker: str = "GP", quality: Quality = Quality.ESTIMATED
-    ) -> None:
-        self._sink, self._talker, self._quality = sink, talker, quality
+    def __init__(self, sink: Sink, *, quality: Quality = Quality.ESTIMATED) -> None:
+        self._sink, self._quality = sink, quality
 
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
         """Write one view; `utc_ns` is its time where there is no estimate. Raises `OSError`."""
-        sentences = [
-            make(
-                estimate,
-                talker=self._talker,
-                quality=self._quality,
-                utc_ns=utc_ns,
-                min_confidence=min_confidence,
-            )
-            for make in (gga, rmc)
-        ]
-        sentences.append(
-            gst(estimate, talker=self._talker, utc_ns=utc_ns, min_confidence=min_confidence)
-        )
-        self._sink.write(b"".join(sentences))
+        options: dict[str, Any] = {"utc_ns": utc_ns, "min_confidence": min_confidence}
+        sentences = [make(estimate, quality=self._quality, **options) for make in (gga, rmc)]
+        self._sink.write(b"".join([*sentences, gst(estimate, **options)]))
 
     def close(self) -> None:
         """Close the sink."""
@@ -423,13 +397,154 @@ class JsonOut:
         except OSError:
             stream, self._stream = self._stream, None
             if self._path is not None:
-                _close_quietly(stream)
+                with contextlib.suppress(OSError):  # a full disk: its buffered data are lost
+                    stream.close()
             raise
 
 
-def _close_quietly(stream: TextIO) -> None:
-    """Close a file whose disk is full; its buffered data are lost."""
-    try:
-        stream.close()
-    except OSError:
-        return
+class ViewOutput(Protocol):
+    """Takes every view, and the health: lines of JSON, the console. Raises `OSError`."""
+
+    def view(
+        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
+    ) -> None:
+        """Take one view: its age at the end, the messages sent, why none was."""
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """Take the health."""
+
+    def close(self) -> None:
+        """Close the output."""
+
+
+class PositionOutput(Protocol):
+    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`.
+
+    `for_filter`: whether it gets covariances for a filter instead of those of the fixes.
+    """
+
+    for_filter: bool
+
+    def position(
+        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
+    ) -> tuple[str, ...]:
+        """Send one position; returns the names of messages. `stamp_ns`: time of the image."""
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """Send the health."""
+
+    def close(self) -> None:
+        """Close the output."""
+
+
+class Publisher:
+    """Publishes results to all outputs. Mutable."""
+
+    def __init__(
+        self,
+        gate: Gate,
+        clocks: Clocks,
+        *,
+        messenger: Messenger | None = None,
+        link: AutopilotLink | None = None,
+        nmea: Sequence[NmeaOut] = (),
+        lines: Sequence[ViewOutput] = (),
+        graph: PositionOutput | None = None,
+        min_confidence: float = CONFIDENT,
+        min_std_m: float = 0.0,
+    ) -> None:
+        """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
+        self.gate, self._clocks = gate, clocks
+        self.messenger, self._link = messenger, link
+        self._nmea, self._lines, self._least = nmea, lines, min_confidence
+        self._graph = [graph] if graph is not None else []
+        self._covariance = FilterCovariance(min_std_m)
+        self.failed = 0
+
+    def publish(
+        self,
+        result: ViewResult,
+        exposed_ns: int,
+        vehicle: VehicleState,
+        *,
+        judged: bool,
+        withheld: str | None = None,
+    ) -> tuple[str, ...]:
+        """Send the position of a view where the gate admits it; the names of the messages.
+
+        Only views that the locator processed (`judged`) can give a position: the prediction of a
+        track is not a measurement. `withheld`: reason why a view was not located, which the gate
+        counts.
+        """
+        estimate: NavigationEstimate | None = None
+        sent: tuple[str, ...] = ()
+        if withheld is not None:
+            self.gate.withheld[withheld] += 1
+        elif judged:
+            now_ns = self._clocks.mono_ns()
+            by_our_clock = replace(result, time_ns=exposed_ns)
+            ahead_ns = self._clocks.utc_ns() - now_ns
+            made = estimate_from_result(by_our_clock, clock=Clock.BOOT, utc_minus_boot_ns=ahead_ns)
+            before = self.gate.withheld.copy()
+            estimate = self.gate.admit(made, now_ns)
+            if estimate is not None:
+                sent = self._send(estimate, exposed_ns, vehicle)
+                if not estimate.dead_reckoned:  # messages of ROS cannot mark it
+                    sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
+            withheld = None if sent else next(iter(self.gate.withheld - before), None)
+        self._write_nmea(estimate)
+        age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
+        self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
+        return sent
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """Send the health to the outputs that carry it."""
+        self._each([*self._lines, *self._graph], lambda out: out.health(plain))
+
+    def close(self) -> None:
+        """Close all outputs."""
+        self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
+
+    def _send(
+        self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState
+    ) -> tuple[str, ...]:
+        if self.messenger is None or self._link is None:
+            return ()
+        return self.messenger.publish(
+            estimate,
+            vehicle,
+            exposed_ns=exposed_ns,
+            boot_ns=self._link.boot_ns(exposed_ns),
+            target=self._link.target,
+            kind=self._link.kind,
+            origin=self._link.origin,
+        )
+
+    def _to_graph(
+        self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int
+    ) -> tuple[str, ...]:
+        sent: list[str] = []
+        if self._graph and self.gate.due("ROS2", self._clocks.mono_ns()):
+            stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
+            self._each(
+                self._graph,
+                lambda out: sent.extend(
+                    out.position(stated if out.for_filter else estimate, vehicle, stamp_ns)
+                ),
+            )
+            self._covariance.sent("ROS2", exposed_ns)
+        return tuple(sent)
+
+    def _write_nmea(self, estimate: NavigationEstimate | None) -> None:
+        if self._nmea and self.gate.due("NMEA", self._clocks.mono_ns()):
+            utc_ns = self._clocks.utc_ns()
+            self._each(self._nmea, lambda out: out.write(estimate, utc_ns, self._least))
+
+    def _each(self, outs: Sequence[Any], call: Callable[[Any], None]) -> None:
+        for out in outs:
+            try:
+                call(out)
+            except Exception as error:  # one output must not end the others
+                if self.failed == 0:
+                    log.warning("output failed: %s", error)
+                self.failed += 1

@@ -17,10 +17,12 @@ from orthonav.core.errors import (
     MissingFileError,
 )
 from orthonav.core.flight.heights import FlownHeights
+from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import Flight, RecordedView
-from orthonav.core.localize.accept import Acceptance
+from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.track import Model
 from orthonav.core.track.tracker import Tracker
 
 log = logging.getLogger(__name__)
@@ -28,6 +30,7 @@ MAP_CHANGED = "map_file_changed"
 """Reason of views after the open map file was truncated or rewritten."""
 MAP_DAMAGED = "map_damaged"
 """Reason of a view for which a part of the map cannot be decoded."""
+LEAST_TILT_DEG = 0.1
 
 
 class Locator(Protocol):
@@ -64,6 +67,40 @@ class SingleViews:
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """Return `reason`: a single view has no other information."""
         return reason
+
+
+@dataclass(frozen=True)
+class MountCorrected:
+    """A locator whose telemetry is corrected by a mount; its fixes report the remaining biases."""
+
+    locator: Locator
+    mount: Mount
+
+    def locate(self, view: View) -> Fix | NoFix:
+        """See `Locator.locate`."""
+        return self.locator.locate(replace(view, telemetry=self.mount.corrected(view.telemetry)))
+
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        """See `Locator.passed`."""
+        return self.locator.passed(self.mount.corrected(telemetry), reason)
+
+    @property
+    def state_name(self) -> str | None:
+        """See `Locator.state_name`."""
+        return self.locator.state_name
+
+
+def model_of(mount: Mount) -> Model:
+    """Model of a flight whose telemetry is corrected by a mount: the biases that remain have the
+    standard deviations of the calibration."""
+    heading, tilt = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
+    tilt_rad = math.radians(max(tilt, LEAST_TILT_DEG))
+    return replace(
+        Model().with_mount(tilt_rad),
+        heading_rad=math.radians(max(heading.std, heading.scatter, 1.0)),
+        log_scale=max(mount.log_scale.std, mount.log_scale.scatter, 0.01),
+        off_mount=0.0,
+    )
 
 
 def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:

@@ -9,7 +9,6 @@ import contextlib
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 # Some functions of mcap have no types: calling them needs `type: ignore[no-untyped-call]`.
@@ -18,25 +17,10 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from orthonav import __version__
-from orthonav.core.flight.logged import PROFILE, TOPICS, VIEW, Topic
+from orthonav.core.flight.logged import PROFILE, TOPICS, Message
 
 _INDEX_BYTES = 64_000, 300
 """Upper bound of the size of the index: constant part, and per chunk."""
-
-
-@dataclass(frozen=True)
-class Message:
-    """A message of the log. `time_ns`: time of exposure. `index`: index of the view."""
-
-    topic: Topic
-    time_ns: int
-    data: bytes
-    index: int = 0
-
-    @property
-    def is_view(self) -> bool:
-        """Whether it is a full image, which is dropped first where space is short."""
-        return self.topic is VIEW
 
 
 class _Tail:

@@ -1,4 +1,4 @@
-"""The last position of the aircraft, saved for a restart.
+"""The last position of the aircraft, saved for a restart, and the serial numbers of flown maps.
 
 A small JSON file, replaced atomically about once a second. It is not synced to disk, which can be
 slow on memory cards: it survives a killed process, but not always a power cut.
@@ -6,6 +6,7 @@ slow on memory cards: it survives a killed process, but not always a power cut.
 
 import contextlib
 import json
+import logging
 import math
 import os
 import tempfile
@@ -14,6 +15,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from orthonav.core.errors import MapFileError, OutputError
+from orthonav.core.files import write_text
+from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 from orthonav.core.records import Prior
 from orthonav.onboard.gnss.biases import Biases, biases_from_plain
 from orthonav.onboard.gnss.learner import Resumed, before_flight
@@ -28,6 +32,7 @@ on."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -160,3 +165,50 @@ def load(path: Path) -> SavedState | None:
         )
     except (ValueError, KeyError, TypeError, OverflowError):
         return None
+
+
+def serials_path(state: Path) -> Path:
+    """The file of the newest serial number flown with each signing key, beside a state file. It is
+    separate because it outlives flights."""
+    return state.with_name(f"{state.name}.serials")
+
+
+def require_newest(state: Path, signature: Signature, map_path: Path) -> None:
+    """Refuse a map older than the newest flown with its key; else remember its serial number.
+
+    A file that is damaged or cannot be written is a warning: it must not keep a flight from being
+    resumed. Raises `MapFileError`.
+    """
+    path = serials_path(state)
+    known = _read(path)
+    newest = known.get(signature.key_id)
+    serial = -1 if signature.serial is None else signature.serial
+    if newest is not None and serial < newest:
+        has = "no serial number" if signature.serial is None else f"serial number {serial}"
+        raise MapFileError(
+            f"map has {has}, and one with serial number {newest} of the same key was flown; to fly "
+            f"an older map, sign it again or remove {path}: {map_path}"
+        )
+    if signature.serial is None or serial == newest:
+        return
+    try:
+        write_text(path, json.dumps({**known, signature.key_id: serial}) + "\n")
+    except OutputError as error:
+        log.warning("serial number of the map is not remembered: %s", error)
+
+
+def _read(path: Path) -> dict[str, int]:
+    try:
+        with path.open("rb") as stream:
+            plain = json.loads(stream.read(MAX_BYTES))
+        known = {
+            str(key): serial
+            for key, serial in plain.items()
+            if type(serial) is int and 0 <= serial <= MAX_SERIAL
+        }
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        log.warning("serial numbers of flown maps cannot be read (%s): %s", error, path)
+        return {}
+    return known

@@ -3,6 +3,7 @@
 from orthonav.core.flight.folder import (
     FlightFolder,
     FlightView,
+    FlightWriter,
     decode_image,
     open_flight,
     read_camera,
@@ -10,7 +11,6 @@ from orthonav.core.flight.folder import (
     read_truth,
 )
 from orthonav.core.flight.recording import Flight, RecordedView
-from orthonav.core.flight.writer import FlightWriter
 
 __all__ = [
     "Flight",

@@ -1,9 +1,10 @@
-"""Reading a flight folder."""
+"""Flight folders, read and written."""
 
+import csv
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from decimal import Decimal
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import CameraError, FlightError, MissingFileError
+from orthonav.core.errors import CameraError, FlightError, MissingFileError, OutputError
 from orthonav.core.files import require_file
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
@@ -21,25 +22,17 @@ from orthonav.core.tables import TableError, TableRows
 
 TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
 OPTIONAL_COLUMNS = (
-    "yaw_std_deg",
-    "agl_std_m",
-    "prior_lat_deg",
-    "prior_lon_deg",
-    "prior_std_m",
-    "vel_east_mps",
-    "vel_north_mps",
-    "tilt_std_deg",
-    "vel_std_mps",
-    "home_m",
-    "amsl_m",
-    "hae_m",
+    *("yaw_std_deg", "agl_std_m", "prior_lat_deg", "prior_lon_deg", "prior_std_m"),
+    *("vel_east_mps", "vel_north_mps", "tilt_std_deg", "vel_std_mps", "home_m", "amsl_m", "hae_m"),
 )
+_PRIOR_FIELDS = ("lat_deg", "lon_deg", "std_m")
+_OPTIONAL_FIELDS = [each.name for each in fields(Telemetry) if each.name in OPTIONAL_COLUMNS]
 MAX_TEXT_BYTES = 500_000_000
 MAX_VIEWS = 1_000_000
 """Rows of a table of a flight: as many views as `simulate` makes, 55 hours at 5 Hz."""
 # The camera describes the sensor: an orientation tag must not rotate the image.
 _DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-_BROKEN_JSON = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 
@@ -188,26 +181,29 @@ def read_camera(path: Path) -> tuple[Camera, str]:
     path = require_file(path, "camera of the flight")
     try:
         plain = json.loads(path.read_text(encoding="utf-8-sig"))
-        raw = plain["camera"]
-        distortion = raw.get("distortion", [])
-        if not isinstance(distortion, list):
-            raise TypeError(f"distortion must be a list, got {distortion!r:.80}")
-        camera = Camera(
-            width_px=int(raw["width_px"]),
-            height_px=int(raw["height_px"]),
-            **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
-            distortion=tuple(float(value) for value in distortion),
-            model=str(raw.get("model", "brown")),
-            focal_std=float(raw.get("focal_std", 0.0)),
-        )
-        return camera, str(plain.get("note", ""))
+        return camera_from_plain(plain["camera"]), str(plain.get("note", ""))
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
-    except _BROKEN_JSON as error:
+    except BROKEN as error:
         raise FlightError(
             "expected {camera: {width_px, height_px, fx_px, fy_px, cx_px, cy_px}} as JSON "
             f"({type(error).__name__}: {error}): {path}"
         ) from error
+
+
+def camera_from_plain(raw: Any) -> Camera:
+    """The camera of plain values as in `flight.json`; raises `CameraError` or one of `BROKEN`."""
+    distortion = raw.get("distortion", [])
+    if not isinstance(distortion, list):
+        raise TypeError(f"distortion must be a list, got {distortion!r:.80}")
+    return Camera(
+        width_px=int(raw["width_px"]),
+        height_px=int(raw["height_px"]),
+        **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
+        distortion=tuple(float(value) for value in distortion),
+        model=str(raw.get("model", "brown")),
+        focal_std=float(raw.get("focal_std", 0.0)),
+    )
 
 
 def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[FlightView]:
@@ -236,26 +232,15 @@ def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[Fligh
 
 
 def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
-    prior = [_optional(row, f"prior_{name}") for name in ("lat_deg", "lon_deg", "std_m")]
-    velocity = [_optional(row, f"vel_{name}_mps") for name in ("east", "north")]
-    usable = prior[0] is not None and prior[1] is not None and prior[2] is not None
-    usable = usable and abs(prior[0] or 0) <= 90 and abs(prior[1] or 0) <= 360
-    return Telemetry(
-        time_ns=time_ns,
-        yaw_deg=number_of(row["yaw_deg"]),
-        pitch_deg=number_of(row["pitch_deg"]),
-        roll_deg=number_of(row["roll_deg"]),
-        agl_m=number_of(row["agl_m"]),
-        yaw_std_deg=_optional(row, "yaw_std_deg"),
-        agl_std_m=_optional(row, "agl_std_m"),
-        tilt_std_deg=_optional(row, "tilt_std_deg"),
-        vel_std_mps=_optional(row, "vel_std_mps"),
-        home_m=_optional(row, "home_m"),
-        amsl_m=_optional(row, "amsl_m"),
-        hae_m=_optional(row, "hae_m"),
-        prior=Prior(prior[0] or 0.0, prior[1] or 0.0, prior[2] or 0.0) if usable else None,
-        vel_en_mps=None if None in velocity else (velocity[0] or 0.0, velocity[1] or 0.0),
-    )
+    lat, lon, std_m = (_optional(row, f"prior_{name}") for name in _PRIOR_FIELDS)
+    east, north = (_optional(row, f"vel_{name}_mps") for name in ("east", "north"))
+    prior = None
+    if lat is not None and lon is not None and std_m is not None:
+        prior = Prior(lat, lon, std_m) if abs(lat) <= 90 and abs(lon) <= 360 else None
+    values: dict[str, Any] = {name: number_of(row[name]) for name in TELEMETRY_COLUMNS[2:]}
+    values |= {name: _optional(row, name) for name in _OPTIONAL_FIELDS}
+    velocity = None if east is None or north is None else (east, north)
+    return Telemetry(time_ns, **values, prior=prior, vel_en_mps=velocity)
 
 
 def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
@@ -304,3 +289,100 @@ def number_of(text: Any) -> float:
 def _optional(row: Mapping[str, str], name: str) -> float | None:
     value = number_of(row.get(name, ""))
     return value if math.isfinite(value) else None
+
+
+class FlightWriter:
+    """Writes views into an existing empty folder; `close` writes telemetry, camera and truth.
+
+    Use it inside `orthonav.core.files.replacing_folder`, so that it is written whole or not at all.
+    """
+
+    def __init__(self, folder: Path, camera: Camera, note: str) -> None:
+        self._folder = Path(folder)
+        self._camera = camera
+        self._note = note
+        self._rows: list[dict[str, Any]] = []
+        self._truth: list[tuple[str, str, str]] = []
+        (self._folder / "frames").mkdir()
+
+    def add(
+        self,
+        frame: str,
+        image: NDArray[np.uint8],
+        telemetry: Telemetry,
+        truth_latlon_deg: tuple[float, float],
+        jpeg_quality: int = 90,
+    ) -> None:
+        """Add one view: `image` (H, W, 3) RGB, JPEG or PNG by the ending of `frame`."""
+        data = encoded(np.ascontiguousarray(image[..., ::-1]), frame, jpeg_quality)
+        self.add_encoded(frame, data, telemetry, truth_latlon_deg)
+
+    def add_encoded(
+        self,
+        frame: str,
+        data: bytes,
+        telemetry: Telemetry,
+        truth_latlon_deg: tuple[float, float] | None,
+    ) -> None:
+        """Add one view whose image is encoded already, as `data`; its truth where known."""
+        path = self._folder / "frames" / frame
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+        self._rows.append({"frame": frame, **_columns(telemetry)})
+        if truth_latlon_deg is not None:
+            lat, lon = truth_latlon_deg
+            self._truth.append((frame, f"{lat:.8f}", f"{lon:.8f}"))
+
+    def close(self) -> None:
+        """Write `telemetry.csv`, `flight.json` and, where any is known, `truth.csv`."""
+        used = [
+            name for name in OPTIONAL_COLUMNS if any(row[name] is not None for row in self._rows)
+        ]
+        columns = [*TELEMETRY_COLUMNS, *used]
+        table = [[_text(row[name]) for name in columns] for row in self._rows]
+        _write_csv(self._folder / "telemetry.csv", columns, table)
+        if self._truth:
+            _write_csv(self._folder / "truth.csv", ("frame", "lat_deg", "lon_deg"), self._truth)
+        camera = asdict(self._camera)
+        text = json.dumps({"camera": camera, "note": self._note}, indent=1)
+        (self._folder / "flight.json").write_text(text + "\n", encoding="utf-8")
+
+
+def encoded(image: NDArray[np.uint8], frame: str, jpeg_quality: int = 90) -> bytes:
+    """`image` (H, W) grey or (H, W, 3) BGR encoded by the ending of `frame`.
+
+    Raises `OutputError` where OpenCV cannot encode it.
+    """
+    options = [int(cv2.IMWRITE_JPEG_QUALITY), jpeg_quality]
+    if not frame.lower().endswith((".jpg", ".jpeg")):
+        options = []
+    done, data = cv2.imencode(Path(frame).suffix, image, options)
+    if not done:
+        raise OutputError(f"image cannot be encoded: {frame}")
+    return data.tobytes()
+
+
+def _columns(telemetry: Telemetry) -> dict[str, Any]:
+    prior, velocity = telemetry.prior, telemetry.vel_en_mps
+    return {
+        "time_s": Decimal(telemetry.time_ns) / 10**9,
+        **{name: getattr(telemetry, name) for name in (*TELEMETRY_COLUMNS[2:], *_OPTIONAL_FIELDS)},
+        **{f"prior_{name}": prior and getattr(prior, name) for name in _PRIOR_FIELDS},
+        "vel_east_mps": velocity and velocity[0],
+        "vel_north_mps": velocity and velocity[1],
+    }
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, Decimal):
+        return f"{value:.9f}".rstrip("0").rstrip(".")
+    return f"{value:.8f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)

@@ -6,6 +6,7 @@ Heights above ground (`agl_m`), take-off (`home_m`), mean sea level (`amsl_m`) a
 
 import logging
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +14,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.flight.terrain_fit import TerrainFit
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import Ground, TerrainHeights, ground_around, ground_over
 from orthonav.core.records import CONFIDENT, DEFAULT_AGL_STD, Fix, NoFix, Telemetry
@@ -31,6 +31,19 @@ MISMATCH_M = 20.0
 and positions of take-off explain less, a wrong datum more."""
 LARGEST_STD_M = 10_000.0
 """A position with a larger standard deviation is unknown: a map is at most 50 km across."""
+MIN_VIEWS = 20
+"""Fewer confident views say nothing about the terrain."""
+OFF_M = 25.0
+"""Heights by the views and by the terrain that differ by more on the whole are named: barometers
+explain less, a wrong datum more."""
+SPREAD_M, SPREAD_SHARE = 3.0, 0.02
+"""So is a difference whose robust standard deviation is more, in metres and as a share of the
+height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
+(`python -m benchmarks.terrain_flight`)."""
+MAX_VIEWS = 2000
+"""Only so many of the latest confident views are kept."""
+HOLES_SHARE = 0.1
+"""So are holes below more than this share of the confident views."""
 _LOST = ("searching", "lost")
 """States of a track that has no position."""
 log = logging.getLogger(__name__)
@@ -227,3 +240,55 @@ def warn_of_mismatch(off_m: float) -> None:
             "its vertical datum, the take-off position and the altitude of the autopilot",
             off_m,
         )
+
+
+class TerrainFit:
+    """Compares heights above sea by confident views with those reported. Mutable.
+
+    It judges by the latest `MAX_VIEWS` of them, so that long flights cost no more memory and time.
+    """
+
+    def __init__(self, terrain: TerrainHeights) -> None:
+        self._terrain = terrain
+        # Height by the view less the reported one (NaN over a hole), and height above ground.
+        self._latest: deque[tuple[float, float]] = deque(maxlen=MAX_VIEWS)
+        self._views = 0
+        self._said: set[str] = set()
+
+    def take(self, fix: Fix, above_sea_m: float) -> None:
+        """A confident fix of a view that reported this height above sea."""
+        below_m = float(self._terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
+        self._latest.append((below_m + fix.agl_m - above_sea_m, fix.agl_m))
+        self._views += 1
+        if self._views % MIN_VIEWS:
+            return
+        off_m, agl_m = np.array(self._latest).T
+        known = np.isfinite(off_m)
+        holes, views = int((~known).sum()), len(known)
+        if holes > HOLES_SHARE * views:
+            self._say("the terrain has no height below %d of %d views", holes, views)
+        if views - holes >= MIN_VIEWS:
+            self._judge(off_m[known], agl_m[known])
+
+    def _judge(self, off_m: NDArray[np.float64], agl_m: NDArray[np.float64]) -> None:
+        middle_m = float(np.median(off_m))
+        spread_m = 1.4826 * float(np.median(np.abs(off_m - middle_m)))
+        log.debug("heights by views less reported ones: %.1f m +- %.1f m", middle_m, spread_m)
+        if abs(middle_m) > OFF_M:
+            self._say(
+                "by the views the aircraft is %.0f m %s than reported over this terrain: check its "
+                "vertical datum, the take-off position and the altitude of the autopilot",
+                abs(middle_m),
+                "higher" if middle_m > 0 else "lower",
+            )
+        if spread_m > max(SPREAD_M, SPREAD_SHARE * float(np.median(agl_m))):
+            self._say(
+                "heights by the views scatter by %.0f m about those reported over this terrain: it "
+                "may be displaced, or not show this ground",
+                spread_m,
+            )
+
+    def _say(self, said: str, *values: object) -> None:
+        if said not in self._said:
+            self._said.add(said)
+            log.warning(said, *values)

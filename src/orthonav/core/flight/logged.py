@@ -10,11 +10,17 @@ Buffers; all others are read back bit for bit.
 import json
 import math
 import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from orthonav.core.errors import CameraError, FlightError, described
+from orthonav.core.flight.folder import BROKEN, camera_from_plain
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
@@ -188,6 +194,21 @@ _STATUS_FIX, _STATUS_NO_FIX = 0, -1
 
 
 @dataclass(frozen=True)
+class Message:
+    """A message of the log. `time_ns`: time of exposure. `index`: index of the view."""
+
+    topic: Topic
+    time_ns: int
+    data: bytes
+    index: int = 0
+
+    @property
+    def is_view(self) -> bool:
+        """Whether it is a full image, which is dropped first where space is short."""
+        return self.topic is VIEW
+
+
+@dataclass(frozen=True)
 class LoggedView:
     """A view in a log."""
 
@@ -290,17 +311,10 @@ def camera_plain(camera: Camera) -> dict[str, Any]:
 def camera_of(plain: Any) -> Camera:
     """Inverse of `camera_plain`. Raises `FlightError` or `CameraError`."""
     try:
-        return Camera(
-            width_px=_integer(plain["width_px"]),
-            height_px=_integer(plain["height_px"]),
-            **{name: _number(plain[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
-            distortion=tuple(_number(value) for value in plain["distortion"]),
-            model=str(plain["model"]),
-            focal_std=_number(plain.get("focal_std", 0.0)),
-        )
+        return camera_from_plain(plain)
     except CameraError:
         raise
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except BROKEN as error:
         raise FlightError(f"camera of the log is damaged: {described(error)}") from error
 
 
@@ -439,3 +453,55 @@ def _integer(value: Any) -> int:
 def _pair(values: Any) -> tuple[float, float]:
     first, second = values
     return _number(first), _number(second)
+
+
+_MAGIC = b"\x89PNG\r\n\x1a\n"
+_HEADER_BYTES = 33  # magic and IHDR
+
+
+def lossless_png(grey: NDArray[np.uint8]) -> bytes:
+    """`grey` (H, W) uint8 as a PNG with row differences, not compressed.
+
+    The log compresses its chunks, which suffices for differences: PNG's own compression would take
+    ten times as long to save a few per cent. Raises `ValueError` for another array.
+    """
+    if grey.ndim != 2 or grey.dtype != np.uint8 or not grey.size:
+        raise ValueError(f"expected grey levels (H, W) uint8, got {grey.dtype} {grey.shape}")
+    height, width = grey.shape
+    rows = np.empty((height, width + 1), dtype=np.uint8)
+    rows[:, 0] = 2  # filter "up"
+    rows[0, 1:] = grey[0]
+    np.subtract(grey[1:], grey[:-1], out=rows[1:, 1:])  # modulo 256, as PNG defines it
+    chunks = (
+        (b"IHDR", _shape(width, height)),
+        (b"IDAT", zlib.compress(rows.data, 0)),
+        (b"IEND", b""),
+    )
+    return _MAGIC + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+def grey_of_png(data: bytes, width_px: int, height_px: int, where: str) -> NDArray[np.uint8]:
+    """Grey levels (H, W) uint8 of a PNG of this size; `where` is its location, for errors.
+
+    The declared size is checked before anything is allocated. Raises `FlightError`.
+    """
+    expected = b"\0\0\0\rIHDR" + _shape(width_px, height_px)
+    head = data[len(_MAGIC) : len(_MAGIC) + len(expected)]
+    if not data.startswith(_MAGIC) or head != expected:
+        raise FlightError(f"expected a grey PNG of {width_px} x {height_px} px: {where}")
+    if data[_HEADER_BYTES + 4 : _HEADER_BYTES + 8] != b"IDAT":  # no profiles, no texts
+        raise FlightError(f"image is not a PNG of a flight log: {where}")
+    try:
+        grey = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), int(cv2.IMREAD_GRAYSCALE))
+    except cv2.error:
+        grey = None
+    if grey is None or grey.shape != (height_px, width_px) or grey.dtype != np.uint8:
+        raise FlightError(f"image cannot be decoded: {where}")
+    return np.asarray(grey, dtype=np.uint8)
+
+
+def _shape(width_px: int, height_px: int) -> bytes:
+    return struct.pack(">IIBBBBB", width_px, height_px, 8, 0, 0, 0, 0)

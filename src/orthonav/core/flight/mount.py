@@ -1,21 +1,27 @@
-"""Constant errors of a flight's telemetry: mounting of the camera, compass, height, focal length.
+"""Constant errors of a flight's telemetry, and the latency of its camera.
 
-`orthonav calibrate` estimates them from a flight and writes a small JSON file for later flights.
+`orthonav calibrate` estimates them and writes small JSON files for later flights.
 """
 
+import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from orthonav.core.errors import FlightError, described
-from orthonav.core.flight.calibrated import BROKEN, read_record, write_record
+from orthonav.core.files import require_file, write_text
 from orthonav.core.flight.recording import Flight, WithTelemetry
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Telemetry
 
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
+MOST_MS = 12_000.0
+VERSION = 1
+MAX_BYTES = 100_000
+BROKEN = (KeyError, TypeError, ValueError, OverflowError)
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
@@ -120,3 +126,58 @@ def _bias(plain: dict[str, Any], name: str) -> Bias:
     if not (abs(bias.value) <= limit and 0 <= bias.std <= limit and 0 <= bias.scatter <= limit):
         raise ValueError(f"{name} out of range")
     return bias
+
+
+@dataclass(frozen=True)
+class CameraLatency:
+    """Time from exposure to arrival.
+
+    `latency_ms`, `std_ms`: its value and standard deviation. `pairs`: number of pairs of images
+    that it was measured with; 0 where it was stated.
+    """
+
+    latency_ms: float
+    std_ms: float
+    pairs: int = 0
+
+
+def write_latency(path: Path, latency: CameraLatency) -> None:
+    """Write a latency as JSON, whole or not at all."""
+    write_record(path, "latency", asdict(latency))
+
+
+def read_latency(path: Path) -> CameraLatency:
+    """Read what `write_latency` wrote. Raises `MissingFileError` or `FlightError`."""
+    return read_record(path, "latency", "orthonav calibrate --latency", _from_plain)
+
+
+def _from_plain(plain: Any) -> CameraLatency:
+    found = CameraLatency(float(plain["latency_ms"]), float(plain["std_ms"]), int(plain["pairs"]))
+    if not (0 <= found.latency_ms <= MOST_MS and 0 <= found.std_ms < math.inf):
+        raise ValueError("latency out of range")
+    return found
+
+
+def write_record(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
+    """Write fields as JSON with the version in `orthonav_{kind}`, whole or not at all."""
+    plain = {f"orthonav_{kind}": VERSION, **fields}
+    write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+
+
+def read_record(path: Path, kind: str, command: str, from_plain: Callable[[Any], Record]) -> Record:
+    """Read what `write_record` wrote by `command`; `from_plain` raises one of `BROKEN`.
+
+    Raises `MissingFileError` or `FlightError`.
+    """
+    path = require_file(path, f"{kind} file")
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError("too large")
+        plain = json.loads(path.read_text(encoding="utf-8"))
+        if plain[f"orthonav_{kind}"] != VERSION:
+            raise ValueError(f"version {plain[f'orthonav_{kind}']}, expected {VERSION}")
+        return from_plain(plain)
+    except (*BROKEN, AttributeError, RecursionError, OSError) as error:
+        raise FlightError(
+            f"not a {kind} file of `{command}` ({described(error)}): {path}"
+        ) from error

@@ -1,33 +1,322 @@
 """The camera of a placed view: position, height, heading, pitch and roll from the picture.
 
 The reported pitch and roll are only a prior: mounts lean by degrees, and so does the horizon of an
-autopilot. `orthonav.core.localize.resection` fits the camera to the blocks of the view; then the
-view is orthorectified with what was found, one level finer, and fitted again.
+autopilot. Each block of the view says how well it fits the map when it is moved a little aside
+(`orthonav.core.register.blocks`). The camera is where the blocks fit best together, moved as one
+camera moves them, and where the telemetry allows: the maximum of a posterior, found by Newton's
+method. Ground that changed fits nowhere and counts little (a mixture with outliers). Then the view
+is orthorectified with what was found, one level finer, and fitted again.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.orthorectify import Orientation
-from orthonav.core.localize.relief_view import ReliefView
-from orthonav.core.localize.resection import STEPS, Resection, moved_by_camera, resected
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
+from orthonav.core.localize.rectify import Orientation, is_oblique
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
-from orthonav.core.register.blocks import block_scores
+from orthonav.core.register.blocks import BlockScores, block_scores
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.template import BLOCKS, ViewTemplates
+from orthonav.core.register.window import Reference
+
+STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+"""Steps of the numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
+GROUND_STEP_M = 2.0
+"""The same of a point along the ground: about the noise of a terrain model over its slope."""
+BLURS_PX = (2.0, 1.0, 0.0, 0.0)
+"""Gaussian blur of the correlations at each step of an ascent from no correction: wide peaks first,
+so that a view off by several pixels is not caught by chance."""
+SHARP_PX = (0.7, 0.0)
+"""The same from a correction by the peaks of `SAMPLE` blocks, or from one close by."""
+SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
+"""So many such corrections are tried, where the blocks' own peaks are known to so many pixels: a
+view can be off by more than an ascent overcomes (RANSAC, Fischler and Bolles 1981)."""
+FINAL_STEPS = 2
+"""Steps after the information of the blocks was compared with the scatter of their slopes."""
+LONGEST_STEP_PX = 3.0
+"""A step moves no block farther."""
+PIXELS_PER_NUMBER = 5.0
+"""Pixels that hold one independent number. Only the odds of outliers depend on it."""
+LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9
+"""Limits of the mean correlation that a right block is expected to have."""
+CORRELATED, CORRELATED_PX = 2.0, 60.0
+"""Errors of levels and of dates are not independent: the variance is at least so many times what
+the scatter between blocks implies, and more where blocks are smaller than what their errors reach
+over, in pixels of the map (docs/decisions/camera.md)."""
+MIN_BLOCKS = 8
+"""Fewer blocks do not show an attitude."""
+WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
+"""Standard deviations of a camera of which nothing is reported: metres and degrees."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Resection:
+    """A correction (6,) of metres east, north, up and degrees of heading, pitch and roll, and the
+    covariance (6, 6) of what it corrects: `correction`, `covariance` by blocks and telemetry,
+    `alone`, `alone_covariance` by the blocks alone, as far as they show it (`WEAK`)."""
+
+    correction: Array
+    covariance: Array
+    alone: Array
+    alone_covariance: Array
+
+
+def resected(
+    seen: Sequence[tuple[BlockScores, Array]],
+    prior: tuple[Array, Array],
+    *,
+    block_px: float,
+    close: bool = False,
+) -> Resection | None:
+    """The camera under which the blocks of a view fit the map best.
+
+    `seen`: for each level of the map, all with the same reach, the blocks, and how far (N, 2, 6)
+    what they show moves over the window by metres and degrees of the camera, pixels of the level
+    right and down. `prior`: expected correction (6,) and its information (6, 6). `block_px`:
+    side of a block, pixels of level 0. `close`: whether the camera is known to a pixel or two. None
+    where too few blocks are seen.
+    """
+    correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
+    blocks = _Blocks.of(seen, correlated)
+    if blocks is None:
+        return None
+    correction = blocks.climbed(np.zeros(6), SHARP_PX if close else BLURS_PX, prior)
+    if not close:
+        sampled = blocks.best(blocks.sampled(prior), prior)
+        ascents = [correction, blocks.climbed(sampled, SHARP_PX, prior)]
+        correction = blocks.best(np.stack(ascents), prior)
+    curvature, slopes = blocks.system(correction)
+    inverse = np.linalg.pinv(curvature, hermitian=True)
+    spread = slopes.T @ slopes * (blocks.seen / max(blocks.seen - 6, 1))
+    excess = max(1.0, correlated * float(np.trace(inverse @ spread)) / 6)
+    for _ in range(FINAL_STEPS):
+        correction = blocks.stepped(correction, 0.0, excess, prior)
+    mean, information = prior
+    curvature = blocks.system(correction)[0] / excess
+    covariance = np.linalg.inv(curvature + information)
+    # Without the telemetry's share: where the quadratic of the blocks alone has its peak.
+    alone_covariance = np.linalg.inv(curvature + np.diag(WEAK**-2))
+    alone = correction + alone_covariance @ information @ (correction - mean)
+    if not all(np.isfinite(each).all() for each in (correction, covariance, alone_covariance)):
+        return None
+    return Resection(
+        correction, np.asarray(covariance), np.asarray(alone), np.asarray(alone_covariance)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Blocks (L * N) of all levels: correlations (L * N, S, S), pixels (L * N,), and their moves
+    (L * N, 2, 6) by the camera. `correlated`: see `CORRELATED`."""
+
+    levels: int
+    correlated: float
+    correlations: Array
+    pixels: Array
+    moved: Array
+
+    @classmethod
+    def of(cls, seen: Sequence[tuple[BlockScores, Array]], correlated: float) -> "_Blocks | None":
+        """None where fewer than `MIN_BLOCKS` count at every level."""
+        moved = np.concatenate([each for _, each in seen])
+        known = np.isfinite(moved).all(axis=(1, 2))
+        pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
+        if (pixels.reshape(len(seen), -1) > 0).sum(axis=1).max() < MIN_BLOCKS:
+            return None
+        correlations = np.concatenate([scores.correlations for scores, _ in seen])
+        moved = np.where((pixels > 0)[:, None, None], moved, 0.0)
+        return cls(len(seen), correlated, correlations, pixels, moved)
+
+    def sampled(self, prior: tuple[Array, Array]) -> Array:
+        """Corrections (S, 6) by the peaks of a few blocks each, chosen by how high these are."""
+        mean, information = prior
+        count, side = len(self.pixels), self.correlations.shape[1]
+        flat = self.correlations.reshape(count, -1)
+        highest = flat.argmax(axis=1)
+        peaks_px = np.stack([highest % side, highest // side], axis=-1) - side // 2
+        height = np.maximum(flat.max(axis=1), 0.0)
+        with np.errstate(divide="ignore"):
+            chance = np.log(self._weights(self._usual(height)) * height)
+        drawn = np.random.default_rng(0).gumbel(size=(SAMPLES, count)) + chance
+        chosen = np.argpartition(-drawn, SAMPLE, axis=1)[:, :SAMPLE]
+        moved = self.moved[chosen].reshape(SAMPLES, 2 * SAMPLE, 6)
+        peaks = peaks_px[chosen].reshape(SAMPLES, 2 * SAMPLE)
+        known = moved.swapaxes(1, 2) / SAMPLE_STD_PX**2
+        right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
+        return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
+
+    @property
+    def seen(self) -> int:
+        """Blocks that count at any level."""
+        return int((self.pixels.reshape(self.levels, -1) > 0).any(axis=0).sum())
+
+    def climbed(self, start: Array, blurs_px: Sequence[float], prior: tuple[Array, Array]) -> Array:
+        """A maximum of the posterior near a correction."""
+        correction = start
+        for blur_px in blurs_px:
+            correction = self.stepped(correction, blur_px, 1.0, prior)
+        return correction
+
+    def best(self, corrections: Array, prior: tuple[Array, Array]) -> Array:
+        """The one of corrections (S, 6) with the highest posterior."""
+        mean, information = prior
+        moved = (self.moved.reshape(-1, 6) @ corrections.T).T.reshape(len(corrections), -1, 2)
+        here = _values(self.correlations, moved)
+        usual = self._usual(here).max(axis=0)
+        fit = (
+            np.logaddexp(0.0, self._weights(usual) * (here - usual / 2)).sum(axis=1)
+            / self.correlated
+        )
+        off = corrections - mean
+        prior_nats = np.einsum("sp,pq,sq->s", off, information, off) / 2
+        return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
+
+    def _usual(self, correlations: Array) -> Array:
+        """Correlation (.., L * N) that a right block is expected to have: the mean of its level."""
+        by_level = (*correlations.shape[:-1], self.levels, -1)
+        weighted = (correlations * self.pixels).reshape(by_level).sum(axis=-1)
+        pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
+        usual = weighted / np.maximum(pixels, 1.0)
+        usual = np.minimum(np.maximum(usual, LEAST_CORRELATION), MOST_CORRELATION)
+        return np.repeat(usual, len(self.pixels) // self.levels, axis=-1)
+
+    def _weights(self, usual: Array) -> Array:
+        """Log likelihood ratio (L * N,) of blocks, per unit of their correlation, between a pair of
+        Gaussians of the `usual` correlation and of none."""
+        return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
+
+    def stepped(
+        self, correction: Array, blur_px: float, excess: float, prior: tuple[Array, Array]
+    ) -> Array:
+        """The correction after one step of Newton's method; the blocks say less by `excess`."""
+        mean, information = prior
+        curvature, slopes = self.system(correction, blur_px)
+        pull = slopes.sum(axis=0) / excess + information @ (mean - correction)
+        step = np.linalg.solve(curvature / excess + information, pull)
+        longest = float(np.hypot(*(self.moved @ step).T).max())
+        return np.asarray(correction + step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9)))
+
+    def system(self, correction: Array, blur_px: float = 0.0) -> tuple[Array, Array]:
+        """Curvature (6, 6) of the log likelihood at a correction, and its slope (N, 6) by each
+        block, its levels added up."""
+        here, slope, curvature = _quadratic(
+            _blurred(self.correlations, blur_px), self.moved @ correction
+        )
+        usual = self._usual(here)
+        weight = self._weights(usual)
+        odds = np.clip(weight * (here - usual / 2), -30.0, 30.0)
+        weight = weight / (1 + np.exp(-odds))
+        terms = ((slope * weight[:, None])[:, None] @ self.moved)[:, 0]
+        held = (curvature * weight[:, None, None]) @ self.moved
+        total = self.moved.reshape(-1, 6).T @ held.reshape(-1, 6)
+        return total, terms.reshape(self.levels, -1, 6).sum(axis=0)
+
+
+def _blurred(correlations: Array, blur_px: float) -> Array:
+    """Correlations (N, S, S) blurred by a Gaussian."""
+    if blur_px == 0:
+        return correlations
+    at = np.arange(correlations.shape[1])
+    kernel = np.exp(-((at[:, None] - at) ** 2) / (2 * blur_px**2))
+    kernel /= kernel.sum(axis=1, keepdims=True)
+    return np.asarray(kernel @ correlations @ kernel.T)
+
+
+def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
+    """Surfaces (N, S, S) at displacements (N, 2), x and y: their values (N,), slopes (N, 2) and
+    curvatures (N, 2, 2), not negative.
+
+    By the quadratic through the pixels around; beyond the surface all are 0.
+    """
+    reach = surfaces.shape[1] // 2
+    inside = (np.abs(moved_px) <= reach).all(axis=1)
+    held = np.clip(moved_px, 1 - reach, reach - 1)
+    nearest = np.rint(held)
+    x, y = (nearest.astype(int) + reach).T
+    rows = np.arange(len(surfaces))
+
+    def at(right: int, down: int) -> Array:
+        return np.asarray(surfaces[rows, y + down, x + right])
+
+    here = at(0, 0)
+    slope = np.stack([at(1, 0) - at(-1, 0), at(0, 1) - at(0, -1)], axis=-1) / 2
+    along = 2 * here - at(1, 0) - at(-1, 0)
+    down = 2 * here - at(0, 1) - at(0, -1)
+    across = (at(1, -1) + at(-1, 1) - at(1, 1) - at(-1, -1)) / 4
+    curvature = np.stack([along, across, across, down], axis=-1).reshape(-1, 2, 2)
+    off = np.clip(moved_px - nearest, -1.0, 1.0)
+    bent = (curvature @ off[..., None])[..., 0]
+    value = here + ((slope - bent / 2) * off).sum(axis=1)
+    slope = slope - bent
+    return value * inside, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
+
+
+def _values(surfaces: Array, moved_px: Array) -> Array:
+    """Values (.., N) of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else
+    0."""
+    reach = surfaces.shape[-1] // 2
+    nearest = np.rint(np.minimum(np.maximum(moved_px, -reach), reach)).astype(int) + reach
+    values = surfaces[np.arange(len(surfaces)), nearest[..., 1], nearest[..., 0]]
+    return np.asarray(values * (np.abs(moved_px) <= reach).all(axis=-1))
+
+
+def _positive(matrices: Array) -> Array:
+    """Symmetric matrices (N, 2, 2) with negative eigenvalues set to 0."""
+    half = (matrices[:, 0, 0] + matrices[:, 1, 1]) / 2
+    apart = np.hypot((matrices[:, 0, 0] - matrices[:, 1, 1]) / 2, matrices[:, 0, 1])
+    # Between an ellipse and a saddle only the larger one is left: its projection.
+    whole, none = half >= apart, half <= -apart
+    scale = np.where(whole, 1.0, (half + apart) / np.maximum(2 * apart, 1e-30))
+    shift = np.where(whole, 0.0, apart - half)
+    out = scale[:, None, None] * (matrices + shift[:, None, None] * np.eye(2))
+    return np.asarray(np.where(none[:, None, None], 0.0, out))
+
+
+def moved_by_camera(
+    camera: Camera, orientation: Orientation, ground_m: Array, slopes: Array
+) -> Array:
+    """How far (N, 2, 6) what is seen at an image point moves over the ground, metres east and
+    north, by metres and degrees of the camera.
+
+    `ground_m` (N, 3): the ground seen, east, north, above sea; `slopes` (N, 2): its rise per metre
+    east and north. NaN where it cannot be seen.
+    """
+    by_ground = []
+    for axis in range(2):
+        step = np.zeros((len(ground_m), 3))
+        step[:, axis] = GROUND_STEP_M
+        step[:, 2] = slopes[:, axis] * GROUND_STEP_M
+        ahead, behind = (orientation.seen_px(camera, ground_m + sign * step) for sign in (1, -1))
+        by_ground.append((ahead - behind) / (2 * GROUND_STEP_M))
+    by_camera = []
+    for axis in range(6):
+        change = np.zeros(6)
+        change[axis] = STEPS[axis]
+        ahead, behind = (
+            orientation.moved(sign * change).seen_px(camera, ground_m) for sign in (1, -1)
+        )
+        by_camera.append((ahead - behind) / (2 * STEPS[axis]))
+    on_ground = np.stack(by_ground, axis=-1)
+    bad = ~np.isfinite(on_ground).all(axis=(1, 2))
+    on_ground[bad] = np.eye(2)
+    moved = -np.linalg.solve(on_ground, np.stack(by_camera, axis=-1))
+    moved[bad] = np.nan
+    return np.asarray(moved)
+
 
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Blocks are moved so far, pixels of each level, by the first fit and by those after it. 7 px of
 the final level are what 10 deg of tilt make at the rim of a view 65 deg wide."""
 FITS = 3
 """The view is fitted at most so many times,"""
-SETTLED = 0.2
+SMALL_SHARE = 0.2
 """until a correction is below this share of its standard deviations."""
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +340,13 @@ class CameraFound:
     middle_covariance: Array | None
 
 
-def camera_found(seen: ReliefView, reference: Reference, pose: Pose) -> CameraFound | None:
+def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> CameraFound | None:
     """The camera of a view whose window lies at `pose`, its height counted from the mean ground of
-    that window; None where the ground is unknown or too few blocks are seen."""
+    that window; None where the reported tilt is exact or too few blocks are seen."""
+    if tilt_std_deg(seen.view.telemetry) == 0:
+        return None
+    if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
+        seen = ViewOverGround(Relief(LevelTerrain(), seen.relief.grid), seen.view)
     orientation, start = seen.orientation(pose), None
     if orientation is None:
         return None
@@ -64,7 +357,7 @@ def camera_found(seen: ReliefView, reference: Reference, pose: Pose) -> CameraFo
         if found is None:
             return None
         orientation = start.moved(found.correction)
-        small = np.abs(found.correction) < SETTLED * np.sqrt(np.diag(found.covariance))
+        small = np.abs(found.correction) < SMALL_SHARE * np.sqrt(np.diag(found.covariance))
         if number > 0 and small.all():
             break
     assert found is not None and start is not None
@@ -90,7 +383,7 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
 
 
 def _fitted(
-    seen: ReliefView, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
+    seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> Resection | None:
     """A correction of `orientation`, under which the view is rectified: the first at the final
     level and a coarser one, others one level finer too."""
@@ -119,16 +412,16 @@ def _fitted(
 
 
 def _templates(
-    seen: ReliefView, pose: Pose, level: int, orientation: Orientation, *, first: bool
+    seen: ViewOverGround, pose: Pose, level: int, orientation: Orientation, *, first: bool
 ) -> ViewTemplates | None:
     """The view rectified under an orientation; over level ground the first is the search's."""
-    if first and seen.relief.is_level and not seen.is_oblique:
+    if first and seen.relief.is_level and not is_oblique(seen.view.view):
         return seen.view.templates
     return seen.templates_at(pose, level, orientation)
 
 
 def _middle_covariance(
-    seen: ReliefView, orientation: Orientation, covariance: Array
+    seen: ViewOverGround, orientation: Orientation, covariance: Array
 ) -> Array | None:
     """Covariance (2, 2), m2, of the ground that the middle of a view shows; None where unknown
     ground is next to it."""
@@ -140,9 +433,9 @@ def _middle_covariance(
     return slopes @ covariance @ slopes.T if np.isfinite(slopes).all() else None
 
 
-def _prior(seen: ReliefView, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:
+def _prior(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:
     """Expected correction (6,) of an orientation by telemetry, and its information (6, 6)."""
-    telemetry, prior = seen.view.picture_at(seen.view.levels.final).telemetry, seen.view.prior
+    telemetry, prior = seen.view.telemetry, seen.view.prior
     expected, std = 0.0, prior.log_scale_std
     if prior.scale_map is not None:
         expected, std = prior.scale_map.at(pose.x_px, pose.y_px), prior.scale_map.std

@@ -1,29 +1,266 @@
 """Placing a view by its tile: embed it under a few headings, and find the most similar tile.
 
 As Di Piazza et al. 2024 do. Positions are good to a fraction of a tile; maps with a registration
-layer are placed by `registration` instead, which uses these tiles for candidates only.
+layer are placed by `registration` instead, which uses these tiles for candidates only
+(`TileProposer`).
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError, VariantError
-from orthonav.core.localize.checks import check_rectified
-from orthonav.core.localize.logistic import LogisticConfidence
-from orthonav.core.localize.match import Match, TileMatcher
-from orthonav.core.localize.propose import TileProposer
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.confidence import LogisticConfidence
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
+from orthonav.core.localize.view import check_rectified
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.search import Peak
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.exact import rows_within
-from orthonav.core.tiles.position import PositionRule
-from orthonav.core.tiles.stored import embedder_of
+from orthonav.core.tiles.bank import Representation, embed_poses
+from orthonav.core.tiles.embed import ViewEmbedder, embedder_of
+from orthonav.core.tiles.exact import ExactIndex, rows_within
+from orthonav.core.tiles.position import PositionRule, TileNeighbours, offset_en_m, parabola_peak
+from orthonav.core.tiles.whitened import WhitenedEmbedder
 from orthonav.core.variants import variant_from_recipe
+
+MAX_RATIO = 10.0
+"""Ratios are cut off here; a rival at or below zero leaves the best without any rival."""
+
+
+def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
+    """Best score over second best (Di Piazza et al. 2024, section 4), up to `MAX_RATIO`.
+
+    `best` is the index of the score that counts as best, the highest where None; where another one
+    is higher the ratio is below 1.
+
+    With dense overlap the second best tile is nearly always the neighbour of the best.
+    """
+    if scores.size < 2:
+        return MAX_RATIO
+    if best is None:
+        best = int(scores.argmax())
+    others = max(scores[:best].max(initial=-1.0), scores[best + 1 :].max(initial=-1.0))
+    return _ratio(float(scores[best]), float(others))
+
+
+def rival_score(
+    scores: NDArray[np.float32],
+    centres_en_m: NDArray[np.float32],
+    best: int,
+    exclusion_m: float,
+) -> float:
+    """Best score among tiles farther than `exclusion_m` from the best tile.
+
+    The best score itself where there is no such tile: without a rival nothing is known of how
+    much the best stands out, and that must not appear as certainty.
+    """
+    offset = centres_en_m - centres_en_m[best]
+    elsewhere = np.einsum("ij,ij->i", offset, offset) > exclusion_m**2
+    if not elsewhere.any():
+        return float(scores[best])
+    return float(np.max(scores, where=elsewhere, initial=-1.0))
+
+
+def peak_ratio(best_score: float, rival: float) -> float:
+    """Best score over the best score elsewhere (`rival_score`), up to `MAX_RATIO`."""
+    return _ratio(best_score, rival)
+
+
+def _ratio(best: float, second: float) -> float:
+    if best <= 0:
+        return 1.0
+    return min(MAX_RATIO, best / second) if second > 0 else MAX_RATIO
+
+
+BACKGROUND_TILES = 20_000
+"""Rivals are taken from about so many tiles of the whole map, evenly spread: enough for the best
+rival, and the search of a narrow prior stays fast."""
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """The best tile for one view.
+
+    `tile`: its row. `shift_en_m`: offset of the position from the centre of that tile, east and
+    north (m). `query`: index of the best of the headings tried. `evidence`: that of
+    `TileMatcher.match`.
+    """
+
+    tile: int
+    shift_en_m: tuple[float, float]
+    query: int
+    evidence: dict[str, float]
+
+
+class TileMatcher:
+    """The tiles of a sheet: centres (N, 2) float32 and embeddings (N, D) float16."""
+
+    def __init__(
+        self,
+        grid: TileGrid,
+        centres_en_m: NDArray[np.float32],
+        embeddings: NDArray[np.float16],
+        position: PositionRule = "peak",
+    ) -> None:
+        """`position` says how scores become a position between the tiles.
+
+        Raises `MapFileError` where the centres are not those of the grid.
+        """
+        self._position: PositionRule = position
+        self.index = ExactIndex(embeddings)
+        self.grid = grid
+        self.centres_en_m = centres_en_m
+        self.neighbours = TileNeighbours(grid, centres_en_m)
+        step = -(-len(embeddings) // BACKGROUND_TILES)
+        self._background = np.arange(0, len(embeddings), step, dtype=np.intp)
+
+    def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
+        """Best tile for queries (Q, D), one per heading, among `rows` (all where None).
+
+        Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
+        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
+        are sought beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
+        narrow prior leaves no rival of its own, and that must not appear as certainty.
+        """
+        searched = None
+        if rows is not None:
+            searched = np.union1d(rows, self._background)
+        scores = self.index.scores(queries, searched)
+        best_heading = scores.argmax(axis=1)
+        per_tile = np.take_along_axis(scores, best_heading[:, None], axis=1)[:, 0]
+        if searched is None or rows is None:
+            centres, best = self.centres_en_m, int(per_tile.argmax())
+            tile = best
+        else:
+            centres, allowed = self.centres_en_m[searched], np.searchsorted(searched, rows)
+            best = int(allowed[per_tile[allowed].argmax()])
+            tile = int(searched[best])
+        score = float(per_tile[best])
+        rival = rival_score(per_tile, centres, best, self.grid.tile_m / 2)
+        evidence = {
+            "score": score,
+            "margin": score - rival,
+            "lowe_ratio": lowe_ratio(per_tile, best),
+            "peak_ratio": peak_ratio(score, rival),
+            "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
+        }
+        # The background serves as rivals only: a mean of all is one of those that are allowed.
+        used, used_rows = per_tile, searched
+        if self._position == "weighted" and searched is not None and rows is not None:
+            used, used_rows = per_tile[np.searchsorted(searched, rows)], rows
+        shift = offset_en_m(
+            self._position,
+            used,
+            tile,
+            used_rows,
+            self.centres_en_m,
+            self.neighbours,
+            self.grid.stride_m,
+        )
+        return Match(tile, shift, int(best_heading[best]), evidence)
+
+
+@dataclass(frozen=True, eq=False)
+class TileProposer:
+    """Embeds a view under many poses and finds the most similar tiles.
+
+    `grid`, `centres_en_m` (N, 2) and `index` are those of the sheet's tiles, `neighbours` the tiles
+    next to each; `representation` and `embedder` made the embeddings.
+    """
+
+    grid: TileGrid
+    centres_en_m: NDArray[np.float32]
+    index: ExactIndex
+    embedder: WhitenedEmbedder
+    representation: Representation
+    neighbours: TileNeighbours
+
+    @classmethod
+    def of(
+        cls, tiles: TileMatcher, embedder: ViewEmbedder, representation: Representation
+    ) -> "TileProposer | None":
+        """A proposer for whitened embeddings, None for others: those cannot embed a view under
+        many poses at once."""
+        if not isinstance(embedder, WhitenedEmbedder):
+            return None
+        return cls(
+            tiles.grid, tiles.centres_en_m, tiles.index, embedder, representation, tiles.neighbours
+        )
+
+    def fits(self, side_px: float, view_tiles: tuple[float, float]) -> bool:
+        """Whether a view of this side (pixels of the map) is from the least to the largest of
+        `view_tiles` tiles wide."""
+        smallest, largest = view_tiles
+        return smallest * self.grid.tile_px <= side_px <= largest * self.grid.tile_px
+
+    def candidates(
+        self,
+        view: RectifiedView,
+        poses: list[tuple[float, float]],
+        weights: NDArray[np.float32],
+        rows: NDArray[np.intp] | None,
+        count: int,
+    ) -> list[Peak]:
+        """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
+
+        `poses` are headings (rad) and log scales; scores are those of the embeddings, times the
+        `weights` (Q,) of the poses. Up to `count` tiles, the best of those that no tile next to
+        them exceeds: neighbours show the same ground.
+        """
+        queries = embed_poses(
+            self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
+        )
+        scores = self.index.best(queries * weights[:, None], rows)
+        chosen = self.neighbours.maxima(scores, count, rows)
+        tiles = chosen if rows is None else rows[chosen]
+        by_pose = self.index.scores(queries, tiles)
+        peaks = peak_poses(np.array(poses), by_pose, weights)
+        found = []
+        for place, tile, (turn_rad, log_scale) in zip(chosen, tiles, peaks.tolist(), strict=True):
+            shift = self.neighbours.peak_offset(scores, int(tile), rows)
+            east, north = self.centres_en_m[tile] + np.array(shift) * self.grid.stride_m
+            x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
+            y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
+            pose = Pose(x_px, y_px, turn_rad, log_scale)
+            found.append(Peak(float(scores[place]), pose))
+        return found
+
+
+def peak_poses(
+    poses: NDArray[np.float64], scores: NDArray[np.float32], weights: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Headings and log scales (N, 2) where the scores (N, Q) of poses (Q, 2) on a grid have their
+    peak.
+
+    By a parabola along each, or those of the best pose where one of its neighbours is missing. The
+    best one has the highest score times its weight (Q,); weights do not move the parabola.
+    """
+    off = poses - poses[:, None]
+    off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
+    best, tiles = (scores * weights).argmax(axis=1), np.arange(len(scores))
+    peaks: NDArray[np.float64] = poses[best]
+    for axis in (0, 1):
+        other = np.isclose(off[..., 1 - axis], 0.0)
+        beside = []
+        for sign in (-1, 1):
+            along = sign * off[..., axis]
+            away = np.where(other & (along > 1e-9), along, np.inf)
+            nearest = away.argmin(axis=1)[best]
+            beside.append((nearest, away[best, nearest]))
+        (before, back), (after, ahead) = beside
+        has_both = np.isfinite(back + ahead)
+        around = scores[tiles[:, None], np.stack([before, best, after], axis=1)]
+        moved = np.array([parabola_peak(*each) for each in around.tolist()])
+        step = np.where(has_both, (back + ahead) / 2, 0.0)
+        peaks[:, axis] += np.where(has_both, moved, 0.0) * step
+    return peaks
+
 
 HEADING_SIGMAS = 1.5
 """Headings are tried this far around the reported one, in its standard deviations: three headings

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     )
 
 SCHEMA = 2
-"""Schema 1 has neither serial number nor time."""
 FORMAT = "orthonav-signature"
 ALGORITHM = "ed25519"
 MAX_SIGNATURE_BYTES = 4096
@@ -56,23 +55,22 @@ class Signature:
     """A verified signature.
 
     `key_id`: of the key. `manifest_sha256`: digest of the map's manifest, hexadecimal. `serial`:
-    serial number, at least 0. `signed_utc`: time of signing by the clock of the signer. The last
-    two are None in signatures of schema 1.
+    serial number, at least 0. `signed_utc`: time of signing by the clock of the signer.
     """
 
     key_id: str
     manifest_sha256: str
-    serial: int | None = None
-    signed_utc: str | None = None
+    serial: int
+    signed_utc: str
 
     @property
     def message(self) -> bytes:
         """The signed bytes; their beginning separates them from other uses of the key."""
-        digest = f"manifest sha256 {self.manifest_sha256}"
-        if self.serial is None:
-            return f"orthonav map, schema 1, {digest}".encode("ascii")
-        named = f"serial {self.serial}, signed {self.signed_utc}"
-        return f"orthonav map, schema 2, {named}, {digest}".encode("ascii")
+        text = (
+            f"orthonav map, schema {SCHEMA}, serial {self.serial}, signed {self.signed_utc}, "
+            f"manifest sha256 {self.manifest_sha256}"
+        )
+        return text.encode("ascii")
 
 
 def signature_path(path: Path) -> Path:
@@ -213,11 +211,6 @@ def _least(text: str) -> int | datetime:
 
 
 def _require_not_older(found: Signature, least: int | datetime, text: str, path: Path) -> None:
-    if found.serial is None or found.signed_utc is None:
-        raise MapFileError(
-            f"signature has no serial number and no date, which --not-before needs; sign the map "
-            f"again: {path}"
-        )
     if isinstance(least, int):
         if found.serial < least:
             raise MapFileError(
@@ -241,35 +234,27 @@ def _signature(path: Path) -> tuple[Signature, str]:
             raise ValueError(f"it is larger than {MAX_SIGNATURE_BYTES} bytes")
         plain = json.loads(data)
         schema = plain["schema"]
-        if plain["format"] != FORMAT or type(schema) is not int or schema < 1:
+        if plain["format"] != FORMAT or type(schema) is not int:
             raise ValueError("not an orthonav signature")
-        if schema > SCHEMA or plain["algorithm"] != ALGORITHM:
+        if schema != SCHEMA or plain["algorithm"] != ALGORITHM:
             raise ValueError(
                 f"schema {schema}, algorithm {plain['algorithm']!r:.20}; update orthonav"
             )
-        found = {name: plain[name] for name in ("key_id", "manifest_sha256", "signature")}
-        texts = all(isinstance(value, str) and value.isascii() for value in found.values())
-        if not texts or not re.fullmatch(r"[0-9a-f]{16}", found["key_id"]):
+        texts = plain["key_id"], plain["manifest_sha256"], plain["signature"]
+        if not all(isinstance(text, str) and text.isascii() for text in texts):
             raise ValueError("a field is invalid")
-        if not _DIGEST.fullmatch(found["manifest_sha256"]):
-            raise ValueError("its digest is invalid")
-        encoded = found.pop("signature")
-        signature = Signature(**found) if schema == 1 else Signature(**found, **_age(plain))
+        if not re.fullmatch(r"[0-9a-f]{16}", texts[0]) or not _DIGEST.fullmatch(texts[1]):
+            raise ValueError("its key or digest is invalid")
+        serial, signed_utc = plain["serial"], plain["signed_utc"]
+        if type(serial) is not int or not 0 <= serial <= MAX_SERIAL:
+            raise ValueError("its serial number is invalid")
+        if datetime.strptime(signed_utc, _TIME).strftime(_TIME) != signed_utc:
+            raise ValueError("its time is invalid")
     except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
         raise MapFileError(
             f"signature of the map is broken ({described(error)}): {file}"
         ) from error
-    return signature, encoded
-
-
-def _age(plain: dict[str, Any]) -> dict[str, Any]:
-    """Serial number and time of signing of a signature file; raises `ValueError`."""
-    serial, signed_utc = plain["serial"], plain["signed_utc"]
-    if type(serial) is not int or not 0 <= serial <= MAX_SERIAL:
-        raise ValueError("its serial number is invalid")
-    if datetime.strptime(signed_utc, _TIME).strftime(_TIME) != signed_utc:
-        raise ValueError("its time is invalid")
-    return {"serial": serial, "signed_utc": signed_utc}
+    return Signature(texts[0], texts[1], serial, signed_utc), texts[2]
 
 
 def _private_key(path: Path) -> "Ed25519PrivateKey":
@@ -281,9 +266,7 @@ def _private_key(path: Path) -> "Ed25519PrivateKey":
         raise MapFileError(f"private key has a passphrase; give one without: {path}") from error
     except Exception as error:
         raise MapFileError(f"not a private key in PEM: {path}") from error
-    if not isinstance(key, ed25519.Ed25519PrivateKey):
-        raise MapFileError(f"expected an Ed25519 private key, got another kind: {path}")
-    found: Ed25519PrivateKey = key
+    found: Ed25519PrivateKey = _of_kind(key, ed25519.Ed25519PrivateKey, "private", path)
     return found
 
 
@@ -294,18 +277,23 @@ def _public_key(path: Path) -> "Ed25519PublicKey":
         key = serialization.load_pem_public_key(data)
     except Exception as error:
         raise MapFileError(f"not a public key in PEM: {path}") from error
-    if not isinstance(key, ed25519.Ed25519PublicKey):
-        raise MapFileError(f"expected an Ed25519 public key, got another kind: {path}")
-    found: Ed25519PublicKey = key
+    found: Ed25519PublicKey = _of_kind(key, ed25519.Ed25519PublicKey, "public", path)
     return found
 
 
+def _of_kind(key: Any, kind: type, name: str, path: Path) -> Any:
+    if not isinstance(key, kind):
+        raise MapFileError(f"expected an Ed25519 {name} key, got another kind: {path}")
+    return key
+
+
 def _key_bytes(path: Path, what: str) -> bytes:
-    path = require_file(path, what)
     try:
-        with path.open("rb") as stream:
+        with require_file(path, what).open("rb") as stream:
             return stream.read(MAX_KEY_BYTES)
     except OSError as error:
+        if isinstance(error, MissingFileError):
+            raise
         raise MissingFileError(f"{what} cannot be read ({error.strerror}): {path}") from error
 
 

@@ -1,7 +1,7 @@
 """Registration: a view laid on the map, to fractions of a pixel, or refused.
 
-`evidence` is what is compared (oriented gradients and locally normalized grey), `template` a view
-made ready at several resolutions, `reference` the map made ready where it is looked at, `search`
+`channels` is what is compared (oriented gradients and locally normalized grey), `template` a view
+made ready at several resolutions, `window` the map made ready where it is looked at, `search`
 finds candidates by FFT over a bank of headings and scales, `refine` moves each candidate to its
 best position, heading and scale and says how well it fits and how exactly it is known.
 """

@@ -1,7 +1,7 @@
 """Blocks of a view beside the map: how well each fits when it is moved a little aside.
 
 A view that was rectified with the wrong tilt, relief or lens is distorted, so its blocks fit at
-different displacements. `orthonav.core.localize.resection` turns these into the camera.
+different displacements. `orthonav.core.localize.camera` turns these into the camera.
 """
 
 import math
@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import CHANNELS
+from orthonav.core.register.channels import CHANNELS
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.map_window import MapWindow
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.template import BLOCKS, Template
+from orthonav.core.register.window import MapWindow, Reference
 
 GREY_SHARE = 0.25
 """Energy of grey levels over that of gradients. Less than in the search: grey levels of another

@@ -1,7 +1,7 @@
 """Moving a candidate to its best position, heading and scale, and judging it there.
 
-Gauss-Newton on the sum of squared differences between a view's evidence and the map's, each kind
-of evidence with its own gain, so that correlation is what is maximized; the step is found on the
+Gauss-Newton on the sum of squared differences between a view's channels and the map's, each kind
+of channels with its own gain, so that correlation is what is maximized; the step is found on the
 view's side, whose derivatives are made once (inverse compositional alignment, Baker and Matthews,
 IJCV 2004). The covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang
 and Zeger 1986): residuals of neighbouring pixels are not independent, so their scores are summed
@@ -17,13 +17,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import GROUPS
+from orthonav.core.register.channels import GROUPS
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.map_window import MapWindow
 from orthonav.core.register.pose import Pose, even_scale
-from orthonav.core.register.reference import Reference
-from orthonav.core.register.sums import FULLY_VALID, Sums, compared, sampled_planes
 from orthonav.core.register.template import BLOCKS, Template, by_steps, from_middle, gradients
+from orthonav.core.register.window import (
+    FULLY_VALID,
+    MapWindow,
+    Reference,
+    Sums,
+    compared,
+    sampled_planes,
+)
 
 Array = NDArray[np.float32]
 STEPS = 6
@@ -48,17 +53,15 @@ MIN_CURVATURE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A view placed on the map.
+class Fit:
+    """How well a view fits the map at a pose and a level.
 
     `score`: weighted sum of correlations times the square root of the pixels of the level that
-    it rests on; `correlations` of the kinds of evidence, `weighted` their weighted mean;
+    it rests on; `correlations` of the kinds of channels, `weighted` their weighted mean;
     `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
     `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
     standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
-    pixels), turn (rad) and log scale, where they were asked for; `window`: over relief, the pose
-    whose height is counted from the mean ground of the window, that of `pose` from the ground below
-    the camera.
+    pixels), turn (rad) and log scale, where they were asked for.
     """
 
     pose: Pose
@@ -71,12 +74,6 @@ class Placed:
     agreement: float = math.nan
     blocks_t: float = math.nan
     covariance: NDArray[np.float64] | None = None
-    window: Pose | None = None
-
-    @classmethod
-    def unjudged(cls, pose: Pose, level: int) -> "Placed":
-        """A proposed pose that was not judged yet."""
-        return cls(pose, level, math.nan, (), math.nan, math.nan, False)
 
 
 class Refiner:
@@ -100,28 +97,28 @@ class Refiner:
         small_step_px: float = SMALL_STEP_PX,
         *,
         with_covariance: bool = False,
-    ) -> Placed:
+    ) -> Fit:
         """The view at the best pose near `pose`, within a few pixels of the level.
 
         It ends where a step moves no part of the view by more than `small_step_px`.
         """
         window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
-        placed, step = self._refined(window, pose, steps, small_step_px)
+        fit, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
-            return placed
-        sums = self._spread(window, placed.pose)
-        to_map = self._to_map(placed.pose)
+            return fit
+        sums = self._spread(window, fit.pose)
+        to_map = self._to_map(fit.pose)
         covariance = np.asarray(to_map @ sums.covariance() @ to_map.T)
-        if not placed.converged:
+        if not fit.converged:
             # Still moving: its last step is an error of its own.
             covariance += np.outer(move := to_map @ step, move)
         return replace(
-            placed, covariance=covariance, agreement=sums.agreement(), blocks_t=sums.blocks_t()
+            fit, covariance=covariance, agreement=sums.agreement(), blocks_t=sums.blocks_t()
         )
 
     def _refined(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
-    ) -> tuple[Placed, Sequence[float]]:
+    ) -> tuple[Fit, Sequence[float]]:
         """The best pose of so many steps at most, and the last step (4,)."""
         if KERNEL is None:
             return self._refined_by_numpy(window, pose, steps, small_step_px)
@@ -129,7 +126,7 @@ class Refiner:
             *self._for_kernel(window, pose, steps, small_step_px)
         )
         numbers = score, correlations, weighted, overlap, bool(converged)
-        return Placed(Pose(*found), self.template.level, *numbers), step
+        return Fit(Pose(*found), self.template.level, *numbers), step
 
     def _for_kernel(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
@@ -145,7 +142,7 @@ class Refiner:
 
     def _refined_by_numpy(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
-    ) -> tuple[Placed, Sequence[float]]:
+    ) -> tuple[Fit, Sequence[float]]:
         """`_refined` without the kernel."""
         unit = 2.0**self.template.level
         converged, step = False, [0.0] * 4
@@ -162,7 +159,7 @@ class Refiner:
             converged = moves_px < small_step_px
             if converged:
                 break
-        return best.placed(converged), step
+        return best.fit(converged), step
 
     def _compared(self, window: MapWindow, pose: Pose) -> "Comparison":
         """The view beside the map under a pose."""
@@ -212,7 +209,7 @@ class SpreadSums(NamedTuple):
     - `observed` (4, 4): products of the view's derivatives by the steps and the map's.
     - `hessian` (4, 4): the Gauss-Newton matrix.
     - `blocks` (B * B, 7): by block of the view, the derivatives (4) of the score by the steps, the
-      products of view and map of both kinds of evidence, and the pixels that count.
+      products of view and map of both kinds of channels, and the pixels that count.
     """
 
     observed: NDArray[np.float64]
@@ -232,7 +229,7 @@ class SpreadSums(NamedTuple):
         return np.asarray(inverse @ spread @ inverse.T)
 
     def agreement(self) -> float:
-        """Share of the blocks of a view whose evidence correlates positively."""
+        """Share of the blocks of a view whose channels correlate positively."""
         sums, counts = self.blocks[:, 4] + self.blocks[:, 5], self.blocks[:, 6]
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0
@@ -257,7 +254,7 @@ def _bounded_inverse(
 class Comparison:
     """A view beside the map under one pose.
 
-    `correlations`, `squares` and `gains` by kind of evidence: the step is made of gain * map -
+    `correlations`, `squares` and `gains` by kind of channel: the step is made of gain * map -
     correlation^2 * view, so that its part of each kind is what moves the peak, weighted by what
     that kind can say: steps from the plain difference would fall short by the square of the
     correlation.
@@ -293,9 +290,9 @@ class Comparison:
         pixels = self.template.block_pixels
         return np.asarray((pixels - self._sums.left_pixels) / np.maximum(pixels, 1.0))
 
-    def placed(self, converged: bool) -> Placed:
+    def fit(self, converged: bool) -> Fit:
         """The numbers of this pose."""
-        return Placed(
+        return Fit(
             self.pose,
             self.template.level,
             self.score,

@@ -1,18 +1,18 @@
 """Candidates: where, and how turned and scaled, a view might lie in a window of the map.
 
-The view's evidence is laid on the window at every position at once by FFT, for each heading and
-scale of a bank. Evidence of the map is divided by its local energy beforehand, so that one
-backward transform gives the sum over all kinds of evidence. What comes out is the correlation
+The view's channels are laid on the window at every position at once by FFT, for each heading and
+scale of a bank. Channels of the map are divided by their local energy beforehand, so that one
+backward transform gives the sum over all kinds of channels. What comes out is the correlation
 times the square root of the pixels that it rests on: pure chance then gives values alike at every
 scale, whereas correlation alone favours small views.
 """
 
 import math
+import threading
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.core.geo.camera import counted_from_centres
-from orthonav.core.register.evidence import GROUPS
+from orthonav.core.register.channels import GROUPS, ChannelRecipe
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.memory import thread_memory
-from orthonav.core.register.pose import Pose, even_scale, rotation
-from orthonav.core.register.reference import cut
-from orthonav.core.register.scale_map import ScaleMap
+from orthonav.core.register.pose import Pose, ScaleMap, even_scale, rotation
 from orthonav.core.register.template import Template, energy_of, turn_planes
+from orthonav.core.register.window import Reference, cut, thread_memory
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
@@ -37,23 +35,12 @@ POSES_AT_ONCE = 6
 """Poses that a thread takes at a time."""
 PLACES_AT_ONCE = 50
 """Poses whose surroundings a thread searches at a time."""
+MAX_KEPT_WINDOWS = 4
+"""Search windows of whole sheets in the cache."""
 WIDE = 8
 """Columns or rows that the kernel transforms together."""
 LONGEST_PX = 32768
 """Longest side of a window that the kernel takes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Bank:
-    """Turns (rad) and log scales (natural) that are tried, each with each."""
-
-    turns_rad: NDArray[np.float64]
-    log_scales: NDArray[np.float64]
-
-    @property
-    def poses(self) -> list[tuple[float, float]]:
-        """All pairs (turn, log scale)."""
-        return [(float(t), float(s)) for s in self.log_scales for t in self.turns_rad]
 
 
 def bank(
@@ -63,14 +50,16 @@ def bank(
     turn_step_rad: float,
     scale_step: float,
     sigmas: float,
-) -> Bank:
-    """Turns and scales that reach `sigmas` standard deviations; all turns where `None`."""
+) -> list[tuple[float, float]]:
+    """Turns (rad) and log scales that reach `sigmas` standard deviations, each with each; all turns
+    where `None`."""
     if turn_std_rad is None or sigmas * turn_std_rad + turn_step_rad / 2 >= math.pi:
         count = math.ceil(2 * math.pi / turn_step_rad)
         turns = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
     else:
         turns = _spread(sigmas * turn_std_rad, turn_step_rad)
-    return Bank(turns, _spread(sigmas * log_scale_std, scale_step))
+    scales = _spread(sigmas * log_scale_std, scale_step)
+    return [(float(turn), float(scale)) for scale in scales for turn in turns]
 
 
 def _spread(reach: float, step: float) -> NDArray[np.float64]:
@@ -79,16 +68,15 @@ def _spread(reach: float, step: float) -> NDArray[np.float64]:
     return (np.arange(count, dtype=np.float64) - (count - 1) / 2) * step
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A peak: `score` (correlation times square root of pixels) at a pose."""
+class Peak(NamedTuple):
+    """A candidate: `score` (correlation times square root of pixels) at a pose."""
 
     score: float
     pose: Pose
 
 
 class SearchWindow:
-    """A window of the map made ready to be searched: evidence (H, W, 4) at a level.
+    """A window of the map made ready to be searched: channels (H, W, 4) at a level.
 
     (`row`, `col`) is its first pixel on that level of the sheet; `view_px` about the side of the
     views that will be laid on it; within `margin_px` of the border no middle of a view is sought.
@@ -121,7 +109,7 @@ class SearchWindow:
 
     @cached_property
     def channels(self) -> Array:
-        """The evidence (H, W, 3) divided by its local energy."""
+        """The channels (H, W, 3) divided by their local energy."""
         return self._normalized()
 
     @cached_property
@@ -149,6 +137,12 @@ class SearchWindow:
         """Make what threads share when they search for a view, so that none makes it again."""
         _ = self.spectra_by_columns if self.by_kernel else (self.spectra, template.interleaved)
 
+    def prepare_near(self, template: Template) -> None:
+        """The same for `best_near`."""
+        _ = self.channels
+        if KERNEL is None:
+            _ = template.interleaved
+
     def _transformed(self) -> NDArray[np.complex64]:
         planes = np.moveaxis(self._normalized(), 2, 0)
         return np.asarray(rfft2(planes, s=self.size), np.complex64)
@@ -168,6 +162,60 @@ def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
     return np.asarray(channels / np.sqrt(local + ENERGY_FLOOR * typical + 1e-12)[..., None])
 
 
+class SearchWindows:
+    """Windows of one sheet. Safe to share between threads."""
+
+    def __init__(self, reference: Reference) -> None:
+        self._reference = reference
+        self._windows: dict[tuple[int, ChannelRecipe, int], SearchWindow] = {}
+        self._lock = threading.Lock()
+
+    def whole(self, level: int, recipe: ChannelRecipe, view_px: float) -> SearchWindow:
+        """The whole sheet at a level: views of about the same size share it."""
+        side = _rounded_side(view_px / 2**level)
+        key = (level, recipe, side)
+        with self._lock:
+            found = self._windows.pop(key, None)
+            if found is None:
+                found = SearchWindow(self._reference.whole(level, recipe), level, 0, 0, side)
+                while len(self._windows) >= MAX_KEPT_WINDOWS:
+                    self._windows.pop(next(iter(self._windows)))
+            self._windows[key] = found  # the least recently used one is the first
+        return found
+
+    def part(
+        self,
+        level: int,
+        recipe: ChannelRecipe,
+        view_px: float,
+        centre_px: tuple[float, float],
+        reach_px: float,
+        half_px: int | None = None,
+    ) -> SearchWindow:
+        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y).
+
+        `half_px`: see `SearchWindow`.
+        """
+        unit = 2.0**level
+        margin = math.ceil(view_px / 2 / unit)
+        rows, cols = self._reference.shape(level)
+        low, size = [], []
+        for middle, extent in zip(centre_px, (cols, rows), strict=True):
+            # Middles farther out than half a view see nothing of the sheet.
+            first = math.floor(max((middle - reach_px) / unit, -margin))
+            last = math.ceil(min((middle + reach_px) / unit + 2, extent + margin))
+            low.append(first - margin)
+            size.append(max(last - first, 1) + 2 * margin)
+        made = self._reference.window(level, low[1], low[0], size[1], size[0], recipe)
+        side = _rounded_side(view_px / unit)
+        return SearchWindow(made, level, low[1], low[0], side, margin, half_px)
+
+
+def _rounded_side(side: float) -> int:
+    """A side rounded up by steps of about a quarter, so that views of like size share a window."""
+    return math.ceil(2 ** (math.ceil(4 * math.log2(max(side, 8.0))) / 4))
+
+
 def search(
     template: Template,
     window: SearchWindow,
@@ -175,7 +223,7 @@ def search(
     count: int,
     scales: ScaleMap | None = None,
     pool: Executor | None = None,
-) -> list[Candidate]:
+) -> list[Peak]:
     """The `count` best candidates, best first, not closer together than an eighth of the view.
 
     With `scales` every place is compared under the scales that are expected there only. The threads
@@ -204,13 +252,13 @@ def search(
         x, y = _between(best, row, col)
         turn, log_scale = poses[int(which[row, col])]
         pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
-        found.append(Candidate(float(best[row, col]), pose))
+        found.append(Peak(float(best[row, col]), pose))
     return found
 
 
 def best_near(
     template: Template, window: SearchWindow, poses: Sequence[Pose], reach_px: float
-) -> list[Candidate]:
+) -> list[Peak]:
     """The best place of a view within `reach_px` (level 0) of each pose, along each axis, under its
     heading and scale."""
     unit = 2.0**template.level
@@ -230,7 +278,7 @@ def best_near(
     found[:, 1] = (window.col + found[:, 1]) * unit
     found[:, 2] = (window.row + found[:, 2]) * unit
     return [
-        Candidate(score, Pose(x, y, pose.turn_rad, pose.log_scale))
+        Peak(score, Pose(x, y, pose.turn_rad, pose.log_scale))
         for (score, x, y), pose in zip(found.tolist(), poses, strict=True)
     ]
 
@@ -379,7 +427,7 @@ def largest_half_px(template: Template, poses: Sequence[tuple[float, float]]) ->
 def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     """Channels (3, P, P) of a template as the map would show them, its middle in theirs.
 
-    Each kind of evidence has the norm of its weight over `even_scale`, so that scores of all scales
+    Each kind of channel has the norm of its weight over `even_scale`, so that scores of all scales
     compare.
     """
     height, width = template.mask.shape

@@ -1,8 +1,8 @@
-"""How much a place stands out from the ground around it: evidence against texture that repeats.
+"""How much a place stands out from the ground around it, which tells it from texture that repeats.
 
 A view of rows, lattices or a single road fits nearly as well a little aside. Places found by chance
 do so too. The view's window is moved a little aside, and what it scores there is compared with its
-score at the place itself: for all evidence, for gradients alone, and as phase correlation (Kuglin
+score at the place itself: for all channels, for gradients alone, and as phase correlation (Kuglin
 and Hines, 1975), which weighs all spatial frequencies alike. All three come from the same spectra.
 What they bring is in docs/decisions/evidence.md.
 """
@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from orthonav.core.register.evidence import CHANNELS, GROUPS
+from orthonav.core.register.channels import CHANNELS, GROUPS
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.map_window import MapWindow
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
 from orthonav.core.register.template import Template, turn_planes
+from orthonav.core.register.window import MapWindow, Reference
 
 Array = NDArray[np.float32]
 REACH_SHARE, MIN_REACH_PX = 0.125, 8
@@ -39,8 +38,8 @@ PHASE_FLOOR = 1e-3
 class Sharpness(NamedTuple):
     """How far the score of a place stands out from those a little aside.
 
-    `ratio`: of all evidence, over the best one aside, up to 10; 0 where the view does not correlate
-    at all. `gradients`, `phase`: of gradients alone, and by phase correlation of all evidence, over
+    `ratio`: of all channels, over the best one aside, up to 10; 0 where the view does not correlate
+    at all. `gradients`, `phase`: of gradients alone, and by phase correlation of all channels, over
     the mean aside, in standard deviations.
     """
 

@@ -1,4 +1,4 @@
-"""A view as templates: its evidence at every level of the map that registration uses."""
+"""A view as templates: its channels at every level of the map that registration uses."""
 
 import math
 from dataclasses import dataclass
@@ -8,10 +8,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import CHANNELS, FINE, GROUPS, EvidenceRecipe, evidence_planes
+from orthonav.core.register.channels import (
+    CHANNELS,
+    COARSE,
+    FINE,
+    GROUPS,
+    ChannelRecipe,
+    channel_planes,
+)
 from orthonav.core.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
+JUDGED_PX = 72.0
+"""A view is judged at the level where it is about so many pixels across
+(docs/decisions/registration.md)."""
 BLOCKS = 6
 """Blocks along one side of a view, in which residuals are taken as one (see `refine`)."""
 
@@ -20,21 +30,21 @@ BLOCKS = 6
 class Template:
     """One view at one level.
 
-    `planes` (4, H, W): evidence, each kind scaled to the energy that its weight gives it, and 1
+    `planes` (4, H, W): channels, each kind scaled to the energy that its weight gives it, and 1
     where it counts; `weights` of the kinds; `level` of the map whose ground resolution it has.
     """
 
     level: int
     planes: Array
     weights: tuple[float, ...]
-    recipe: EvidenceRecipe
+    recipe: ChannelRecipe
 
     @classmethod
     def of(
-        cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: EvidenceRecipe
+        cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: ChannelRecipe
     ) -> "Template":
         """The template of grey levels (H, W) at the ground resolution of `level`."""
-        planes, weights = np.stack(evidence_planes(grey, valid, recipe)), (1.0, recipe.grey_share)
+        planes, weights = np.stack(channel_planes(grey, valid, recipe)), (1.0, recipe.grey_share)
         for group, weight in zip(GROUPS, weights, strict=True):
             energy = energy_of(planes[group])
             planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
@@ -42,7 +52,7 @@ class Template:
 
     @property
     def channels(self) -> Array:
-        """The evidence (3, H, W)."""
+        """The channels (3, H, W)."""
         return self.planes[:3]
 
     @property
@@ -67,17 +77,17 @@ class Template:
 
     @cached_property
     def interleaved(self) -> Array:
-        """The evidence as (H, W, 3)."""
+        """The channels as (H, W, 3)."""
         return np.ascontiguousarray(self.values[..., :3])
 
     @cached_property
     def energies(self) -> NDArray[np.float64]:
-        """Sums of squares (G,) of the kinds of evidence."""
+        """Sums of squares (G,) of the kinds of channels."""
         return np.array([energy_of(self.channels[group]) for group in GROUPS])
 
     @cached_property
     def slopes(self) -> Array:
-        """Derivatives of the evidence along x and y (H, W, 8), each of four numbers, the last 0;
+        """Derivatives of the channels along x and y (H, W, 8), each of four numbers, the last 0;
         with the kernel only."""
         return self._derived[0]
 
@@ -104,7 +114,7 @@ class Template:
 
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
-        """Gauss-Newton matrices (G, 4, 4) of the steps, one for each kind of evidence."""
+        """Gauss-Newton matrices (G, 4, 4) of the steps, one for each kind of channel."""
         return np.asarray(self.block_hessians.sum(axis=0))
 
     @cached_property
@@ -199,7 +209,7 @@ def from_middle(height: int, width: int) -> tuple[Array, Array]:
 
 
 def turn_planes(made: Array, turn_rad: float, into: Array, scratch: Array) -> None:
-    """Evidence (H, W, C) as planes `into` (C, H, W), edge directions turned clockwise.
+    """Channels (H, W, C) as planes `into` (C, H, W), edge directions turned clockwise.
 
     `scratch` (2, H, W) is overwritten.
     """
@@ -215,6 +225,25 @@ def energy_of(values: Array) -> float:
     return float(flat @ flat)
 
 
+@dataclass(frozen=True)
+class Levels:
+    """Levels of the map at which a view is searched coarsely, judged, and finished."""
+
+    coarse: int
+    judged: int
+    final: int
+
+    @classmethod
+    def of(cls, view_px: float, levels: int) -> "Levels":
+        """Levels for a view of `view_px` pixels of level 0 across (root of its area)."""
+        judged = max(0, min(round(math.log2(max(view_px, 1.0) / JUDGED_PX)), levels - 1))
+        return cls(min(judged + 1, levels - 1), judged, max(judged - 1, 0))
+
+    def recipe(self, level: int) -> ChannelRecipe:
+        """Parameters of the channels at a level."""
+        return COARSE if level > self.judged else FINE
+
+
 class ViewTemplates:
     """A view's templates at the levels of a map, made when asked for.
 
@@ -224,14 +253,19 @@ class ViewTemplates:
     def __init__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], finest: int) -> None:
         self.finest = finest
         self._pictures = [(grey, valid)]
-        self._made: dict[tuple[int, EvidenceRecipe], Template] = {}
+        self._made: dict[tuple[int, ChannelRecipe], Template] = {}
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """What was seen (H, W), at the finest level."""
         return self._pictures[0][1]
 
-    def at(self, level: int, recipe: EvidenceRecipe = FINE) -> Template:
+    @cached_property
+    def side_px(self) -> float:
+        """Root of the area of the view, in pixels of level 0."""
+        return math.sqrt(self.at(self.finest).pixels) * 2.0**self.finest
+
+    def at(self, level: int, recipe: ChannelRecipe = FINE) -> Template:
         """The template at a level, `finest` or coarser."""
         key = (level, recipe)
         if key not in self._made:

@@ -114,7 +114,7 @@ class WordsEmbedder:
     def view(self, maps: Array, valid: Mask) -> Array:
         """Frequencies of words (k,) in a view's grey levels (1, S, S), as `similarity` says.
 
-        Grey levels are 0..1 as `orthonav.core.tiles.gray` gives them, or 0..255 if one is above 1.
+        Grey levels are 0..1 as `represent.Gray` gives them, or 0..255 if one is above 1.
         A view without features gives zeros. Raises `ValueError` if there is not one channel.
         """
         return self._weighted(self.counts(_levels(maps), valid))

@@ -145,15 +145,3 @@ def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
 def distance(one: Hypothesis, other: Hypothesis) -> float:
     """Metres between the positions of two hypotheses."""
     return math.dist(one.mean[POSITION], other.mean[POSITION])
-
-
-def within(mean: Array, covariance: Array, radius_m: float, middle: Array | None = None) -> float:
-    """Probability that a state lies within a radius of `middle` (2,), its own mean where None.
-
-    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
-    """
-    variance = float(covariance[0, 0] + covariance[1, 1]) / 2
-    away = 0.0 if middle is None else math.dist(mean[POSITION], middle)
-    if away > radius_m + 3 * math.sqrt(variance):
-        return 0.0
-    return 1 - math.exp(-(radius_m**2) / (2 * variance + away**2 + 1e-9))

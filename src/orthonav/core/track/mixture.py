@@ -17,8 +17,8 @@ from functools import partial
 import numpy as np
 
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize.confidence import within
 from orthonav.core.records import CONFIDENT
-from orthonav.core.track.evidence import Measurement, confirmed_ground, recognition, tempered
 from orthonav.core.track.hypotheses import (
     Hypothesis,
     distance,
@@ -26,7 +26,15 @@ from orthonav.core.track.hypotheses import (
     merged,
     moments,
     moved,
-    within,
+)
+from orthonav.core.track.likelihood import (
+    Measurement,
+    confirmed_ground,
+    log_densities,
+    log_density,
+    recognition,
+    tempered,
+    updated,
 )
 from orthonav.core.track.model import (
     POSITION,
@@ -36,9 +44,6 @@ from orthonav.core.track.model import (
     Model,
     ReportedAttitude,
     Sighting,
-    log_densities,
-    log_density,
-    updated,
 )
 from orthonav.core.track.motion import (
     CameraDisplacement,
@@ -196,10 +201,7 @@ class Mixture:
         self.elsewhere /= self.area_m2
         made += self._born_at(mean_en_m, std_m, START_SHARE * self.elsewhere)
         self.elsewhere *= 1 - START_SHARE
-        self.hypotheses = made
-        self._settle()
-        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
-        self._settle()
+        self._merge(made)
 
     def predict(
         self,
@@ -289,36 +291,35 @@ class Mixture:
         that, a view does not count towards a confirmed track.
         """
         ground = newness if new_ground is None else new_ground
-        made = []
-        missed = self.model.miss**newness
-        missed_again = self.model.miss ** (newness * BLIND**self._blind)
+        starts = [
+            replace(each, uncounted=min(each.uncounted + ground, 1.0)) for each in self.hypotheses
+        ]
+        made = [self._missed(each, newness, ground, searched) for each in starts]
+        split = [one for each in starts for one in self._with_bias_jump(each)]
         found = (1 - self.model.miss) ** newness
         searched_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
         mounts = [(share, covariance) for share, _, covariance in self._mounts()]
-        measurements = [
-            tempered(self.model, mounts, (self.area_m2, searched_m2), reported, each, newness)
-            for each in sightings
-        ]
-        starts = []
-        for each in self.hypotheses:
-            in_search = self._on_map(each.mean)
-            if searched is not None:
-                in_search &= math.dist(each.mean[:2], searched[0]) < searched[1]
-            miss = missed_again if each.followed else missed
-            share = each.share * (miss if in_search else 1.0)
-            each = replace(each, uncounted=min(each.uncounted + ground, 1.0))
-            made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
-            starts += self._with_bias_jump(each)
-        for seen in measurements:
-            made += self._updated(starts, seen, found, ground, confirms)
+        for each in sightings:
+            areas_m2 = self.area_m2, searched_m2
+            seen = tempered(self.model, mounts, areas_m2, reported, each, newness)
+            made += self._updated(split, seen, found, ground, confirms)
             made += self._born(seen, confirms)
-        self.hypotheses = made
-        self._settle()
-        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
-        self._settle()
+        self._merge(made)
         shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
         confirmed = self._state is not State.SEARCHING
         self._blind = self._blind + newness if confirmed and not shown else 0.0
+
+    def _missed(
+        self, each: Hypothesis, newness: float, ground: float, searched: tuple[Array, float] | None
+    ) -> Hypothesis:
+        """A hypothesis for which the view was taken at none of the places found; see `update`."""
+        in_search = self._on_map(each.mean)
+        if searched is not None:
+            in_search &= math.dist(each.mean[:2], searched[0]) < searched[1]
+        share = each.share
+        if in_search:
+            share *= self.model.miss ** (newness * (BLIND**self._blind if each.followed else 1.0))
+        return replace(each, share=share, sighted=_forgotten(each.sighted, ground))
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
         """The best cluster, None where there is no hypothesis.
@@ -537,8 +538,15 @@ class Mixture:
             recognized=0.0,
         )
 
-    def _settle(self) -> None:
-        """Normalize: shares and the belief elsewhere add up to one."""
+    def _merge(self, made: list[Hypothesis]) -> None:
+        """Take new hypotheses in place of the present ones, similar ones merged."""
+        self.hypotheses = made
+        self._normalize()
+        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
+        self._normalize()
+
+    def _normalize(self) -> None:
+        """Shares and the belief elsewhere add up to one."""
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from orthonav.core.track.likelihood import log_density
 from orthonav.core.track.model import (
     HEADING,
     HORIZON,
@@ -15,7 +16,6 @@ from orthonav.core.track.model import (
     VELOCITY,
     Array,
     Model,
-    log_density,
 )
 
 VELOCITY_JITTER = 0.3

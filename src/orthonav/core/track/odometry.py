@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import axis_on_ground_en_m
-from orthonav.core.localize.checks import check_footprint
+from orthonav.core.localize.place import Placer
 from orthonav.core.localize.rectify import downsampled, rectify_footprint
+from orthonav.core.localize.view import check_footprint
 from orthonav.core.records import Telemetry, View
-from orthonav.core.register.evidence import FINE, EvidenceRecipe
-from orthonav.core.register.pose import Pose
-from orthonav.core.register.reference import Reference
-from orthonav.core.register.refine import Placed
-from orthonav.core.register.registrar import Levels, PosePrior, Registrar
-from orthonav.core.register.search import bank, largest_half_px, search
-from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.channels import FINE, ChannelRecipe
+from orthonav.core.register.pose import Pose, PosePrior
+from orthonav.core.register.refine import Fit
+from orthonav.core.register.search import SearchWindows, bank, largest_half_px, search
+from orthonav.core.register.template import Levels, ViewTemplates
+from orthonav.core.register.window import Reference
 from orthonav.core.track import CameraDisplacement
 
 VIEW_PX = 160
@@ -27,7 +27,7 @@ LEVELS = 3
 """Levels of a view that serves as the map of the next one."""
 TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
 """Spacing of headings and log scales in the search, which is refined from a coarse level: about
-that of `plan.SearchPlan`."""
+that of `policy.SearchPolicy`."""
 MAX_SPEED_MPS = 80.0
 """Largest speed over ground for which a displacement is sought."""
 MIN_SCORE_RATIO = 2.5
@@ -112,7 +112,7 @@ class _ViewAsMap(Reference):
         """All levels are small."""
         return True
 
-    def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> NDArray[np.float32]:
+    def whole(self, level: int, recipe: ChannelRecipe = FINE) -> NDArray[np.float32]:
         """Evidence (H, W, 4) of a level."""
         return self._templates.at(level, recipe).values
 
@@ -121,13 +121,12 @@ class _ViewAsMap(Reference):
 class OdometryView:
     """A view rectified for odometry, heading up.
 
-    `registrar`: registers the next view on this one. `templates`: the rectified view, of `pixel_m`
-    metres a pixel. `camera_px` (2,): the camera seen from its middle, x to the right and y down.
-    `telemetry`: that of the view, corrected by `bias` (4,) of heading (rad), log scale, pitch and
-    roll (rad). `view`: what it was made of, averaged towards `pixel_m`.
+    `templates`: the rectified view, of `pixel_m` metres a pixel. `camera_px` (2,): the camera seen
+    from its middle, x to the right and y down. `telemetry`: that of the view, corrected by `bias`
+    (4,) of heading (rad), log scale, pitch and roll (rad). `view`: what it was made of, averaged
+    towards `pixel_m`.
     """
 
-    registrar: Registrar
     templates: ViewTemplates
     pixel_m: float
     camera_px: Array
@@ -177,7 +176,6 @@ class OdometryView:
         camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
         templates = ViewTemplates(made.grey, made.valid, 0)
         return cls(
-            registrar=Registrar(_ViewAsMap(templates)),
             templates=templates,
             pixel_m=pixel_m,
             camera_px=camera_px,
@@ -265,6 +263,9 @@ class Terrain:
     rise: float
 
 
+LEVEL = Terrain(np.zeros(2), np.zeros(2), 0.0)
+
+
 def over_terrain(
     measured: ViewDisplacement,
     agl_m: tuple[float, float],
@@ -274,54 +275,53 @@ def over_terrain(
     """A displacement over ground that is not level.
 
     `agl_m`: heights reported with both views. `terrain`: None where it is unknown. `ahead_en_m`
-    (2,): middle of a view, from the camera. Level ground is assumed by the
-    measurement: by parallax, a slope along the way looks like a change of scale, one across it like
-    a turn, each by half, about the middle of the views. They displace the camera, which is not
-    there. The displacement is seen at the distance of the ground there, and the height above the
-    ground below changes by what this rises (docs/decisions/terrain.md).
+    (2,): middle of a view, from the camera.
+
+    The measurement assumes level ground. A slope along the displacement looks like a change of
+    scale, one across it like a turn, each by half, about the middle of the views: this parallax
+    displaces the camera, which is not there. The displacement is seen at the distance of the ground
+    there, and the height above the ground below changes by what this rises
+    (docs/decisions/terrain.md).
     """
-    seen = measured.displacement
-    moved_en_m, near, below = seen.moved_en_m, 1.0, 0.0
-    along, across = 0.0, 0.0
-    unknown = UNKNOWN_SLOPE
-    if terrain is not None:
-        near = max(1 - terrain.rise, LEAST_SCALED)
-        steep = max(1 + float(terrain.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
-        share_en = moved_en_m / (agl_m[0] * steep)
-        along = float(share_en @ terrain.seen) / 2
-        across = float(share_en[1] * terrain.seen[0] - share_en[0] * terrain.seen[1]) / 2
-        parallax = np.array([[along, -across], [across, along]])
-        moved_en_m = near * (moved_en_m + parallax @ ahead_en_m)
-        below = float(moved_en_m @ terrain.below) / agl_m[0]
-        unknown *= LEFT_OF_SLOPE
-    unknown *= float(np.hypot(*moved_en_m)) / agl_m[0]
-    aside_m = float(np.hypot(*ahead_en_m)) * unknown / 2
+    seen, ground = measured.displacement, terrain or LEVEL
+    steep = max(1 + float(ground.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
+    share_en = seen.moved_en_m / (agl_m[0] * steep)
+    scale = float(share_en @ ground.seen) / 2
+    turn = float(share_en[1] * ground.seen[0] - share_en[0] * ground.seen[1]) / 2
+    parallax = np.array([[scale, -turn], [turn, scale]])
+    distance = max(1 - ground.rise, LEAST_SCALED)  # over the height, as on level ground
+    moved_en_m = distance * (seen.moved_en_m + parallax @ ahead_en_m)
+    # What remains of the slope: all of a usual one where it is unknown.
+    slope = UNKNOWN_SLOPE * (1.0 if terrain is None else LEFT_OF_SLOPE)
+    slope *= float(np.hypot(*moved_en_m)) / agl_m[0]
+    aside_m = float(np.hypot(*ahead_en_m)) * slope / 2
     reported = math.log(agl_m[1] / agl_m[0])
-    left = near * (math.exp(seen.scaled + reported) - along) + 1 - near - below
+    seen_height = distance * (math.exp(seen.scaled + reported) - scale)
+    risen = float(moved_en_m @ ground.below) / agl_m[0]
+    height = seen_height + (1 - distance) - risen  # of the later view, over that of the earlier one
     over = replace(
         seen,
         moved_en_m=moved_en_m,
         covariance=seen.covariance + np.eye(2) * aside_m**2,
-        turned_rad=seen.turned_rad + across,
-        turned_std_rad=math.hypot(seen.turned_std_rad, unknown / 2),
-        scaled=math.log(max(left, LEAST_SCALED)) - reported,
-        scaled_std=math.hypot(seen.scaled_std, 1.5 * unknown),
+        turned_rad=seen.turned_rad + turn,
+        turned_std_rad=math.hypot(seen.turned_std_rad, slope / 2),
+        scaled=math.log(max(height, LEAST_SCALED)) - reported,
+        scaled_std=math.hypot(seen.scaled_std, 1.5 * slope),
     )
     return replace(measured, displacement=over)
 
 
 def _registered(
     before: OdometryView, now: OdometryView, prior: PosePrior, expected_en_m: Array | None
-) -> Placed | None:
+) -> Fit | None:
     """The later view registered on the earlier one; None where no place stands out."""
-    templates = now.templates
+    templates, reference = now.templates, _ViewAsMap(before.templates)
     side_px = math.sqrt(float(templates.valid.sum()))
-    levels = Levels.of(side_px, LEVELS)
+    placer = Placer(templates, Levels.of(side_px, LEVELS), prior, reference)
     if expected_en_m is not None:
-        placed = _as_expected(before, now, templates, levels, prior, expected_en_m)
-        if placed.weighted >= EXPECTED_CORRELATION:
-            return placed
-    reach = _reach_px(before, now)
+        fit = _as_expected(before, now, placer, expected_en_m)
+        if fit.weighted >= EXPECTED_CORRELATION:
+            return fit
     tried = bank(
         prior.turn_std_rad,
         prior.log_scale_std,
@@ -329,45 +329,32 @@ def _registered(
         scale_step=SCALE_STEP,
         sigmas=2.5,
     )
-    poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried.poses]
-    level = levels.coarse
-    recipe = levels.recipe(level)
-    registrar = before.registrar
+    poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried]
+    level = placer.levels.coarse
+    recipe = placer.levels.recipe(level)
     template = templates.at(level, recipe)
-    window = registrar.part_window(
-        level,
-        recipe,
-        side_px,
-        before.middle_px,
-        reach + 2.0 * 2**level,
-        largest_half_px(template, poses),
-    )
-    candidates = search(template, window, poses, CANDIDATES)
-    if not candidates:
+    reach_px, half_px = _reach_px(before, now) + 2.0 * 2**level, largest_half_px(template, poses)
+    windows = SearchWindows(reference)
+    window = windows.part(level, recipe, side_px, before.middle_px, reach_px, half_px)
+    found = [each.pose for each in search(template, window, poses, CANDIDATES)]
+    if not found:
         return None
-    judged = registrar.judged(templates, levels, candidates, level, prior)
-    found = registrar.finished(templates, levels, judged, prior, len(candidates))
-    return found.placed if found.peak_ratio >= MIN_SCORE_RATIO else None
+    best = placer.finished(placer.judge(found, level), len(found))
+    return best.fit if best.scores["peak_ratio"] >= MIN_SCORE_RATIO else None
 
 
 def _as_expected(
-    before: OdometryView,
-    now: OdometryView,
-    templates: ViewTemplates,
-    levels: Levels,
-    prior: PosePrior,
-    expected_en_m: Array,
-) -> Placed:
+    before: OdometryView, now: OdometryView, placer: Placer, expected_en_m: Array
+) -> Fit:
     """The later view refined from its expected place, from coarse to fine."""
-    turned = Pose(0.0, 0.0, prior.turn_rad or 0.0, 0.0)
+    turned = Pose(0.0, 0.0, placer.prior.turn_rad or 0.0, 0.0)
     moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
     pose = replace(turned, x_px=float(x), y_px=float(y))
-    for level in range(levels.look, levels.final - 1, -1):
-        refiner = before.registrar.refiner(templates, levels, level)
-        placed = refiner.place(pose, EXPECTED_STEPS, SMALL_STEP_PX)
-        pose = placed.pose
-    return placed
+    for level in range(placer.levels.judged, placer.levels.final - 1, -1):
+        fit = placer.refiner(level).place(pose, EXPECTED_STEPS, SMALL_STEP_PX)
+        pose = fit.pose
+    return fit
 
 
 def _reach_px(before: OdometryView, now: OdometryView) -> float:

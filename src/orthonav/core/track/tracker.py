@@ -8,7 +8,7 @@ on each other too, which is odometry by the camera (`odometry`).
 import math
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,15 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize.camera import CameraFound
-from orthonav.core.localize.checks import check_view
+from orthonav.core.localize.confidence import within
+from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.places import places_of
-from orthonav.core.localize.prepared import PreparedView
-from orthonav.core.localize.registration import RegisteredView
-from orthonav.core.localize.relief import Relief
+from orthonav.core.localize.place import Place
+from orthonav.core.localize.search import Search
+from orthonav.core.localize.view import PreparedView, check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.refine import Placed
-from orthonav.core.register.registrar import Registered
 from orthonav.core.track import (
     CameraDisplacement,
     Estimate,
@@ -38,7 +36,7 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
-from orthonav.core.track.hypotheses import within
+from orthonav.core.track.likelihood import places_of
 from orthonav.core.track.model import (
     BIASES,
     HEADING,
@@ -98,6 +96,22 @@ SIGHT_STEPS = 4
 """Steps along the line of sight to the ground that a view shows. Each leaves a share of the error:
 the slope of the ground over that of the line."""
 Array = NDArray[np.float64]
+
+
+class SearchArea(NamedTuple):
+    """The part of the map that is searched: a `circle` (middle (2,), radius in metres), None for
+    all of it; and whether a place found there `confirms` the track."""
+
+    circle: tuple[Array, float] | None
+    confirms: bool
+
+    @property
+    def area_m2(self) -> float:
+        """Its area, infinite for all of the map."""
+        return math.inf if self.circle is None else math.pi * self.circle[1] ** 2
+
+
+WHOLE_MAP = SearchArea(None, True)
 
 
 class Tracker:
@@ -461,7 +475,10 @@ class Tracker:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
-        prior, searched, confirms = self._search_area(expected)
+        if expected is not None and expected.followed and self._must_compete(expected):
+            self._whole_map = not self._whole_map  # the whole map and the surroundings by turns
+        searched = self._search_area(expected, whole_map=self._whole_map)
+        prior = self._prior(searched)
         bias, spread = self._correction(telemetry, expected, prior)
         known = _known(corrected_by(telemetry, bias), spread)
         if prior is not None and expected is not None and telemetry.below is not None:
@@ -471,21 +488,23 @@ class Tracker:
             camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
             telemetry=known,
         )
-        seen = self._registration.register(corrected, prior, self._heading_known)
-        if isinstance(seen, NoFix):
-            return seen
+        search = self._registration.search(corrected, prior, self._heading_known)
+        if isinstance(search, NoFix):
+            return search
         sightings, newness = [], max(1 - overlap, LEAST_NEW)
-        if not isinstance(seen.found, NoFix):
-            area = math.inf if searched is None else math.pi * searched[1] ** 2
-            share = min(area / self.mixture.area_m2, 1.0)
-            sightings = self._sightings(seen, seen.found, known, bias[1], share)
+        best = search.run()
+        if not isinstance(best, NoFix):
+            share = min(searched.area_m2 / self.mixture.area_m2, 1.0)
+            sightings = self._sightings(search, best, known, bias[1], share)
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
         )
         self._seen = sightings
-        self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
+        self.mixture.update(
+            attitude, sightings, newness, searched.circle, ground, confirms=searched.confirms
+        )
         return None
 
     def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
@@ -520,39 +539,36 @@ class Tracker:
             return expected.belief < LOCAL_SHARE
         return not (expected.state.is_followed and expected.confirmed)
 
-    def _search_area(
-        self, expected: Estimate | None
-    ) -> tuple[Prior | None, tuple[Array, float] | None, bool]:
-        """The part of the map to search, as a prior and as a circle (middle, radius), None for all,
-        and whether a place found there may confirm the track.
-
-        It is the surroundings of the predicted position where that is nearly certain. Where these
-        have to compete with the whole map, views are searched there and here by turns.
-        """
-        whole_map = None, None, True
+    def _search_area(self, expected: Estimate | None, *, whole_map: bool) -> SearchArea:
+        """The part of the map to search: the surroundings of the predicted position where that is
+        nearly certain, else all of it. `whole_map`: what to search where places there have to
+        compete with the whole map."""
         if expected is None or not expected.followed:
-            return whole_map  # an unconfirmed place must compete with the whole map
+            return WHOLE_MAP  # an unconfirmed place must compete with the whole map
         competes = self._must_compete(expected)
-        if competes:
-            self._whole_map = not self._whole_map
-            if self._whole_map:
-                return whole_map
-        elif expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE:
-            return whole_map
+        is_lost = expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE
+        if whole_map if competes else is_lost:
+            return WHOLE_MAP
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
-        reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
-        if 4 * reach**2 > self.mixture.area_m2 / 4:
-            return whole_map
-        lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
-        prior = Prior(float(lat), float(lon), reach / PRIOR_SIGMAS)
+        reach_m = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
+        if 4 * reach_m**2 > self.mixture.area_m2 / 4:
+            return WHOLE_MAP
         # Dead reckoning from a confirmed place that is still exact is as good as tracking.
-        exact = expected.state is not State.SEARCHING and reach <= MIN_LOCAL_M
-        return prior, (expected.mean[:2], reach), exact or not competes
+        exact = expected.state is not State.SEARCHING and reach_m <= MIN_LOCAL_M
+        return SearchArea((expected.mean[:2], reach_m), exact or not competes)
+
+    def _prior(self, area: SearchArea) -> Prior | None:
+        """An area as the prior of a search."""
+        if area.circle is None:
+            return None
+        middle, reach_m = area.circle
+        lat, lon = self._localizer.sheet.frame.latlon_from_en(middle)
+        return Prior(float(lat), float(lon), reach_m / PRIOR_SIGMAS)
 
     def _sightings(
         self,
-        seen: RegisteredView,
-        found: Registered,
+        search: Search,
+        best: Place,
         telemetry: Telemetry,
         log_scale: float,
         searched_share: float,
@@ -562,16 +578,16 @@ class Tracker:
         `telemetry`: corrected by the track; `log_scale`: what its height was corrected by.
         `searched_share`: share of the map that was searched.
         """
-        near_px = NEAR_SHARE * seen.prepared.side_px
-        places = places_of(found, self._confidence, near_px, searched_share)
+        near_px = NEAR_SHARE * search.view.side_px
+        places = places_of(best, self._confidence, near_px, searched_share)
         made = []
-        for log_odds, alone, placed in places:
+        for log_odds, alone, place in places:
             likely = log_odds > places[0][0] - LIKELY_NATS
-            camera = seen.camera(placed) if likely else None
+            camera = search.camera(place) if likely else None
             if camera is None:
-                mean, covariance = self._by_similarity(seen.prepared, placed, telemetry)
+                mean, covariance = self._by_similarity(search, place, telemetry)
             else:
-                mean, covariance = self._by_camera(seen.prepared, camera, telemetry)
+                mean, covariance = self._by_camera(search.view, camera, telemetry)
             mean[3] += log_scale
             if np.isfinite(covariance).all():
                 made.append(Sighting(mean, covariance, log_odds, alone))
@@ -594,20 +610,18 @@ class Tracker:
         return np.array([east, north, heading, scale, pitch, roll]), covariance
 
     def _by_similarity(
-        self, prepared: PreparedView, placed: Placed, telemetry: Telemetry
+        self, search: Search, place: Place, telemetry: Telemetry
     ) -> tuple[Array, Array]:
         """The same of a view that does not show its tilt."""
-        if placed.covariance is None:
-            again = self._registration.registrar.with_covariance(
-                prepared.templates, prepared.levels, placed
-            )
-            placed = replace(again, pose=placed.pose)
+        registration, pose, spread = self._registration, place.pose, place.fit.covariance
+        if spread is None:
+            spread = search.placer.covariance_at(pose)
         tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-        mean = np.concatenate([self._registration.seen_from(prepared, placed.pose), tilt_rad])
-        heading_deg = math.degrees(placed.pose.turn_rad)
+        mean = np.concatenate([registration.seen_from(search.view, pose), tilt_rad])
+        heading_deg = math.degrees(pose.turn_rad)
         lever = tilt_lever_m(replace(telemetry, yaw_deg=heading_deg))
         covariance = np.zeros((6, 6))
-        covariance[:4, :4] = self._registration.covariance(prepared, placed)
+        covariance[:4, :4] = registration.camera_covariance(search.view, pose, spread)
         covariance[:2, :2] += UNSEEN_TILT_RAD**2 * lever @ lever.T
         covariance[:2, 4:] = -(UNSEEN_TILT_RAD**2) * lever
         covariance[4:, :2] = covariance[:2, 4:].T

@@ -1,16 +1,20 @@
-"""Building the index of an atlas: its coarse tiles as vectors, in shards.
+"""The index of an atlas: its coarse tiles as vectors, in shards, and the manifest of its files.
 
 Whitening and quantizers are learnt once, from tiles evenly spaced over all sheets, and shared by
 all shards. New sheets become a new shard and the rows of changed or removed sheets are retired;
-after many changes the whole index is rebuilt.
+after many changes the whole index is rebuilt. The manifest is written last: an atlas without it has
+no index. It may come from an untrusted source, so every value is checked when it is read.
 """
 
 import hashlib
+import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
+from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,27 +25,107 @@ from orthonav.core.files import Progress, no_progress
 from orthonav.core.tiles.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.coarse import POOLING, read_coarse, tile_count
-from orthonav.ground.atlas.index_manifest import (
-    FOLDER,
-    FORMAT,
-    MANIFEST,
-    IndexManifest,
-    Part,
-    ShardInfo,
-    indexed_sheets,
-    read_manifest,
-    stale_sheets,
-)
-from orthonav.ground.atlas.index_shards import write_shard
-from orthonav.ground.atlas.item import Sheet, StoredFile
-from orthonav.ground.atlas.quantizers import (
+from orthonav.ground.atlas.item import Sheet, StoredFile, canonical, parsed, reason
+from orthonav.ground.atlas.store import digest_of
+from orthonav.ground.atlas.vectors import (
     MAX_TRAINING_VECTORS,
     QUANTIZERS_NAME,
+    Part,
     Quantizers,
+    ShardInfo,
     VectorRecipe,
     train,
+    write_shard,
 )
-from orthonav.ground.atlas.store import digest_of
+
+FOLDER = "index"
+MANIFEST = f"{FOLDER}/index.json"
+FORMAT = "orthonav-index"
+SCHEMA = 2
+"""2: shards have no manifests of their own."""
+MAX_ROWS = 10**6
+"""Rows of a sheet: as many as it may have coarse tiles (`orthonav.ground.atlas.coarse`)."""
+_NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
+
+
+@dataclass(frozen=True)
+class IndexManifest:
+    """What an index consists of; `files` has all its files by their names in the folder."""
+
+    recipe: VectorRecipe
+    shards: tuple[ShardInfo, ...]
+    files: Mapping[str, StoredFile]
+
+    @property
+    def sheets(self) -> dict[str, str]:
+        """SHA-256 of the coarse tiles of each indexed sheet."""
+        return {
+            part.sheet: part.sha256
+            for shard in self.shards
+            for part in shard.parts
+            if not part.retired
+        }
+
+    def to_json(self) -> bytes:
+        """Canonical JSON."""
+        return canonical({"format": FORMAT, "schema": SCHEMA, **asdict(self)}) + b"\n"
+
+    @classmethod
+    def from_json(cls, data: bytes) -> "IndexManifest":
+        """Inverse of `to_json`; raises `AtlasError` unless writing it again gives `data`."""
+        try:
+            plain: Any = parsed(data, MANIFEST)
+            if (plain["format"], plain["schema"]) != (FORMAT, SCHEMA):
+                raise ValueError(
+                    f"format {plain['format']!r:.40}, schema {plain['schema']!r:.20}, expected "
+                    f"schema {SCHEMA}; rebuild it with 'orthonav atlas index'"
+                )
+            shards = tuple(map(_shard, plain["shards"]))
+            files = {name: StoredFile(**file) for name, file in plain["files"].items()}
+            made = cls(VectorRecipe(**plain["recipe"]), shards, files)
+            possible = (
+                all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
+                and all(file.name == f"{FOLDER}/{name}" for name, file in files.items())
+                and all(0 <= part.rows <= MAX_ROWS for shard in shards for part in shard.parts)
+                and list(accumulate((shard.rows for shard in shards), initial=0))[:-1]
+                == [shard.base for shard in shards]
+                and made.to_json() == data
+            )
+            if not possible:
+                raise ValueError("damaged or altered")
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise AtlasError(f"index of the atlas cannot be read ({reason(error)})") from error
+        return made
+
+
+def _shard(plain: Any) -> ShardInfo:
+    """A shard; values of another type are converted, and differ when they are written again."""
+    parts = tuple(
+        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"]), bool(part["retired"]))
+        for part in plain["parts"]
+    )
+    return ShardInfo(str(plain["name"]), int(plain["base"]), parts)
+
+
+def read_manifest(atlas: Atlas) -> IndexManifest | None:
+    """The manifest of the index of an atlas, None where it has no index. Raises `AtlasError`."""
+    if atlas.store.size(MANIFEST) is None:
+        return None
+    return IndexManifest.from_json(atlas.store.read(MANIFEST))
+
+
+def indexed_sheets(atlas: Atlas) -> dict[str, Sheet]:
+    """The sheets of an atlas that have coarse tiles, by name."""
+    return {name: each for name, each in atlas.sheets().items() if "coarse" in each.files}
+
+
+def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list[str]]:
+    """Names of the sheets that are new or changed since indexing, and of those that are gone."""
+    there = {name: each.files["coarse"].sha256 for name, each in indexed_sheets(atlas).items()}
+    known = manifest.sheets
+    new = [name for name, sha256 in there.items() if known.get(name) != sha256]
+    return new, [name for name in known if name not in there]
+
 
 WHITENING_NAME = "whitening.safetensors"
 MAX_TRAINING_TILES = 40_000

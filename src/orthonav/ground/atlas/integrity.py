@@ -1,51 +1,47 @@
 """Checking an atlas: missing, incomplete, damaged or leftover files, and other recipes."""
 
+import math
 import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.mapfile import Manifest, open_map
-from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
 from orthonav.ground.atlas.coarse import read_coarse
-from orthonav.ground.atlas.index_manifest import FOLDER as INDEX
-from orthonav.ground.atlas.index_manifest import MANIFEST, read_manifest, stale_sheets
-from orthonav.ground.atlas.item import FILES, Sheet, StoredFile, sheet_of_file, split_name
-from orthonav.ground.atlas.item_files import (
+from orthonav.ground.atlas.index import FOLDER as INDEX
+from orthonav.ground.atlas.index import MANIFEST, read_manifest, stale_sheets
+from orthonav.ground.atlas.item import (
+    FILES,
     ITEMS,
     MAX_SNAPSHOT_BYTES,
     SNAPSHOT,
+    Sheet,
+    StoredFile,
     read_items,
+    sheet_of_file,
     snapshot_of,
+    split_name,
 )
-from orthonav.ground.atlas.recipe import AtlasRecipe
 from orthonav.ground.atlas.store import Store, digest_of
-from orthonav.ground.build.methods import usual_edges
+from orthonav.ground.build.encoders import usual_edges
 
 MIN_AGE_S = 24 * 3600.0
 """Younger files may belong to a running build, which writes the files of a sheet before its item:
 no sheet takes a day."""
 _TEMPORARY = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
-_FOLDERS = [folder for folder, _, _ in FILES.values()]
 _SUFFIXES = {folder: suffix for folder, suffix, _ in FILES.values()}
-_CLOSE = 1e-6
-"""Relative difference of numbers of manifest and recipe that is rounding."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One problem of an atlas.
-
-    `kind`: two words, such as `missing file`.
-    `name`: the file.
-    `detail`: cause or remedy.
-    `removed`: whether the problem was removed.
-    """
+    """A problem of an atlas: its kind (such as `missing file`), the file, cause or remedy, and
+    whether it was removed."""
 
     kind: str
     name: str
@@ -68,68 +64,62 @@ def check_atlas(
     replaced revisions) and rewrites a stale snapshot; nothing else is changed. Raises
     `StorageError` where the storage fails.
     """
-    items, broken = read_items(atlas.store)
-    files = _files(atlas.store)
+    store, clean_s = atlas.store, min_age_s if clean else None
+    items, broken = read_items(store)
+    files = _files(store)
     problems = [Problem("damaged item", f"{ITEMS}/{name}", why) for name, why in broken.items()]
-    current = _current(items)
     not_whole = {found[0] for found in map(split_name, broken) if found}
+    current = _current(items)
     for number, (name, sheet) in enumerate(sorted(current.items())):
         progress("check", number / len(current))
         found = list(_sheet_problems(atlas, name, sheet, files, deep))
         problems += found
         not_whole |= {sheet.id for _ in found}
-    cleaner = _Cleaner(atlas.store, min_age_s if clean else None)
     older = {name: sheet for name, sheet in items.items() if name not in current}
     for name, sheet in older.items():
         detail = f"revision {sheet.revision} of {sheet.id} was replaced and not removed"
-        whole = sheet.id not in not_whole  # else the old revision is all that there is
-        problems.append(cleaner.leftover(f"{ITEMS}/{name}", "second revision", detail, whole))
+        # Where the sheet is not whole, the old revision is all that there is.
+        age_s = None if sheet.id in not_whole else clean_s
+        problems.append(_leftover(store, f"{ITEMS}/{name}", "second revision", detail, age_s))
     if clean and older:
-        items, files = read_items(atlas.store)[0], _files(atlas.store)
-    for name in _orphans(atlas.store, files, items, not_whole):
-        problems.append(cleaner.leftover(name, "orphan", "no item names it"))
-    for folder in ("", ITEMS, *_FOLDERS, INDEX):
-        for file in filter(_TEMPORARY.fullmatch, atlas.store.names(folder)):
+        items, files = read_items(store)[0], _files(store)
+    for name in _orphans(store, files, items, not_whole):
+        problems.append(_leftover(store, name, "orphan", "no item names it", clean_s))
+    for folder in ("", ITEMS, *_SUFFIXES, INDEX):
+        for file in filter(_TEMPORARY.fullmatch, store.names(folder)):
             name = f"{folder}/{file}" if folder else file
-            problems.append(cleaner.leftover(name, "leftover", "incomplete file"))
+            problems.append(_leftover(store, name, "leftover", "incomplete file", clean_s))
     if not broken:
-        problems += cleaner.snapshot(_current(items).values())
+        problems += _snapshot_problems(store, _current(items).values(), clean)
     if not any(each.kind == "damaged item" for each in problems):
         atlas.sheets(refresh=True)
         problems += _index_problems(atlas, deep)
     return sorted(problems, key=lambda each: (each.name, each.kind))
 
 
-class _Cleaner:
-    """Reports leftovers, and removes them if requested."""
+def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float | None) -> Problem:
+    """A file that is left over; removed where it has that age, None never."""
+    if min_age_s is None:
+        return Problem(kind, name, detail)
+    age_s = store.age_s(name)
+    if (age_s is None and min_age_s > 0) or (age_s or 0) < min_age_s:
+        return Problem(kind, name, f"{detail}; too young to be removed")
+    store.remove(name)
+    return Problem(kind, name, detail, removed=True)
 
-    def __init__(self, store: Store, min_age_s: float | None) -> None:
-        self._store = store
-        self._min_age_s = min_age_s
 
-    def leftover(self, name: str, kind: str, detail: str, removable: bool = True) -> Problem:
-        """The problem; the file is removed if that was requested and it is old enough."""
-        problem = Problem(kind, name, detail)
-        if self._min_age_s is None or not removable:
-            return problem
-        age_s = self._store.age_s(name)
-        if (age_s is None and self._min_age_s > 0) or (age_s or 0) < self._min_age_s:
-            return replace(problem, detail=f"{detail}; too young to be removed")
-        self._store.remove(name)
-        return replace(problem, removed=True)
-
-    def snapshot(self, sheets: Iterable[Sheet]) -> list[Problem]:
-        """A snapshot that does not show these sheets; rewritten if that was requested."""
-        expected = snapshot_of(sorted(sheets, key=lambda sheet: sheet.id))
-        size = self._store.size(SNAPSHOT)
-        if size is None or (
-            size == len(expected) and self._store.read(SNAPSHOT, MAX_SNAPSHOT_BYTES) == expected
-        ):
-            return []
-        if self._min_age_s is not None:
-            self._store.write(SNAPSHOT, expected)
-        detail = "does not show the present sheets; the atlas opens more slowly"
-        return [Problem("stale snapshot", SNAPSHOT, detail, removed=self._min_age_s is not None)]
+def _snapshot_problems(store: Store, sheets: Iterable[Sheet], clean: bool) -> Iterator[Problem]:
+    """A snapshot that does not show these sheets; rewritten with `clean`."""
+    expected = snapshot_of(sorted(sheets, key=lambda sheet: sheet.id))
+    size = store.size(SNAPSHOT)
+    if size is None or (
+        size == len(expected) and store.read(SNAPSHOT, MAX_SNAPSHOT_BYTES) == expected
+    ):
+        return
+    if clean:
+        store.write(SNAPSHOT, expected)
+    detail = "does not show the present sheets; the atlas opens more slowly"
+    yield Problem("stale snapshot", SNAPSHOT, detail, removed=clean)
 
 
 def _current(items: Mapping[str, Sheet]) -> dict[str, Sheet]:
@@ -141,7 +131,7 @@ def _current(items: Mapping[str, Sheet]) -> dict[str, Sheet]:
 def _files(store: Store) -> dict[str, int]:
     return {
         f"{folder}/{name}": size
-        for folder in _FOLDERS
+        for folder in _SUFFIXES
         for name, size in store.names(folder).items()
     }
 
@@ -151,20 +141,21 @@ def _orphans(
 ) -> list[str]:
     """Files of sheets that no item names, except those of sheets with an unreadable item."""
 
-    def orphans(items: Iterable[Sheet]) -> list[str]:
-        named = {file.name for sheet in items for file in sheet.files.values()}
-        return [name for name in files if _is_sheet_file(name) and name not in named]
+    def unnamed(items: Mapping[str, Sheet]) -> list[str]:
+        named = {file.name for sheet in items.values() for file in sheet.files.values()}
+        return [
+            name
+            for name in files
+            if name not in named
+            and sheet_of_file(name) is not None
+            and name.endswith(_SUFFIXES[name.partition("/")[0]])
+        ]
 
-    if not orphans(items.values()):
+    if not unnamed(items):
         return []
     now, broken = read_items(store)  # a sheet may have been finished since
-    unread = {found[0] for found in map(split_name, broken) if found}
-    return [name for name in orphans(now.values()) if sheet_of_file(name) not in unread | not_whole]
-
-
-def _is_sheet_file(name: str) -> bool:
-    folder = name.partition("/")[0]
-    return sheet_of_file(name) is not None and name.endswith(_SUFFIXES[folder])
+    kept = not_whole | {found[0] for found in map(split_name, broken) if found}
+    return [name for name in unnamed(now) if sheet_of_file(name) not in kept]
 
 
 def _sheet_problems(
@@ -174,12 +165,12 @@ def _sheet_problems(
         atlas.require_place(sheet)
     except AtlasError as error:
         yield Problem("damaged item", f"{ITEMS}/{name}", str(error))
-    remedy = f"build sheet {sheet.id} again"
     for key, file in sheet.files.items():
         size = files.get(file.name, atlas.store.size(file.name))
         if size is None and atlas.store.size(f"{ITEMS}/{name}") is None:
             return  # replaced or retired during the check
-        content = partial(_content_problems, atlas.recipe, sheet, key, file.name)
+        content = partial(_content_problem, atlas.recipe, sheet, key, file.name)
+        remedy = f"build sheet {sheet.id} again"
         yield from _file_problems(atlas.store, file, size, deep, remedy, content)
 
 
@@ -189,11 +180,11 @@ def _file_problems(
     size: int | None,
     deep: bool,
     remedy: str,
-    content: Callable[[Path], Iterable[Problem]] = lambda path: (),
+    content: Callable[[Path], Problem | None] = lambda path: None,
 ) -> Iterator[Problem]:
-    """Problems of a file that is `size` bytes long, None where it is missing.
+    """The problem of a file that is `size` bytes long, None where it is missing.
 
-    `content` finds those of the content of a file whose checksum is right.
+    `content` finds that of the content of a file whose checksum is right.
     """
     if size is None:
         yield Problem("missing file", file.name, remedy)
@@ -203,8 +194,8 @@ def _file_problems(
         with _local_path(store, file.name) as path:
             if digest_of(path) != file.sha256:
                 yield Problem("wrong checksum", file.name, remedy)
-            else:
-                yield from content(path)
+            elif problem := content(path):
+                yield problem
 
 
 def _index_problems(atlas: Atlas, deep: bool) -> Iterator[Problem]:
@@ -237,10 +228,9 @@ def _local_path(store: Store, name: str) -> Iterator[Path]:
         yield path
 
 
-def _content_problems(
+def _content_problem(
     recipe: AtlasRecipe, sheet: Sheet, key: str, name: str, path: Path
-) -> Iterator[Problem]:
-    """Problems of the content of a file whose checksum is right."""
+) -> Problem | None:
     try:
         if key == "map":
             differences = _differences(recipe, sheet, open_map(path).manifest)
@@ -248,10 +238,8 @@ def _content_problems(
             made = read_coarse(path)
             differences = [] if made.recipe == recipe.coarse else [f"made with {made.recipe}"]
     except (MapFileError, AtlasError) as error:
-        yield Problem("damaged file", name, str(error))
-        return
-    if differences:
-        yield Problem("other recipe", name, "; ".join(differences))
+        return Problem("damaged file", name, str(error))
+    return Problem("other recipe", name, "; ".join(differences)) if differences else None
 
 
 def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[str]:
@@ -277,6 +265,7 @@ def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[
 
 
 def _same(own: object, other: object) -> bool:
+    """Whether values are equal, numbers but for rounding."""
     if isinstance(own, int | float) and isinstance(other, int | float):
-        return abs(own - other) <= _CLOSE * abs(other)
+        return math.isclose(own, other, rel_tol=1e-6)
     return own == other

@@ -1,9 +1,11 @@
-"""The files of an atlas, in a local folder or in object storage.
+"""The files of an atlas, in a local folder or by fsspec in object storage and on servers.
 
 A file exists completely or not at all: locally it is written to a temporary name and renamed,
 object stores show a file when it is complete, elsewhere (SFTP) it is moved to its name. No file
 outside the atlas is ever named, because the catalogue may come from an untrusted source. Remote
-files are copied to a cache and verified; that of fsspec neither verifies nor limits its size.
+files are copied to a cache and verified; that of fsspec neither verifies nor limits its size. Nor
+does a folder go through fsspec: its local file system neither syncs files to disk before it renames
+them nor refuses links that lead outside.
 """
 
 import contextlib
@@ -12,15 +14,18 @@ import hashlib
 import logging
 import os
 import re
+import shutil
 import time
-from collections.abc import Iterable, Iterator
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from orthonav.core.errors import MissingExtraError, OrthonavError, StorageError
+from orthonav.core.extras import needed
 from orthonav.core.files import replacing
-from orthonav.ground.atlas.filesystems import LocalFolder, RemoteFiles
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +35,11 @@ LIMIT_BYTES = 20 * 10**9
 """Some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)."""
 GRACE_S = 600.0
 """Files used within this time are not removed: a process may be about to open them."""
+_OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
+"""There a file appears when it is complete; elsewhere it is moved to its name."""
+_FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
+_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}
+"""Protocols that refuse to replace a file unless `overwrite` is passed."""
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
 _PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 _PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
@@ -42,7 +52,6 @@ _UNREACHABLE = re.compile(
     "Connect(or|ion)|Timeout|HTTPClientError|SSLError|ServiceRe(quest|sponse)Error|gaierror"
 )
 """In the names of exceptions: the storage cannot be reached."""
-_REFUSED = {401, 403}
 _MAX_TEXT = 300
 
 
@@ -56,17 +65,17 @@ class Store:
     def __init__(self, url: str) -> None:
         """The store at a folder or URL, which need not exist yet."""
         match = _PROTOCOL.match(url)
-        protocol = match.group(1).lower() if match else "file"
-        self.is_local = protocol in ("file", "local")
+        self._protocol = match.group(1).lower() if match else "file"
+        self.is_local = self._protocol in ("file", "local")
         self._verified: set[tuple[str, int, int]] = set()
         if self.is_local:
-            folder = Path(url[match.end() :] if match else url).expanduser().absolute()
-            self.url = str(folder)
-            self._files: LocalFolder | RemoteFiles = LocalFolder(folder)
-        else:
-            self.url = url.rstrip("/")
-            with storage_errors(str(self), "open the storage"):
-                self._files = RemoteFiles(self.url, protocol)
+            self._root = Path(url[match.end() :] if match else url).expanduser().absolute()
+            self.url = str(self._root)
+            return
+        self.url = url.rstrip("/")
+        with storage_errors(str(self), "open the storage"):
+            self._fsspec = needed("fsspec", "atlas", "an atlas in object storage")
+            self._remote("")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.url,)
@@ -79,20 +88,43 @@ class Store:
 
         Subfolders are left out. Empty where there is no such folder.
         """
+        found: dict[str, int] = {}
         with storage_errors(self.shown(folder), "list the files of the atlas"):
-            found = self._files.names(checked_name(folder) if folder else "", prefix)
+            folder = checked_name(folder) if folder else ""
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                if self.is_local:
+                    found = _listed(self._path(folder), prefix)
+                else:
+                    found = self._listed_remote(folder, prefix)
         return dict(sorted(found.items()))
 
     def size(self, name: str) -> int | None:
         """Bytes of a file, None where it does not exist."""
         with storage_errors(self.shown(name), "access the atlas"):
-            return self._files.size(checked_name(name))
+            if self.is_local:
+                path = self._path(checked_name(name))
+                return path.stat().st_size if path.is_file() else None
+            fs, remote_path = self._remote(checked_name(name))
+            fs.invalidate_cache()
+            try:
+                info = fs.info(remote_path)
+            except FileNotFoundError:
+                return None
+            return int(info["size"]) if info["type"] == "file" else None
 
     def age_s(self, name: str) -> float | None:
         """Seconds since a file was written, None where the store does not report it."""
         with storage_errors(self.shown(name), "access the atlas"):
-            modified = self._files.modified_s(checked_name(name))
-        return None if modified is None else time.time() - modified
+            if self.is_local:
+                return time.time() - self._path(checked_name(name), follow=False).lstat().st_mtime
+            fs, remote_path = self._remote(checked_name(name))
+            try:
+                when = fs.modified(remote_path)
+            except NotImplementedError:
+                when = fs.info(remote_path).get("mtime")
+        if isinstance(when, datetime):
+            when = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+        return time.time() - when if isinstance(when, int | float) else None
 
     def read(self, name: str, limit_bytes: int = MAX_READ_BYTES) -> bytes:
         """Content of a file of at most `limit_bytes`."""
@@ -108,7 +140,15 @@ class Store:
     def read_many(self, names: Iterable[str]) -> dict[str, bytes]:
         """Contents of small files, in one request where the store supports it."""
         with storage_errors(str(self), "read files of the atlas"):
-            return self._files.read([checked_name(name) for name in names])
+            names = [checked_name(name) for name in names]
+            if self.is_local:
+                return self._read_local(names)
+            if not names:
+                return {}
+            fs, root = self._remote("")
+            paths = [f"{root}/{name}" for name in names]
+            found = fs.cat(paths) if len(paths) > 1 else {paths[0]: fs.cat_file(paths[0])}
+            return {name: found[path] for name, path in zip(names, paths, strict=True)}
 
     def fetch(self, name: str, size: int, sha256: str) -> Path:
         """A local file with that content, verified once: the file itself or a cached copy.
@@ -132,28 +172,59 @@ class Store:
     def download(self, name: str, path: Path) -> None:
         """Copy a file of a remote atlas to `path`, not verified."""
         with storage_errors(self.shown(name), f"copy from the atlas to {path.parent}"):
-            name = checked_name(name)
-            assert isinstance(self._files, RemoteFiles)
-            self._files.get(name, path)
+            fs, remote_path = self._remote(checked_name(name))
+            fs.get_file(remote_path, str(path))
 
     def write(self, name: str, content: Path | bytes) -> None:
         """Write a file, a copy of a local one or these bytes, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.save(content, checked_name(name))
+            name = checked_name(name)
+            if not self.is_local:
+                self._write_remote(name, content)
+                return
+            with replacing(self._path(name)) as temporary:
+                if isinstance(content, Path):
+                    shutil.copyfile(content, temporary)
+                else:
+                    temporary.write_bytes(content)
 
     def remove(self, name: str) -> None:
         """Remove a file if it exists."""
-        with storage_errors(self.shown(name), "remove a file of the atlas"):
-            self._files.remove(checked_name(name))
+        with (
+            storage_errors(self.shown(name), "remove a file of the atlas"),
+            contextlib.suppress(FileNotFoundError),
+        ):
+            if self.is_local:
+                self._path(checked_name(name), follow=False).unlink()
+            else:
+                fs, remote_path = self._remote(checked_name(name))
+                fs.rm_file(remote_path)
 
     def shown(self, name: str) -> str:
         """The address of a file, without a password."""
         return f"{self}/{name:.200}" if name else str(self)
 
+    def _path(self, name: str, follow: bool = True) -> Path:
+        """The path of a local file. Links that lead out of the atlas are refused; without `follow`
+        the file itself may be one."""
+        path = self._root.joinpath(*name.split("/")) if name else self._root
+        real = path.resolve() if follow or not name else path.parent.resolve()
+        if not real.is_relative_to(self._root.resolve()):
+            raise StorageError(f"a link leads out of the atlas: {path}")
+        return path
+
+    def _read_local(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Contents of files; folders are resolved once, which takes as long as reading a file."""
+        folders = {folder: self._path(folder).resolve() for folder in map(_folder_of, names)}
+        found = {}
+        for name in names:
+            path = folders[_folder_of(name)] / name.rpartition("/")[2]
+            found[name] = (self._path(name) if path.is_symlink() else path).read_bytes()
+        return found
+
     def _verified_path(self, name: str, size: int, sha256: str) -> Path:
-        assert isinstance(self._files, LocalFolder)
         with storage_errors(self.shown(name), "read the atlas"):
-            path = self._files.path(checked_name(name))
+            path = self._path(checked_name(name))
             if not path.is_file():
                 raise StorageError(f"the atlas has no such file: {self.shown(name)}")
             state = (sha256, path.stat().st_size, path.stat().st_mtime_ns)
@@ -161,6 +232,71 @@ class Store:
                 _require(path, size, sha256, self.shown(name))
                 self._verified.add(state)
         return path
+
+    def _remote(self, name: str) -> tuple[Any, str]:
+        """The file system and a path on it. fsspec keeps one per process and thread."""
+        try:
+            self._fsspec.get_filesystem_class(self._protocol)
+            fs, root = self._fsspec.core.url_to_fs(self.url)
+        except ValueError as error:
+            raise StorageError(f"invalid address ({error}): {self._protocol}://") from error
+        except ImportError as error:
+            raise MissingExtraError(
+                f"an atlas at {self._protocol}:// needs a package that is not installed ({error})"
+            ) from error
+        return fs, f"{root.rstrip('/')}/{name}" if name else root.rstrip("/")
+
+    def _listed_remote(self, folder: str, prefix: str) -> dict[str, int]:
+        fs, path = self._remote(folder)
+        fs.invalidate_cache()
+        if prefix and self._protocol in _FINDS_BY_PREFIX:
+            found = list(fs.find(path, prefix=prefix, detail=True).values())
+        else:
+            found = fs.ls(path, detail=True)
+        sizes = {}
+        for each in found:
+            parent, _, name = each["name"].strip("/").rpartition("/")
+            if each["type"] == "file" and parent == path.strip("/") and name.startswith(prefix):
+                sizes[name] = int(each["size"])
+        return sizes
+
+    def _write_remote(self, name: str, content: Path | bytes) -> None:
+        fs, path = self._remote(name)
+        if self._protocol in _OBJECT_STORES:
+            self._send(fs, content, path)
+            return
+        folder, _, file = path.rpartition("/")
+        fs.makedirs(folder, exist_ok=True)
+        temporary = f"{folder}/.{file}.{uuid.uuid4().hex[:12]}.tmp"
+        try:
+            self._send(fs, content, temporary)
+            fs.mv(temporary, path)
+        except BaseException:
+            with contextlib.suppress(Exception):
+                fs.rm_file(temporary)
+            raise
+
+    def _send(self, fs: Any, content: Path | bytes, path: str) -> None:
+        if isinstance(content, bytes):
+            fs.pipe_file(path, content)
+        else:
+            more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
+            fs.put_file(str(content), path, **more)
+
+
+def _folder_of(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _listed(folder: Path, prefix: str) -> dict[str, int]:
+    """Names and sizes of the files in a local folder."""
+    found = {}
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.startswith(prefix) and not entry.is_dir():
+                with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+                    found[entry.name] = entry.stat(follow_symlinks=False).st_size
+    return found
 
 
 def checked_name(name: str) -> str:
@@ -252,7 +388,7 @@ def _cause(error: Exception) -> str:
         return f"no valid credentials ({text}); set those of the storage, see its documentation"
     if errno.EROFS in numbers:
         return "the file system is read-only"
-    if "PermissionError" in names or any(_status(each) in _REFUSED for each in chain):
+    if "PermissionError" in names or any(_status(each) in (401, 403) for each in chain):
         return f"not permitted, or credentials refused ({text})"
     if any(isinstance(each, FileNotFoundError) for each in chain):
         return f"no such file, folder or bucket ({text})"

@@ -25,8 +25,8 @@ from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.gradients import HARMONICS
 from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.build.blocks import Block
 from orthonav.ground.build.cellparts import StoredCells
+from orthonav.ground.build.sheet import Block
 from orthonav.ground.planning.area import Extent
 
 KERNEL_PX = 3

@@ -14,14 +14,16 @@ import shutil
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError, OutputError
 from orthonav.core.files import replacing
-from orthonav.ground.build.blocks import Block
+
+if TYPE_CHECKING:
+    from orthonav.ground.build.sheet import Block
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +78,7 @@ class BlockCache:
                 self._folder,
             )
 
-    def begin(self, blocks: Sequence[tuple[Block, Any]]) -> int:
+    def begin(self, blocks: Sequence[tuple["Block", Any]]) -> int:
         """Register the blocks of a build, each with the inputs that it alone depends on.
 
         Removes files of other builds; returns the number of cached blocks.
@@ -94,7 +96,7 @@ class BlockCache:
                 path.unlink(missing_ok=True)
         return there
 
-    def load(self, block: Block) -> dict[str, NDArray[Any]] | None:
+    def load(self, block: "Block") -> dict[str, NDArray[Any]] | None:
         """The arrays of a block, None if it is not cached or damaged."""
         path = self._folder / self._names[block]
         try:
@@ -106,7 +108,7 @@ class BlockCache:
             log.warning("cached block is damaged (%s) and is recomputed: %s", error, path)
             return None
 
-    def store(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
+    def store(self, block: "Block", parts: dict[str, NDArray[Any]]) -> None:
         """Write a finished block, complete or not at all. Raises `OutputError`."""
         path = self._folder / self._names[block]
         try:

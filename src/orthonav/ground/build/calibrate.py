@@ -9,6 +9,7 @@ to them.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.files import Progress
+from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.logistic import FEATURES, LogisticConfidence, fit_few, fit_logistic
-from orthonav.core.localize.match import TileMatcher
-from orthonav.core.tiles.contract import ViewEmbedder
+from orthonav.core.localize.confidence import (
+    TILE_FEATURES,
+    USUAL_CHANCES,
+    Chances,
+    LogisticConfidence,
+    RegisteredConfidence,
+)
+from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.tiles import TileMatcher
+from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
+from orthonav.core.register.pose import rotation
+from orthonav.core.tiles.embed import ViewEmbedder
+from orthonav.ground.build.fit import fit_few, fit_logistic, fit_registered
+
+MAX_REPLACED = 0.75
+"""Largest replaced share of a view."""
+MAX_MIXED = 0.85
+"""Largest share of detail mixed in from the other image."""
+
+
+def changed(
+    rng: np.random.Generator,
+    grey: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    *,
+    most_replaced: float = MAX_REPLACED,
+    most_mixed: float = MAX_MIXED,
+) -> NDArray[np.uint8]:
+    """`grey` (S, S) uint8 with the changes of years.
+
+    `other` is an image that must not occur on the map. Parts are replaced by it, and its detail is
+    mixed into the rest; brightness and contrast of fields change, some invert their contrast;
+    light, blur and noise differ. `most_replaced`: largest replaced share (0..1). `most_mixed`:
+    largest weight of the detail of `other` in the rest (0..1).
+    """
+    size = grey.shape[0]
+    resized = np.asarray(cv2.resize(other, (size, size)), dtype=np.float32)
+    own, own_broad = _detail(grey.astype(np.float32), size)
+    foreign, foreign_broad = _detail(resized, size)
+    mask = _smooth(rng, size, int(rng.integers(3, 12)))
+    replaced = mask < np.quantile(mask, rng.uniform(0, most_replaced))
+    gain = 0.35 + 0.9 * _smooth(rng, size, 6)
+    turned = _smooth(rng, size, 5) > rng.uniform(0.55, 1.1)
+    mixed = rng.uniform(0, most_mixed)
+    detail = (1 - mixed) * own * np.where(turned, -gain, gain)
+    # Flipped, so that replaced and mixed parts show different detail.
+    detail = np.where(replaced, foreign, detail + mixed * foreign[::-1])
+    light = np.where(replaced, foreign_broad, own_broad) + 40 * (_smooth(rng, size, 4) - 0.5)
+    tone = np.power(np.clip(light + detail, 0, 255) / 255, rng.uniform(0.6, 1.7))
+    blurred = np.asarray(cv2.GaussianBlur(tone, (0, 0), float(rng.uniform(0.3, 1.4))))
+    exposed = blurred * 255 * rng.uniform(0.6, 1.25)
+    noisy = exposed + rng.normal(0, rng.uniform(1, 6), grey.shape)
+    return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
+
+
+def _detail(
+    picture: NDArray[np.float32], size: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """High-pass and low-pass part of an image (S, S)."""
+    broad = np.asarray(cv2.GaussianBlur(picture, (0, 0), size / 16), dtype=np.float32)
+    return picture - broad, broad
+
+
+def _smooth(rng: np.random.Generator, size: int, cells: int) -> NDArray[np.float32]:
+    """A smooth random field (S, S) around 0.5, `cells` values across."""
+    values = rng.random((cells, cells)).astype(np.float32)
+    return np.asarray(cv2.resize(values, (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
+
 
 CROPS = 192
 """Views searched; seconds per map."""
@@ -168,10 +235,10 @@ def calibrate(
             other = other[:, ::-1]
         for mirror in (False, True):
             picture = crop.grey[:, ::-1] if mirror else crop.grey
-            changed = changed_picture(rng, picture, other)
-            queries = _queries(rng, changed, grid, representation, embedder, heading_step_deg)
+            aged = changed_picture(rng, picture, other)
+            queries = _queries(rng, aged, grid, representation, embedder, heading_step_deg)
             match = matcher.match(queries)
-            features.append([match.evidence[name] for name in FEATURES])
+            features.append([match.evidence[name] for name in TILE_FEATURES])
             truth = [
                 grid.west_m + crop.col_px * grid.gsd_m,
                 grid.north_m - crop.row_px * grid.gsd_m,
@@ -179,8 +246,8 @@ def calibrate(
             errors.append(centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
             mirrored.append(mirror)
         progress("calibrate", (done + 1) / len(crops))
-    return _fitted(
-        np.array(features).reshape(-1, len(FEATURES)),
+    return _tile_calibration(
+        np.array(features).reshape(-1, len(TILE_FEATURES)),
         np.array(errors).reshape(-1, 2),
         np.array(mirrored, dtype=bool),
         grid,
@@ -188,7 +255,7 @@ def calibrate(
     )
 
 
-def _fitted(
+def _tile_calibration(
     features: NDArray[np.float64],
     errors_en_m: NDArray[np.float64],
     mirrored: NDArray[np.bool_],
@@ -243,3 +310,188 @@ def _queries(
         valid = np.asarray(cv2.warpAffine(inside, matrix, (size, size)) > 0, dtype=np.bool_)
         queries.append(embedder.view(representation(view, valid), valid))
     return np.stack(queries)
+
+
+YAW_STD_DEG = 5.0
+AGL_STD = 0.05
+"""Errors of heading and height (a share): those of the benchmarks."""
+FOCAL_PX = 1000.0
+"""Any value: views have the resolution of the map, and only the ratio to the height matters."""
+SIDES = (0.55, 1.0)
+"""Long side of a view, from and to, in tiles; the short side is three quarters of it."""
+ENOUGH_RIGHT = 10
+"""Fewest correct views of another date that anything is learnt from."""
+FLOOR_PX = 0.6
+"""Usual standard deviation per axis, in pixels, between orthophotos of two dates."""
+FLOOR_LIMITS_PX = (0.25, 3.0)
+MIN_NEGATIVES = 5
+"""Mirrored views from which on the scores of chance are their medians."""
+WHOLE_PX, SEARCHED_PX = 6144, 4096
+"""Maps larger than a square of the first are searched in a square of the second for each view: on
+a map of 50 x 5 km a full search took 7 GB and minutes per view, and too few views were found for a
+fit (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
+FALLBACK_CHANCE = 40.0
+"""Score of a chance match if no negative has one."""
+USUAL_FINE, USUAL_FINE_VIEWS = 1.45, 8.0
+"""Prior of the ratio by which one more level raises the score of a chance match, and its weight in
+views."""
+
+
+@dataclass(frozen=True)
+class RegistrationCalibration:
+    """Calibration of registration.
+
+    `floor_px`: lower bound of the reported standard deviation per axis, pixels.
+    """
+
+    confidence: RegisteredConfidence
+    floor_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    evidence: Mapping[str, float]
+    error_px: NDArray[np.float64]
+    mirrored: bool
+
+
+def calibrate_registration(
+    localizer: RegistrationLocalizer,
+    crops: Sequence[Crop],
+    other_dates: Sequence[Crop],
+    views: int,
+    seed: int,
+    progress: Progress,
+) -> RegistrationCalibration:
+    """Locate mirrored views and views of other dates, and learn from the outcome.
+
+    `crops` and `other_dates` are crops of the map and of other dates of its area. At most `views`
+    mirrored views are located, and as many of other dates.
+    """
+    rng = np.random.default_rng([seed, 3])
+    order = rng.permutation(len(crops))
+    later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
+    mirrored = (later or [crops[i] for i in order])[:views]
+    work = [(crop, False) for crop in later] + [(crop, True) for crop in mirrored]
+    outcomes: list[_Outcome] = []
+    for done, (crop, mirror) in enumerate(work):
+        picture = crop.grey
+        if mirror:
+            picture = np.ascontiguousarray(picture[:, ::-1])
+        if not later:
+            # The replacement is mirrored: unmirrored it would be found at its own position.
+            replaced_by = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
+            picture = changed(rng, picture, replaced_by)
+        outcome = _placed(rng, localizer, crop, picture, mirror)
+        if outcome is not None:
+            outcomes.append(outcome)
+        progress("calibrate registration", (done + 1) / len(work))
+    return _registration_calibration(outcomes, localizer.radius_m / localizer.grid.gsd_m)
+
+
+def _placed(
+    rng: np.random.Generator,
+    localizer: RegistrationLocalizer,
+    crop: Crop,
+    picture: NDArray[np.uint8],
+    mirror: bool,
+) -> _Outcome | None:
+    """Outcome of locating one view of the picture of a crop; None if there is no fix."""
+    view = _view(rng, picture, localizer.grid)
+    search = localizer.search(view, _prior(rng, localizer, crop))
+    best = search if isinstance(search, NoFix) else search.run()
+    if isinstance(best, NoFix):
+        return None
+    error = np.array([best.pose.x_px - crop.col_px, best.pose.y_px - crop.row_px])
+    return _Outcome(best.scores, error, mirror)
+
+
+def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
+    """Prior that limits the search on a large map to a square with the crop in its middle half.
+
+    None searches the whole map.
+    """
+    grid = localizer.grid
+    if grid.height_px * grid.width_px <= WHOLE_PX**2:
+        return None
+    col, row = np.array([crop.col_px, crop.row_px]) + rng.uniform(-0.25, 0.25, 2) * SEARCHED_PX
+    place = np.array([grid.west_m + col * grid.gsd_m, grid.north_m - row * grid.gsd_m])
+    lat, lon = localizer.sheet.frame.latlon_from_en(place)
+    return Prior(float(lat), float(lon), SEARCHED_PX / 2 * grid.gsd_m / PRIOR_SIGMAS)
+
+
+def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) -> View:
+    """A vertical view of the middle of a picture, with errors of heading and height."""
+    size = picture.shape[0]
+    longest = min(grid.tile_px, int(size / 1.27))  # its diagonal fits into the picture
+    width = max(16, round(longest * rng.uniform(*SIDES)))
+    height = max(12, round(width * 0.75))
+    yaw_deg = rng.uniform(0, 360)
+    linear = rotation(math.radians(yaw_deg))
+    move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    matrix = np.column_stack([linear, move])
+    view = cv2.warpAffine(picture, matrix, (width, height), flags=flags)
+    agl_m = FOCAL_PX * grid.gsd_m
+    reported_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
+    telemetry = Telemetry(
+        time_ns=0,
+        yaw_deg=yaw_deg + rng.normal(0, YAW_STD_DEG),
+        pitch_deg=0.0,
+        roll_deg=0.0,
+        agl_m=reported_m,
+        yaw_std_deg=YAW_STD_DEG,
+        agl_std_m=AGL_STD * reported_m,
+    )
+    camera = Camera(width, height, FOCAL_PX, FOCAL_PX, width / 2, height / 2)
+    return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
+
+
+def _registration_calibration(
+    outcomes: Sequence[_Outcome], radius_px: float
+) -> RegistrationCalibration:
+    """The confidence of errors below a radius, and the floor from views of other dates."""
+    negatives = [each.evidence for each in outcomes if each.mirrored]
+    chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
+    confidence, floor_px = RegisteredConfidence.usual(chances), FLOOR_PX
+    errors_px = np.array([np.hypot(*each.error_px) for each in outcomes])
+    mirrored = np.array([each.mirrored for each in outcomes], np.bool_)
+    right = ~mirrored & (errors_px <= radius_px)
+    if right.sum() >= ENOUGH_RIGHT:
+        # From the median: Rayleigh's is 1.1774 standard deviations.
+        spread = float(np.median(errors_px[right])) / 1.1774
+        floor_px = min(max(spread, FLOOR_LIMITS_PX[0]), FLOOR_LIMITS_PX[1])
+        # Without a mirrored view nothing would show what a wrong place looks like.
+        if negatives:
+            confidence = fit_registered([each.evidence for each in outcomes], right, chances)
+    return RegistrationCalibration(confidence, floor_px)
+
+
+def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
+    """The scores of chance by the evidence of mirrored views.
+
+    The strength of a view that is judged and finished at one level is the sum of one score, not of
+    two: with small tiles most views are such, and say nothing of the sum.
+    """
+    look = _median(negatives, "look")
+    both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
+    total = look + USUAL_CHANCES.total - USUAL_CHANCES.look
+    if len(both) >= MIN_NEGATIVES:
+        total = _median(both, "strength")
+    return Chances(total, look, _fine_chance(negatives, total))
+
+
+def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float:
+    """Score of a chance match with one more level, shrunk towards the usual value."""
+    known = sum(math.isfinite(each["fine"]) for each in evidence)
+    usual = USUAL_FINE * total
+    if not known:
+        return usual
+    share = known / (known + USUAL_FINE_VIEWS)
+    return math.exp(share * math.log(_median(evidence, "fine")) + (1 - share) * math.log(usual))
+
+
+def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
+    """Median of one number of the evidence over the views that have it, at least 1."""
+    values = [each[name] for each in evidence if math.isfinite(each[name])]
+    return max(float(np.median(values)), 1.0) if values else FALLBACK_CHANCE

@@ -4,23 +4,106 @@ import importlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import VariantError
-from orthonav.core.extras import needed
+from orthonav.core.errors import MissingExtraError, VariantError
+from orthonav.core.extras import needed, pip_line
 from orthonav.core.files import Progress
+from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.core.tiles.represent import Gray
+from orthonav.core.tiles.whitened import WhitenedRecipe
 from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe
-from orthonav.ground.build.change import changed
-from orthonav.ground.build.pictures import SheetPictures
+from orthonav.core.variants import make_variant, variant_recipe
+from orthonav.ground.build.calibrate import changed
+from orthonav.ground.build.sheet import SheetPictures
+from orthonav.research.caevl_recipe import CaevlRecipe
 from orthonav.research.tiles import SheetTiles
 from orthonav.research.words import learn_words
 
 log = logging.getLogger(__name__)
+
+EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
+Encoder = NetworkEmbedder | WordsEmbedder
+LEARNT_WITH = {
+    "autoencoder": ("torch", "onnx", "onnxruntime"),
+    "caevl": ("torch", "onnx", "onnxruntime"),
+    "triplet": ("torch", "onnx", "onnxruntime"),
+    "bovw": ("faiss",),
+}
+"""Modules of the extra "train" that learning a method needs."""
+USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
+DEVICES = ("auto", "cpu", "cuda")
+LOCAL_FIELDS = ("weights", "cache")
+
+
+def usual_edges(method: str) -> str:
+    """The default representation of a method; for methods of the paper, its choice."""
+    name = method.partition(":")[0]
+    return USUAL_EDGES.get(name, "gradient")
+
+
+def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
+    """The recipe of a method; one-channel images are whitened on finer cells by default.
+
+    Raises `VariantError`, and `MissingExtraError` naming all that learning it needs and lacks.
+    """
+    name, _, parameters = method.partition(":")
+    absent = [each for each in LEARNT_WITH.get(name, ()) if find_spec(each) is None]
+    if absent:
+        gone = ", ".join(absent)
+        raise MissingExtraError(f"--method {name} needs {gone}: {pip_line('train')}")
+    if name == "gradient" and representation.channels == 1 and "cells=" not in parameters:
+        method = f"{name}:{parameters},cells=16"
+    recipe = make_variant(embed.TABLE, method)
+    assert isinstance(recipe, WhitenedRecipe | AutoEncoderRecipe | TripletRecipe | WordsRecipe)
+    if isinstance(recipe, WordsRecipe) and not isinstance(representation, Gray):
+        raise VariantError("bovw needs grey levels; give --edges gray, or omit --edges")
+    if isinstance(recipe, WhitenedRecipe) and getattr(representation, "per", "sheet") == "tile":
+        raise VariantError(
+            "edges per tile need a network; give --method autoencoder, caevl or triplet"
+        )
+    if not represent.TABLE[_name_of(representation)].flies:
+        log.warning(
+            "%s is too slow for flight: this map is for experiments", _name_of(representation)
+        )
+    return recipe
+
+
+def check_device(name: str) -> None:
+    """Raise `VariantError` for an unknown device, and for a GPU that PyTorch does not see."""
+    if name not in DEVICES:
+        raise VariantError(f"device must be {', '.join(DEVICES)}, got '{name}'")
+    if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
+        raise VariantError("PyTorch sees no GPU; use --device auto or cpu")
+
+
+def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:
+    """Raise `VariantError` if a triplet network without other dates would need days.
+
+    Its positives would be segmented anew at every step: seconds to minutes each.
+    """
+    if isinstance(recipe, TripletRecipe) and not represent.TABLE[_name_of(representation)].flies:
+        raise VariantError(
+            f"a triplet network on {_name_of(representation)} edges needs orthophotos of other "
+            "dates; give --other-date"
+        )
+
+
+def stored_representation(representation: Any) -> dict[str, Any]:
+    """Recipe of a representation for a manifest, without local paths and devices."""
+    recipe = variant_recipe(represent.TABLE, representation)
+    return {name: "" if name in LOCAL_FIELDS else value for name, value in recipe.items()}
+
+
+def _name_of(representation: Any) -> str:
+    return str(variant_recipe(represent.TABLE, representation)["name"])
+
 
 BATCH_TILES = 64
 MAX_WORD_TILES = 2000
@@ -30,9 +113,6 @@ largest value: four times that of float16."""
 MOST_REPLACED, MOST_MIXED = 0.35, 0.4
 """Change of the positives of a triplet, weaker than in calibration: with the stronger change a
 network learned a third as much in its first 300 batches."""
-
-EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
-Encoder = NetworkEmbedder | WordsEmbedder
 
 
 @dataclass(frozen=True)
@@ -57,7 +137,7 @@ def learn_encoder(
     """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
 
     A triplet network's positives are the same tiles of `other_dates`; without any, the tiles
-    themselves with simulated ageing.
+    themselves with simulated ageing. CAEVL learns from one date.
     Raises `MissingExtraError` if PyTorch or faiss is needed and missing.
     """
     tiles = pictures.tiles(tiles_px, progress)
@@ -67,19 +147,23 @@ def learn_encoder(
             recipe, chosen, learning.seed, lambda share: progress("learn words", share)
         )
         return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
-    positive: Any = [each.tiles(tiles_px, progress) for each in other_dates]
-    training = _training()
+    needed("torch", "train", "learning a network")
+    training = importlib.import_module("orthonav.research.training")
     device = None if learning.device == "auto" else learning.device
-    trained = training.learn_network(
-        recipe,
-        tiles,
-        binary=not pictures.is_grey,
-        seed=learning.seed,
-        work=learning.work,
-        positive=positive or _changed_tiles(tiles, representation),
-        report=lambda text, share: _log_progress(progress, text, share),
-        means=training.Means(device=device, workers=learning.workers),
-    )
+    how: dict[str, Any] = {
+        "binary": not pictures.is_grey,
+        "seed": learning.seed,
+        "work": learning.work,
+        "report": lambda text, share: _log_progress(progress, text, share),
+        "means": training.Means(device=device, workers=learning.workers),
+    }
+    if isinstance(recipe, CaevlRecipe):
+        caevl = importlib.import_module("orthonav.research.caevl")
+        trained = caevl.learn_caevl(recipe, tiles, representation, **how)
+    else:
+        positive: Any = [each.tiles(tiles_px, progress) for each in other_dates]
+        positive = positive or _changed_tiles(tiles, representation)
+        trained = training.learn_network(recipe, tiles, positive=positive, **how)
     embedded = _embedded(lambda of: trained.views(tiles.batch(of)), tiles, progress)
     _require_as_in_flight(trained.embedder, tiles, embedded)
     return trained.embedder, embedded
@@ -147,8 +231,3 @@ def _embedded(
             "learning_rate or fewer epochs"
         )
     return out
-
-
-def _training() -> Any:
-    needed("torch", "train", "learning a network")
-    return importlib.import_module("orthonav.research.training")

@@ -8,11 +8,13 @@ resumes from it.
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -21,24 +23,381 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.cores import usable_cores
-from orthonav.core.errors import AreaError
-from orthonav.core.files import Progress
+from orthonav.core.errors import AreaError, VariantError
+from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.cells import CellLayout, cell_means
+from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
+from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.block_cache import BlockCache, digest
-from orthonav.ground.build.blocks import Block, Preview, blocks_of, margins, read_block
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
-from orthonav.ground.build.parallel import in_order
-from orthonav.ground.build.pictures import SheetPictures, sheet_maps
-from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
-from orthonav.ground.imagery.quiet import quiet
+from orthonav.ground.imagery.mosaic import GreyPixels, Mosaic, SheetRaster
+from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
+from orthonav.research.tiles import SheetTiles
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+Worker = AbstractContextManager[Callable[[Item], Made]]
+AHEAD = 2
+"""Finished results that may wait for a slower one."""
+
+
+@dataclass(frozen=True)
+class _Failed:
+    error: BaseException
+
+
+def in_order(
+    items: Sequence[Item], opened: Callable[[], Worker[Item, Made]], workers: int
+) -> Iterator[Made]:
+    """Results of a worker for each item, in the order of the items.
+
+    `opened` opens the worker of each thread. At most `workers + AHEAD` items are started and not
+    yet consumed. The first error, in the order of the items, is raised here. After an error, and if
+    the caller stops early, the threads finish their current items and start no new ones.
+    """
+    workers = min(workers, len(items))
+    if workers > 1:
+        yield from _Crew(items, opened).results(workers)
+        return
+    with opened() as work:
+        for item in items:
+            yield work(item)
+
+
+class _Crew(Generic[Item, Made]):
+    """Threads that take items from one queue; each item has a queue for its result."""
+
+    def __init__(self, items: Sequence[Item], opened: Callable[[], Worker[Item, Made]]) -> None:
+        self._items, self._opened = items, opened
+        self._todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+        self._done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
+        self._stop = threading.Event()
+
+    def results(self, workers: int) -> Iterator[Made]:
+        threads = [threading.Thread(target=self._serve, daemon=True) for _ in range(workers)]
+        try:
+            for thread in threads:
+                thread.start()
+            for index in range(workers + AHEAD):
+                self._begin(index)
+            for index, place in enumerate(self._done):
+                made = place.get()
+                if isinstance(made, _Failed):
+                    raise made.error
+                self._begin(index + workers + AHEAD)
+                yield made
+        finally:
+            self._stop.set()
+            for _ in threads:
+                self._todo.put(None)
+            for thread in threads:
+                thread.join()
+
+    def _begin(self, index: int) -> None:
+        if index < len(self._items):
+            self._todo.put(index)
+
+    def _serve(self) -> None:
+        at = slice(None)  # all waiting items, until one is started
+        try:
+            with self._opened() as work:
+                while (index := self._todo.get()) is not None and not self._stop.is_set():
+                    at = slice(index, index + 1)
+                    self._done[index].put(work(self._items[index]))
+        except BaseException as error:
+            for place in self._done[at]:
+                place.put(_Failed(error))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A rectangle of a sheet's raster, in pixels."""
+
+    row: int
+    col: int
+    height: int
+    width: int
+
+    def may_matter(self, area: Area, grid: TileGrid) -> bool:
+        """Whether a tile of the area may need the block; False only far from a route."""
+        if area.route is None:
+            return True
+        east_m = grid.west_m + (self.col + self.width / 2) * grid.gsd_m
+        north_m = grid.north_m - (self.row + self.height / 2) * grid.gsd_m
+        reach_px = np.hypot(self.height, self.width) / 2 + grid.tile_px + grid.stride_px
+        return bool(area.contains(np.array([[east_m, north_m]]), reach_px * grid.gsd_m)[0])
+
+    def within(self, other: "Block") -> tuple[slice, slice]:
+        """Rows and columns of the block in the pixels of another block that contains it."""
+        row, col = self.row - other.row, self.col - other.col
+        return slice(row, row + self.height), slice(col, col + self.width)
+
+    def cut(self, side_px: int) -> Iterator["Block"]:
+        """Parts of the block, divided at multiples of `side_px` of the raster."""
+        bottom, right = self.row + self.height, self.col + self.width
+        for row in range(self.row // side_px * side_px, bottom, side_px):
+            for col in range(self.col // side_px * side_px, right, side_px):
+                top, left = max(row, self.row), max(col, self.col)
+                height, width = min(row + side_px, bottom) - top, min(col + side_px, right) - left
+                yield Block(top, left, height, width)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPixels:
+    """Pixels of a block with a margin; the block begins at row `top`, column `left`."""
+
+    block: Block
+    pixels: GreyPixels
+    top: int
+    left: int
+
+    def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
+        """Rows and columns of the block in the pixels, with `beyond_px` more to south and east."""
+        return (
+            slice(self.top, self.top + self.block.height + beyond_px),
+            slice(self.left, self.left + self.block.width + beyond_px),
+        )
+
+
+def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
+    """Blocks of at most `side_px` that fill the raster of a grid."""
+    for row in range(0, grid.height_px, side_px):
+        for col in range(0, grid.width_px, side_px):
+            height, width = min(side_px, grid.height_px - row), min(side_px, grid.width_px - col)
+            yield Block(row, col, height, width)
+
+
+def margins(grid: TileGrid, block: Block, margin_px: int) -> tuple[int, int, int, int]:
+    """Top, left, bottom, right margin of a block: `margin_px`, less at the raster border."""
+    return (
+        min(margin_px, block.row),
+        min(margin_px, block.col),
+        min(margin_px, grid.height_px - block.row - block.height),
+        min(margin_px, grid.width_px - block.col - block.width),
+    )
+
+
+def read_block(raster: SheetRaster, grid: TileGrid, block: Block, margin_px: int) -> BlockPixels:
+    """Read a block with `margins` around it."""
+    top, left, bottom, right = margins(grid, block, margin_px)
+    width, height = left + block.width + right, top + block.height + bottom
+    pixels = raster.read_grey(block.col - left, block.row - top, width, height)
+    return BlockPixels(block, pixels, top, left)
+
+
+class Preview:
+    """A grey overview of a sheet, at most `across_px` wide or high, filled block by block."""
+
+    def __init__(self, grid: TileGrid, across_px: int) -> None:
+        self._scale = min(1.0, across_px / max(grid.width_px, grid.height_px))
+        height, width = grid.height_px * self._scale, grid.width_px * self._scale
+        self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
+
+    def small(self, read: BlockPixels) -> NDArray[np.uint8]:
+        """The overview of a block: (h, w), empty if it is smaller than a pixel."""
+        return self.small_of(read.block, read.pixels.grey[read.part()])
+
+    def small_of(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The same from an image of the block at its resolution or a coarser one."""
+        y0, y1, x0, x1 = self._edges(block)
+        if y1 <= y0 or x1 <= x0:
+            return np.zeros((0, 0), np.uint8)
+        small = cv2.resize(grey, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, dtype=np.uint8)
+
+    def put(self, block: Block, small: NDArray[np.uint8]) -> None:
+        """Insert the result of `small` for a block."""
+        if small.size:
+            y0, y1, x0, x1 = self._edges(block)
+            self._grey[y0:y1, x0:x1] = small
+
+    def _edges(self, block: Block) -> tuple[int, int, int, int]:
+        """Top, bottom, left, right of a block in the overview."""
+        rows, cols = self._grey.shape
+        y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
+        x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
+        return y0, min(y1, rows), x0, min(x1, cols)
+
+    def jpeg(self) -> NDArray[np.uint8]:
+        """The overview as bytes of a JPEG."""
+        encoded = cv2.imencode(".jpg", self._grey, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
+        return np.asarray(encoded, dtype=np.uint8).reshape(-1)
+
 
 log = logging.getLogger(__name__)
+
+MIN_TILE_VALID_SHARE = 0.5
+"""Tiles with less imagery are omitted: no view can match most of them."""
+_TILES_AT_ONCE = 2**17
+
+
+def grid_of(
+    area: Area, imagery_gsd_m: float, gsd_m: float | None, tile_px: int, overlap: float
+) -> TileGrid:
+    """The tile grid of an area; `gsd_m` None uses the resolution of the imagery.
+
+    Raises `AreaError` if tiles are larger than an area without a route.
+    """
+    gsd_m = rounded_gsd_m(imagery_gsd_m) if gsd_m is None else gsd_m
+    overlap = _whole_cells(tile_px, overlap)
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
+    west, south, east, north = area.extent_en_m
+    side_m = min(east - west, north - south)
+    if area.route is None and side_m < 0.999 * grid.tile_m:
+        raise AreaError(
+            f"a tile of {grid.tile_px} px is {grid.tile_m:.0f} m wide, larger than the area, "
+            f"{east - west:.0f} x {north - south:.0f} m; use smaller tiles, a finer ground "
+            "resolution or a larger area"
+        )
+    if gsd_m < 0.8 * imagery_gsd_m:
+        log.warning(
+            "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, imagery_gsd_m
+        )
+    return grid
+
+
+def rounded_gsd_m(gsd_m: float) -> float:
+    """Ground resolution rounded to few digits: 5.002 to 5, 0.2431 to 0.243."""
+    for digits in (1, 2, 3):
+        rounded = float(f"{gsd_m:.{digits}g}")
+        if abs(rounded / gsd_m - 1) < 0.005:
+            return rounded
+    return float(f"{gsd_m:.4g}")
+
+
+def _whole_cells(tile_px: int, overlap: float) -> float:
+    """The overlap adjusted so that the stride is a multiple of a micro-cell, if it is at least one.
+
+    Tiles then share all their cells; otherwise memory would grow with the square of the ratio.
+    """
+    micro_px = max(1, tile_px // MICRO)
+    stride_px = tile_px * (1 - overlap)
+    if not micro_px <= stride_px <= tile_px:
+        return overlap
+    return 1 - round(stride_px / micro_px) * micro_px / tile_px
+
+
+def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
+    """Grid rows and columns (N, 2) of the tiles in the area that have imagery.
+
+    Raises `AreaError` if there are none.
+    """
+    tiles = np.concatenate(_inside(area, grid))
+    share = cells.valid_share(tiles * grid.stride_px)
+    if not (share >= MIN_TILE_VALID_SHARE).any():
+        best = share.max(initial=0.0)
+        raise AreaError(
+            f"no tile of {grid.tile_px} px ({grid.tile_m:.0f} m) has imagery under at least "
+            f"{MIN_TILE_VALID_SHARE:.0%} of it (best {best:.0%}): the area lies outside the "
+            "orthophotos, or tiles are larger than the imagery; use smaller tiles or a finer "
+            "ground resolution"
+        )
+    return tiles[share >= MIN_TILE_VALID_SHARE]
+
+
+def _inside(area: Area, grid: TileGrid) -> list[NDArray[np.intp]]:
+    """The tiles (N, 2) in the area, a few rows at a time: the box may be mostly empty."""
+    reach_m = grid.stride_m * np.sqrt(0.5)
+    step = max(1, _TILES_AT_ONCE // grid.cols)
+    found = []
+    for first in range(0, grid.rows, step):
+        rows, cols = np.mgrid[first : min(first + step, grid.rows), : grid.cols]
+        tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
+        found.append(tiles[area.contains(grid.centres_en_m(tiles), reach_m)])
+    return found
+
+
+def is_per_tile(representation: Any) -> bool:
+    """Whether every tile is represented by itself, not cut out of the sheet's representation."""
+    return getattr(representation, "per", "sheet") == "tile"
+
+
+class SheetPictures:
+    """Grey levels or edges of a sheet, filled block by block; 1 to 2 bytes per pixel.
+
+    Raises `VariantError` for representations of several channels, which encoders cannot use.
+    """
+
+    def __init__(self, grid: TileGrid, representation: Any) -> None:
+        if representation.channels != 1:
+            raise VariantError(
+                "this method needs a representation of one channel; give --edges gray, canny, "
+                "segments or sam"
+            )
+        shape = grid.height_px, grid.width_px
+        self.is_grey = isinstance(representation, Gray)
+        self._grid, self._representation = grid, representation
+        self._scale = 255.0 if self.is_grey else 1.0
+        self._pixels = np.zeros((1, *shape), np.uint8)
+        self._valid = np.zeros(shape, np.bool_)
+        self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
+
+    def parts(self, read: BlockPixels, maps: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+        """The pixels of a block; `maps` (1, H, W) is its representation with the margin."""
+        part = read.part()
+        parts: dict[str, NDArray[Any]] = {
+            "pixels": np.rint(maps[0][part] * self._scale).astype(np.uint8),
+            "pixels_valid": read.pixels.valid[part],
+        }
+        if self._grey is not None:
+            parts["pixels_grey"] = read.pixels.grey[part]
+        return parts
+
+    def put(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
+        """Insert the `parts` of a block."""
+        where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
+        self._pixels[0][where] = parts["pixels"]
+        self._valid[where] = parts["pixels_valid"]
+        if self._grey is not None:
+            self._grey[where] = parts["pixels_grey"]
+
+    def tiles(self, tiles_px: NDArray[np.intp], progress: Progress = no_progress) -> SheetTiles:
+        """Tiles whose first pixels (row, col) are given (N, 2)."""
+        grey, tile_px = self._grey, self._grid.tile_px
+        tiles = SheetTiles(self._pixels, self._valid, tiles_px, tile_px, self._scale, grey)
+        if not is_per_tile(self._representation):
+            return tiles
+        singles = np.zeros((len(tiles), 1, tile_px, tile_px), np.uint8)
+        for index in range(len(tiles)):
+            made = self._representation(tiles.grey_tile(index), tiles.valid_tile(index))
+            singles[index] = np.rint(made * self._scale)
+            progress("edges of tiles", (index + 1) / len(tiles))
+        return replace(tiles, singles=singles)
+
+
+def sheet_maps(
+    representation: Any, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Representation (C, H, W) of a part of a sheet; zeros if tiles are represented singly."""
+    if is_per_tile(representation):
+        return np.zeros((representation.channels, *grey.shape), np.float32)
+    return np.asarray(representation(grey, valid), np.float32)
+
+
+def read_pictures(
+    mosaic: Mosaic,
+    area: Area,
+    grid: TileGrid,
+    representation: Any,
+    progress: Progress,
+) -> SheetPictures:
+    """Images of the tiles of a sheet at another date."""
+    pictures = SheetPictures(grid, representation)
+    blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
+    with mosaic.grid_sheet(area.frame, grid) as raster:
+        for done, block in enumerate(blocks):
+            read = read_block(raster, grid, block, representation.margin_px)
+            if read.pixels.valid.any():
+                maps = sheet_maps(representation, read.pixels.grey, read.pixels.valid)
+                pictures.put(block, pictures.parts(read, maps))
+            progress("other date", (done + 1) / len(blocks))
+    return pictures
+
 
 BLOCK_PX = 1024
 """Least width of a block: a few MB of memory per thread."""

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OrthonavError
 from orthonav.core.flight.recording import Flight
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.checks import check_view
-from orthonav.core.localize.prepared import PreparedView
-from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.view import PreparedView, check_view
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
-from orthonav.core.register.evidence import evidence
+from orthonav.core.register.channels import channels_of
 from orthonav.core.register.pose import Pose
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid
 
@@ -128,12 +127,13 @@ def beside_map(
     std_m = math.hypot(math.sqrt(float(np.trace(fix.cov_en_m2)) / 2), tilt_m)
     if not math.isfinite(std_m):
         return None
-    found = registration.register(view, Prior(fix.lat_deg, fix.lon_deg, std_m), True)
-    if isinstance(found, NoFix) or isinstance(found.found, NoFix):
+    search = registration.search(view, Prior(fix.lat_deg, fix.lon_deg, std_m))
+    if isinstance(search, NoFix):
         return None
-    if not found.found.placed.blocks_t >= MIN_BLOCKS_T:
+    found = search.run()
+    if isinstance(found, NoFix) or not found.fit.blocks_t >= MIN_BLOCKS_T:
         return None
-    return _compared(registration, grid, found.prepared, found.found.placed.pose)
+    return _compared(registration, grid, search.view, found.pose)
 
 
 def _compared(
@@ -143,8 +143,8 @@ def _compared(
     rectified = view.rectified_at(level)
     shape = rectified.grey.shape
     map_grey, map_valid = _map_under(registration, pose, level, (shape[0], shape[1]))
-    mine = evidence(rectified.grey, rectified.valid)
-    theirs = evidence(map_grey, map_valid)
+    mine = channels_of(rectified.grey, rectified.valid)
+    theirs = channels_of(map_grey, map_valid)
     counts = (mine[..., _VALID] > 0) & (theirs[..., _VALID] > 0)
     numbers = _cell_numbers(registration, grid, pose, 2.0**level, (shape[0], shape[1]))
     inside = counts & (numbers >= 0)

@@ -220,7 +220,8 @@ def _from_plain(plain: dict[str, Any]) -> ChangedGround:
     plane, cells = plain["plane"], plain["cells"]
     frame = LocalFrame(float(plane["origin_lat_deg"]), float(plane["origin_lon_deg"]))
     west_m, north_m, side_m = (float(cells[name]) for name in ("west_m", "north_m", "side_m"))
-    grid = ChangeGrid(west_m, north_m, side_m, int(cells["rows"]), int(cells["cols"]), frame)
+    rows, cols = (int(cells[name]) for name in ("rows", "cols"))
+    grid = ChangeGrid(west_m, north_m, side_m, rows, cols, frame)
     shape = grid.rows, grid.cols
     score, views = np.full(shape, np.nan), np.zeros(shape, np.int32)
     changed = np.zeros(shape, np.bool_)

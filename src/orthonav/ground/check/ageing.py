@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.evidence import FINE, evidence
+from orthonav.core.register.channels import FINE, channels_of
 
 Array = NDArray[np.float32]
 PATCH_PX = 24
@@ -89,7 +89,7 @@ def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
         np.log(_mean(np.abs(a - b)) + np.float32(0.1))
         for a, b in ((picture, broad), (broad, broader))
     ]
-    strength = evidence(grey, np.ones(grey.shape, np.bool_), FINE)
+    strength = channels_of(grey, np.ones(grey.shape, np.bool_), FINE)
     found.append(_mean(strength[..., 0] ** 2 + strength[..., 1] ** 2))
     half = every_px // 2
     thin = [each[half::every_px, half::every_px] for each in found]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.register.reference import GreyPyramid
+from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.planning.area import Area, Extent
 

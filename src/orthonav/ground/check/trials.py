@@ -22,19 +22,18 @@ from orthonav.core.errors import AreaError, MapFileError, WorkerError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.registration import RegistrationLocalizer
+from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.reference import GreyPyramid
-from orthonav.core.register.registrar import Levels, apart_px
+from orthonav.core.register.template import Levels
+from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.check.ageing import MARGIN_PX, another_year, default_model, displaced, features
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.imagery.raster import SheetRaster
+from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 
 EVERY_PX, PERSISTENCE_LEVELS = 8, 3
 """Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""
@@ -453,22 +452,22 @@ class Trier:
             at = place_en_m + rng.normal(0, plan.request.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(at)
             prior = Prior(float(lat), float(lon), plan.request.prior_std_m)
-        seen = registration.register(view, prior, plan.request.yaw_std_deg is not None)
-        if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
+        search = registration.search(view, prior, plan.request.yaw_std_deg is not None)
+        best = search if isinstance(search, NoFix) else search.run()
+        if isinstance(search, NoFix) or isinstance(best, NoFix):
             return Trial(here, math.nan, 0.0, expected)
-        prepared, best = seen.prepared, seen.found
-        fix = registration.fix(seen, best, view.telemetry)
+        fix = registration.fix(search, best, view.telemetry)
         found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
         rivals = [
-            (score, placed)
-            for score, placed in best.finalists
-            if apart_px(placed, best.placed) * registration.grid.gsd_m > plan.side_m / 4
+            each
+            for each in best.rivals
+            if each.apart_px(best) * registration.grid.gsd_m > plan.side_m / 4
         ]
         rival, share = NOWHERE, math.nan
         if rivals:
-            score, placed = max(rivals, key=lambda each: each[0])
-            east, north = registration.camera_en_m(prepared, placed.pose)
-            rival, share = (float(east), float(north)), score / max(best.score, 1e-6)
+            strongest = max(rivals, key=lambda each: each.score)
+            east, north = registration.camera_en_m(search.view, strongest.pose)
+            rival, share = (float(east), float(north)), strongest.score / max(best.score, 1e-6)
         error_m = float(np.hypot(*(found - place_en_m)))
         confidence = fix.confidence if math.isfinite(fix.confidence) else 0.0
         accepted, near = confidence >= plan.request.accept, error_m <= fix.radius_m

@@ -1,17 +1,25 @@
 """The grid of a service, cells of pixels in its own coordinate system, and the cells of an area."""
 
 import math
+import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
+from rasterio.transform import Affine
 
-from orthonav.core.errors import AreaError
-from orthonav.ground.fetch.crs import ground_scale, transformers
+from orthonav.core.errors import AreaError, FetchError
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.planning.area import Area
 
+MERCATOR_HALF_M = math.pi * 6378137.0
+"""Half the width of the square of EPSG:3857, metres of that projection."""
 MAX_CANDIDATES = 40_000_000
 """Cells of the box around an area that are examined: some hundred megabytes at one row a time."""
+_ROUND = 1.02
+"""Allowance for the change of scale across an area."""
 _EDGE = np.linspace(0, 1, 21)
 """Points along an edge that are projected, as rasterio's `transform_bounds` does."""
 
@@ -42,6 +50,11 @@ class CellGrid:
             self.north - row * self.cell_h_px * self.res_y,
         )
 
+    def transform(self, row: int, col: int) -> Affine:
+        """From column and row of a pixel, counted from a cell's corner, to coordinates."""
+        west, north = self.corner(row, col)
+        return Affine(self.res_x, 0, west, 0, -self.res_y, north)
+
     def bounds(self, row: int, col: int) -> tuple[float, float, float, float]:
         """West, south, east, north of a cell."""
         west, north = self.corner(row, col)
@@ -51,11 +64,15 @@ class CellGrid:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The cells of `grid` that cover an area: `cells` (N, 2) rows and columns, by row; `gsd_m`."""
+    """The cells of `grid` that cover an area: `cells` (N, 2) rows and columns, by row; `gsd_m`.
+
+    `is_cut`: whether the area reaches beyond the limits of the grid.
+    """
 
     grid: CellGrid
     cells: NDArray[np.int64]
     gsd_m: float
+    is_cut: bool
 
     @property
     def first(self) -> tuple[int, int]:
@@ -75,57 +92,102 @@ def select(grid: CellGrid, area: Area, margin_m: float) -> Selection:
 
     Raises `AreaError` where there is none, or where the box around the area has too many.
     """
-    rows, cols = _candidates(grid, area, margin_m)
+    row0, col0, row1, col1 = wanted = _box(grid, area, margin_m)
+    if grid.limits is not None:
+        row0, col0 = max(row0, grid.limits[0]), max(col0, grid.limits[1])
+        row1, col1 = min(row1, grid.limits[2]), min(col1, grid.limits[3])
+    rows, cols = range(row0, row1 + 1), np.arange(col0, col1 + 1, dtype=np.int64)
     if len(rows) * len(cols) > MAX_CANDIDATES:
         raise AreaError(
             f"area is {len(rows)} x {len(cols)} cells of this service, more than can be planned; "
             "ask for coarser pixels (--gsd-m) or a part of the area"
         )
-    chosen = [part for row in rows if len(part := _row_cells(grid, area, margin_m, row, cols))]
-    if not chosen:
-        raise AreaError("area lies outside what the service covers")
     scale = ground_scale(grid.crs, area.frame)
+    across, down = grid.cell_w_px * grid.res_x, grid.cell_h_px * grid.res_y
+    half_m = _ROUND * math.hypot(across * scale[0], down * scale[1]) / 2
+    x = grid.west + (cols + 0.5) * across
+    chosen = []
+    for row in rows:
+        y = np.full(len(x), grid.north - (row + 0.5) * down)
+        lon, lat = transformers(grid.crs)[1].transform(x, y)
+        centres = area.frame.en_from_latlon(np.asarray(lat), np.asarray(lon))
+        taken = cols[area.contains(centres, margin_m + half_m)]
+        chosen.append(np.stack([np.full(len(taken), row), taken], axis=1))
+    cells = np.concatenate(chosen or [np.zeros((0, 2), dtype=np.int64)])
+    if not len(cells):
+        raise AreaError("area lies outside what the service covers")
     gsd_m = math.sqrt(scale[0] * grid.res_x * scale[1] * grid.res_y)
-    return Selection(grid, np.concatenate(chosen), gsd_m)
+    return Selection(grid, cells, gsd_m, wanted != (row0, col0, row1, col1))
 
 
-def _row_cells(
-    grid: CellGrid, area: Area, margin_m: float, row: int, cols: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Cells (N, 2) of one row: those whose circumscribed circle touches the area."""
-    corners_x = grid.west + np.append(cols, cols[-1] + 1) * grid.cell_w_px * grid.res_x
-    _, south, _, north = grid.bounds(row, 0)
-    lon, lat = transformers(grid.crs)[1].transform(*np.meshgrid(corners_x, [north, south]))
-    with np.errstate(invalid="ignore"):
-        top, bottom = area.frame.en_from_latlon(np.asarray(lat), np.asarray(lon))
-    centres = (top[:-1] + top[1:] + bottom[:-1] + bottom[1:]) / 4
-    radius = np.maximum(
-        np.linalg.norm(top[:-1] - bottom[1:], axis=1), np.linalg.norm(top[1:] - bottom[:-1], axis=1)
-    )
-    good = np.isfinite(centres).all(axis=1)
-    half_m = float(radius[good].max()) / 2 if good.any() else 0.0
-    inside = good & area.contains(np.nan_to_num(centres), margin_m + half_m)
-    taken = cols[inside]
-    return np.stack([np.full(len(taken), row), taken], axis=1).astype(np.int64)
-
-
-def _candidates(grid: CellGrid, area: Area, margin_m: float) -> tuple[range, NDArray[np.int64]]:
-    """Rows and columns of the box around the area."""
+def _box(grid: CellGrid, area: Area, margin_m: float) -> tuple[int, int, int, int]:
+    """First row and column, last row and column of the box around the area."""
     west, south, east, north = area.extent_en_m
     u = (west - margin_m) + _EDGE * (east - west + 2 * margin_m)
     v = (south - margin_m) + _EDGE * (north - south + 2 * margin_m)
     points = np.stack([m.ravel() for m in np.meshgrid(u, v)], axis=1)
     lat, lon = area.frame.latlon_from_en(points)
-    x, y = transformers(grid.crs)[0].transform(lon, lat)
-    x, y = np.asarray(x), np.asarray(y)
+    x, y = (np.asarray(values) for values in transformers(grid.crs)[0].transform(lon, lat))
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise AreaError(f"area lies outside the coordinate system {grid.crs}")
     across, down = grid.cell_w_px * grid.res_x, grid.cell_h_px * grid.res_y
     col0, col1 = (math.floor((edge - grid.west) / across) for edge in (x.min(), x.max()))
     row0, row1 = (math.floor((grid.north - edge) / down) for edge in (y.max(), y.min()))
-    if grid.limits is not None:
-        row0, col0 = max(row0, grid.limits[0]), max(col0, grid.limits[1])
-        row1, col1 = min(row1, grid.limits[2]), min(col1, grid.limits[3])
-    if row1 < row0 or col1 < col0:
-        raise AreaError("area lies outside what the service covers")
-    return range(row0, row1 + 1), np.arange(col0, col1 + 1, dtype=np.int64)
+    return row0, col0, row1, col1
+
+
+def ground_scale(crs: str, frame: LocalFrame) -> tuple[float, float]:
+    """Metres on the ground per unit of `crs`, along x and along y, at the centre of `frame`."""
+    to_crs, to_degrees = transformers(crs)
+    x, y = to_crs.transform(frame.lon_deg, frame.lat_deg)
+    step = 1e-3 if known_crs(crs).is_geographic else 100.0
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise FetchError(f"area lies outside the coordinate system {crs}")
+    lon, lat = to_degrees.transform([x - step, x + step, x, x], [y, y, y - step, y + step])
+    points = frame.en_from_latlon(np.asarray(lat), np.asarray(lon))
+    along_x = float(np.linalg.norm(points[1] - points[0])) / (2 * step)
+    along_y = float(np.linalg.norm(points[3] - points[2])) / (2 * step)
+    return along_x, along_y
+
+
+def mean_scale(crs: str, frame: LocalFrame) -> float:
+    """The geometric mean of `ground_scale`."""
+    return math.sqrt(math.prod(ground_scale(crs, frame)))
+
+
+@lru_cache(maxsize=16)
+def known_crs(crs: str) -> pyproj.CRS:
+    """A coordinate system by name. Raises `FetchError`."""
+    try:
+        return pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.ProjError as error:
+        raise FetchError(f"unknown coordinate system: {crs[:100]}") from error
+
+
+@lru_cache(maxsize=16)
+def transformers(crs: str) -> tuple[pyproj.Transformer, pyproj.Transformer]:
+    """From longitude, latitude (WGS84) to x, y of `crs`, and back. Raises `FetchError`."""
+    known = known_crs(crs)
+    return (
+        pyproj.Transformer.from_crs("EPSG:4326", known, always_xy=True),
+        pyproj.Transformer.from_crs(known, "EPSG:4326", always_xy=True),
+    )
+
+
+def north_first(crs: str) -> bool:
+    """Whether the authority of `crs` names the northing or latitude first."""
+    axes = known_crs(crs).axis_info
+    return bool(axes) and axes[0].direction.lower() == "north"
+
+
+def epsg_name(crs: str) -> str:
+    """A coordinate system as EPSG:CODE. Raises `FetchError` where it has no such code."""
+    if crs.endswith(("CRS84", "CRS:84")):
+        return "EPSG:4326"
+    found = re.search(r"EPSG\b.*?[:/](\d{4,6})$", crs)
+    code = int(found.group(1)) if found else known_crs(crs).to_epsg()
+    if code in (900913, 3785, 102100, 102113):
+        code = 3857
+    if code is None:
+        raise FetchError(f"unknown coordinate system: {crs[:100]}")
+    return f"EPSG:{code}"

@@ -13,8 +13,8 @@ GSD_TOLERANCE = 1.05
 are powers of two and do not fall on round numbers)."""
 FORMATS = ("image/jpeg", "image/png", "image/webp")
 """Media types that can be read, the usual one of orthophotos first."""
-HEIGHTS_FORMAT = "image/x-bil;bits=32"
-"""Media type of heights: raw numbers of 32 bits, by rows. Taken where a preset or user names it."""
+HEIGHTS_FORMAT = "image/geotiff"
+"""Media type of heights, numbers of 32 bits. Taken where a preset or user names it."""
 TERRAIN_GSD_M = 5.0
 """Ground resolution of heights where none is given: half the posting of a map's terrain."""
 MAX_COARSER = 1.5
@@ -26,43 +26,23 @@ class ImageryOptions:
     """Which imagery a service is asked for; None leaves the choice to the preset or the service."""
 
     layer: str | None = None
-    """Name of the layer."""
     style: str | None = None
-    """Style of the layer; an error where the layer does not have it."""
-    format: str | None = None
-    """Media type, such as `image/jpeg`; an error where the service does not offer it."""
-    crs: str | None = None
-    """Coordinate system as EPSG:CODE."""
-    matrix_set: str | None = None
-    """Tile matrix set of a WMTS."""
-    zoom: str | None = None
-    """Zoom level, or name of a tile matrix."""
-    gsd_m: float | None = None
-    """Metres on the ground per pixel; None means `DEFAULT_GSD_M`, or the files' own (STAC, COG)."""
-    time: str | None = None
-    """Time of the imagery; ISO 8601, for STAC an interval with a slash."""
-    tile_px: int | None = None
-    """Width and height of tiles (XYZ) or of the images requested (WMS), pixels."""
-    min_zoom: int | None = None
-    """Coarsest zoom level that exists, where the service itself does not say."""
-    max_zoom: int | None = None
-    """Finest zoom level that exists, where the service itself does not say."""
-    empty: str | None = None
-    """Colour that stands for missing imagery: "black" or "white"."""
-    collection: str | None = None
-    """Collection of a STAC API."""
-    asset: str | None = None
-    """Asset of each STAC item."""
-    bands: tuple[int, ...] | None = None
-    """Bands of a file, from 1."""
-    version: str | None = None
-    """Version of the WMS protocol, 1.1.1 or 1.3.0."""
-    subdomains: str | None = None
-    """Values of {s} in a tile template, one letter each; None means abc."""
-    preferred_style: str | None = None
-    """Style taken where the layer has it and `style` is None."""
-    preferred_format: str | None = None
-    """Format taken where the service offers it and `format` is None."""
+    format: str | None = None  # media type, such as image/jpeg
+    crs: str | None = None  # as EPSG:CODE
+    matrix_set: str | None = None  # of a WMTS
+    zoom: str | None = None  # zoom level, or name of a tile matrix
+    gsd_m: float | None = None  # metres on the ground per pixel
+    time: str | None = None  # ISO 8601; for STAC an interval with a slash
+    tile_px: int | None = None  # width of tiles (XYZ) or of the images requested (WMS)
+    min_zoom: int | None = None  # coarsest zoom level, where the service does not say
+    max_zoom: int | None = None  # finest zoom level, where the service does not say
+    empty: str | None = None  # colour of missing imagery: "black" or "white"
+    collection: str | None = None  # of a STAC API
+    asset: str | None = None  # of each STAC item
+    bands: tuple[int, ...] | None = None  # of a file, from 1
+    version: str | None = None  # of the WMS protocol, 1.1.1 or 1.3.0
+    preferred_style: str | None = None  # taken where the layer has it and `style` is None
+    preferred_format: str | None = None  # likewise
 
     def over(self, preset: "ImageryOptions") -> "ImageryOptions":
         """These options where they are set, else those of the preset."""
@@ -79,38 +59,25 @@ class ImageryOptions:
 class Provenance:
     """Origin and terms of imagery, written into the file."""
 
-    source: str
-    """Address without keys."""
-    layer: str
-    """Name of the layer, or of the STAC collection."""
-    date: str | None = None
-    """Acquisition date: YYYY[-MM[-DD]], or first and last with a slash between."""
+    source: str  # address without keys
+    layer: str  # or STAC collection
+    date: str | None = None  # acquisition: YYYY[-MM[-DD]], or first and last with a slash between
     licence: str | None = None
-    """Licence of the imagery."""
     attribution: str | None = None
-    """Who must be named."""
-    note: str | None = None
-    """What a user should know, such as resampling."""
-    datum: str | None = None
-    """What the heights of a terrain model count from; None for imagery."""
+    note: str | None = None  # what a user should know, such as resampling
+    datum: str | None = None  # what the heights of a terrain model count from
 
 
 @dataclass(frozen=True)
 class SourceSpec:
     """A service and the imagery requested of it."""
 
-    protocol: str
-    """One of `orthonav.ground.fetch.presets.PROTOCOLS`."""
-    url: str
-    """Its address, with `{key}` in place of a key."""
+    protocol: str  # one of `orthonav.ground.fetch.presets.PROTOCOLS`
+    url: str  # with `{key}` in place of a key
     options: ImageryOptions
-    """Which imagery."""
-    provenance: Provenance
-    """Origin and terms, as far as they are known before the service is asked."""
-    secrets: tuple[Secret, ...] = ()
-    """The key, if the address holds one."""
-    token_url: str | None = None
-    """Address of a signing service for files."""
+    provenance: Provenance  # as far as it is known before the service is asked
+    secrets: tuple[Secret, ...] = ()  # the key, if the address holds one
+    token_url: str | None = None  # address of a signing service for files
 
 
 def finest_fitting(gsds_m: list[float], wanted_m: float, levels: str) -> int:
@@ -118,19 +85,17 @@ def finest_fitting(gsds_m: list[float], wanted_m: float, levels: str) -> int:
 
     Raises `FetchError` with the available `levels`.
     """
-    fitting = [index for index, gsd_m in enumerate(gsds_m) if gsd_m <= wanted_m * GSD_TOLERANCE]
-    if fitting:
-        return max(fitting, key=lambda index: gsds_m[index])
-    finest = min(range(len(gsds_m)), key=lambda index: gsds_m[index])
-    if gsds_m[finest] > wanted_m * MAX_COARSER:
+    fitting = [gsd_m for gsd_m in gsds_m if gsd_m <= wanted_m * GSD_TOLERANCE]
+    finest_m = min(gsds_m)
+    if not fitting and finest_m > wanted_m * MAX_COARSER:
         raise FetchError(
-            f"no imagery of {wanted_m:g} m per pixel: the finest is {gsds_m[finest]:.3g} m; "
+            f"no imagery of {wanted_m:g} m per pixel: the finest is {finest_m:.3g} m; "
             f"available: {levels}"
         )
-    return finest
+    return gsds_m.index(max(fitting, default=finest_m))
 
 
-def choose(names: list[str], wanted: str | None, what: str) -> str:
+def choose(names: Sequence[str], wanted: str | None, what: str) -> str:
     """`wanted` if it is one of `names`, else `FetchError` that lists the names; None: the first."""
     if wanted in names:
         return str(wanted)
@@ -154,10 +119,10 @@ def choose_layer(names: list[str], wanted: str | None, url: str, *, named: bool 
 def choose_format(offered: Sequence[str], options: ImageryOptions, what: str) -> str:
     """The media type requested, else the preferred one, else the first of `FORMATS` on offer."""
     if options.format is not None:
-        return choose(list(offered), options.format, f"{what} has no format")
+        return choose(offered, options.format, f"{what} has no format")
     found = next((name for name in (options.preferred_format, *FORMATS) if name in offered), None)
     if found is None:
-        raise FetchError(f"{what} comes as {listed(list(offered))}; supported are JPEG, PNG, WebP")
+        raise FetchError(f"{what} comes as {listed(offered)}; supported are JPEG, PNG, WebP")
     return found
 
 
@@ -165,19 +130,18 @@ def choose_time(values: Sequence[str], wanted: str, layer: str) -> str:
     """The time requested, if the layer has it; one with an interval (A/B) may have any."""
     if any("/" in value for value in values):
         return wanted
-    return choose(list(values), wanted, f"layer {layer} has no time")
+    return choose(values, wanted, f"layer {layer} has no time")
 
 
-def listed(names: list[str], wanted: str = "", most: int = 12) -> str:
-    """Names for an error: those similar to the wanted one first, at most `most`."""
-    wanted = wanted.lower()
-    words = {word for word in wanted.replace(".", " ").replace("_", " ").split() if len(word) > 2}
-
-    def dissimilarity(name: str) -> tuple[float, str]:
-        low = name.lower()
-        hits = sum(word in low for word in words) + (2 if wanted and wanted[:12] in low else 0)
-        return (-hits, low)
-
-    ordered = sorted(names, key=dissimilarity)
+def listed(names: Sequence[str], wanted: str = "", most: int = 12) -> str:
+    """Names for an error: those that begin like the wanted one or share a word first."""
+    words = [word for word in wanted.lower().replace("_", ".").split(".") if len(word) > 2]
+    ordered = sorted(
+        names,
+        key=lambda name: (
+            -sum(word in name.lower() for word in [*words, wanted.lower()[:12]]),
+            name,
+        ),
+    )
     more = f" and {len(ordered) - most} more" if len(ordered) > most else ""
     return ", ".join(ordered[:most]) + more if ordered else "none"

@@ -1,45 +1,33 @@
 """BD ORTHO packages of a French department, from the download service of the Géoplateforme.
 
 The service answers in Atom: pages of packages, and for each package its files with length and MD5
-(in `content`). Files are downloaded by ranges into `NAME.part` and renamed once length and MD5 are
-verified. They are split 7z archives, which 7-Zip unpacks (`7z x NAME.7z.001`).
+(in `content`). Files are downloaded into `NAME.part` and renamed once length and MD5 are verified.
+They are split 7z archives, which 7-Zip unpacks (`7z x NAME.7z.001`).
 """
 
 import hashlib
 import re
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 from xml.etree.ElementTree import Element
 
 from orthonav.core.errors import FetchError, OutputError
 from orthonav.core.files import Progress
-from orthonav.ground.fetch.client import Client
-from orthonav.ground.fetch.documents import get_xml
 from orthonav.ground.fetch.options import listed
-from orthonav.ground.fetch.politeness import RequestLimits
-from orthonav.ground.fetch.urls import joined, with_query
+from orthonav.ground.fetch.urls import linked, with_query
+from orthonav.ground.fetch.web import Web
 
 SERVICE = "https://data.geopf.fr/telechargement"
-RESOURCE = "BDORTHO"
 PAGE = 50
 """Packages per page, the most that the service returns."""
 MAX_PAGES = 200
-PART_BYTES = 16 * 2**20
-"""Bytes per request: seconds on a usual line, so little is lost by an interrupt."""
-LIMITS = RequestLimits(parallel=2, per_second=1.0, total_s=600.0)
-"""One request a second: the service documents ten, and has refused more than one."""
 ATTRIBUTION = "IGN, BD ORTHO; Licence Ouverte / Open Licence 2.0 (Etalab)"
-_ATOM = "{http://www.w3.org/2005/Atom}"
-_GPF = "{https://data.geopf.fr/annexes/ressources/xsd/gpf_dl.xsd}"
-_NAME = re.compile(r"^[\w.-]{1,200}$")
 _ASKED = re.compile(r"^(D?\d{2,3}|D?\d[AB]|D?0\d[AB]):(\d{4})(?::(RVB|IRC))?$", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class Package:
+class Package(NamedTuple):
     """A package: its name, address, zone such as D003, and date of edition."""
 
     name: str
@@ -48,8 +36,7 @@ class Package:
     date: str
 
 
-@dataclass(frozen=True)
-class PackageFile:
+class PackageFile(NamedTuple):
     """A file of a package; `size_bytes` and `md5` where the service states them."""
 
     name: str
@@ -68,150 +55,114 @@ def parse_package(text: str) -> tuple[str, str, str]:
 
 
 def find_package(
-    client: Client, zone: str, year: str, kind: str = "RVB", service: str = SERVICE
+    web: Web, zone: str, year: str, kind: str = "RVB", service: str = SERVICE
 ) -> Package:
     """The finest package of a department and year. Raises `FetchError` with the available years."""
-    here = [
-        package
-        for package in _packages(client, zone, service)
-        if package.zone == zone and f"_{kind}-" in package.name
-    ]
+    url = f"{service}/resource/BDORTHO"
+    here = []
+    for entry in _entries(web, url, {"zone": zone}):
+        name, link, place = entry.findtext("title", ""), entry.find("link"), entry.find("zone")
+        term = place.get("term") if place is not None else None
+        if term == zone and f"_{kind}-" in name and link is not None:
+            date = entry.findtext("editionDate", "").strip()
+            here.append(Package(name.strip(), linked(url, link.get("href", "")), zone, date))
     dated = [package for package in here if package.date.startswith(year)]
     if not dated:
         years = sorted({package.date[:4] for package in here})
         raise FetchError(f"no {kind} package of {zone} of {year}; available: {listed(years)}")
-    newest_first = sorted(dated, key=lambda package: package.name, reverse=True)
+    newest_first = sorted(dated, reverse=True)
     return min(newest_first, key=_centimetres)
 
 
-def package_files(client: Client, package: Package) -> list[PackageFile]:
+def package_files(web: Web, package: Package) -> list[PackageFile]:
     """Files of a package, in order of their names. Raises `FetchError`."""
-    files: dict[str, PackageFile] = {}
-    for entry in _entries(client, package.url, {}):
-        link = entry.find(f"{_ATOM}link")
+    files = []
+    for entry in _entries(web, package.url, {}):
+        link = entry.find("link")
         if link is None:
             continue
-        url = joined(package.url, link.get("href", ""))
+        url = linked(package.url, link.get("href", ""))
         name = unquote(urlsplit(url).path.rpartition("/")[2])
-        if not _NAME.match(name) or name.startswith("."):
+        if not re.fullmatch(r"\w[\w.-]{,199}", name):
             raise FetchError(f"package names an unsafe file: {name[:100]!r}")
-        length = link.get(f"{_GPF}length", "")
-        md5 = (entry.findtext(f"{_ATOM}content") or "").strip().lower()
-        files[name] = PackageFile(
-            name,
-            url,
-            int(length) if length.isdecimal() else None,
-            md5 if re.fullmatch(r"[0-9a-f]{32}", md5) else None,
-        )
-    archives = [file for file in files.values() if re.search(r"\.7z(\.\d{3})?$", file.name)]
-    if not archives:
+        length, md5 = link.get("length", ""), entry.findtext("content", "").strip().lower()
+        if re.search(r"\.7z(\.\d{3})?$", name):
+            size = int(length) if length.isdecimal() else None
+            files.append(PackageFile(name, url, size, md5 if len(md5) == 32 else None))
+    if not files:
         raise FetchError(f"package has no archive: {package.url}")
-    return sorted(archives, key=lambda file: file.name)
+    return sorted(files)
 
 
 def download_package(
-    client: Client, files: list[PackageFile], folder: Path, progress: Progress
+    web: Web, files: list[PackageFile], folder: Path, progress: Progress
 ) -> list[Path]:
     """Download what is missing of these files into `folder`; returns them in order.
 
-    A complete file is not requested again; an incomplete one is resumed. Raises `FetchError`, and
-    `OutputError` where the disk is too small or cannot be written.
+    A complete file is not requested again. Raises `FetchError`, and `OutputError` where the disk
+    is too small or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder ({error.strerror}): {folder}") from error
     missing = [file for file in files if not (folder / file.name).is_file()]
-    parts = [path for file in missing if (path := _part(folder, file)).is_file()]
-    needed = sum(file.size_bytes or 0 for file in missing) - sum(p.stat().st_size for p in parts)
+    needed = sum(file.size_bytes or 0 for file in missing)
     if needed > shutil.disk_usage(folder).free:
         raise OutputError(f"disk is too small: {needed / 1e9:.1f} GB are needed: {folder}")
     for number, file in enumerate(files):
 
-        def shown(share: float, number: int = number) -> None:
+        def received(size: int, number: int = number, file: PackageFile = file) -> None:
+            share = min(1.0, size / file.size_bytes) if file.size_bytes else 0.0
             progress("package", (number + share) / len(files))
 
         if file in missing:
-            _download(client, file, folder, shown)
-        shown(1.0)
+            part = folder / f"{file.name}.part"
+            try:
+                with part.open("wb") as stream:
+                    web.download(file.url, stream, max_bytes=file.size_bytes, received=received)
+                _check(file, part)
+                part.replace(folder / file.name)
+            except OSError as error:
+                part.unlink(missing_ok=True)
+                if isinstance(error, FetchError | OutputError):
+                    raise
+                raise OutputError(f"cannot write ({error.strerror or error}): {part}") from error
+        progress("package", (number + 1) / len(files))
     return [folder / file.name for file in files]
 
 
-def _download(
-    client: Client, file: PackageFile, folder: Path, progress: Callable[[float], None]
-) -> None:
-    part = _part(folder, file)
-    size: int | None = file.size_bytes
-    try:
-        with part.open("ab") as stream:
-            at = stream.tell()
-            while size is None or at < size:
-                data, size, _ = client.get_range(file.url, at, at + PART_BYTES)
-                if file.size_bytes not in (None, size):
-                    raise FetchError(f"file has {size} bytes, not {file.size_bytes}: {file.url}")
-                stream.write(data)
-                stream.flush()
-                at += len(data)
-                progress(at / size if size else 1.0)
-        _check(file, part, size)
-        part.replace(folder / file.name)
-    except OSError as error:
-        if isinstance(error, FetchError | OutputError):
-            raise
-        raise OutputError(f"cannot write ({error.strerror or error}): {part}") from error
+def _check(file: PackageFile, part: Path) -> None:
+    """Raise `FetchError` where the size or MD5 of a downloaded file is wrong."""
+    size = part.stat().st_size
+    if file.size_bytes not in (None, size):
+        problem = f"has {size} bytes instead of {file.size_bytes}"
+    elif file.md5 not in (None, _md5(part)):
+        problem = "has another MD5 than the service states"
+    else:
+        return
+    raise FetchError(f"file {problem}; it was removed, run the command again: {file.url}")
 
 
-def _check(file: PackageFile, part: Path, size: int | None) -> None:
-    """Remove a file whose size or MD5 is wrong, and raise `FetchError`."""
-    problem = ""
-    if size is not None and part.stat().st_size != size:
-        problem = f"has {part.stat().st_size} bytes instead of {size}"
-    elif file.md5 is not None:
-        with part.open("rb") as stream:
-            found = hashlib.file_digest(
-                stream, lambda: hashlib.md5(usedforsecurity=False)
-            ).hexdigest()
-        problem = "" if found == file.md5 else "has another MD5 than the service states"
-    if problem:
-        part.unlink()
-        raise FetchError(f"file {problem}; it was removed, run the command again: {file.url}")
+def _md5(path: Path) -> str:
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, lambda: hashlib.md5(usedforsecurity=False))
+    return digest.hexdigest()
 
 
-def _packages(client: Client, zone: str, service: str) -> list[Package]:
-    found = []
-    url = f"{service}/resource/{RESOURCE}"
-    for entry in _entries(client, url, {"zone": zone}):
-        name = (entry.findtext(f"{_ATOM}title") or "").strip()
-        link, place = entry.find(f"{_ATOM}link"), entry.find(f"{_GPF}zone")
-        date = (entry.findtext(f"{_GPF}editionDate") or "").strip()
-        if link is None or not _NAME.match(name):
-            continue
-        term = place.get("term", "") if place is not None else ""
-        found.append(Package(name, joined(url, link.get("href", "")), term, date))
-    return found
-
-
-def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Element]:
+def _entries(web: Web, url: str, parameters: dict[str, str]) -> list[Element]:
     """Entries of all pages of a feed. Raises `FetchError`."""
     found: list[Element] = []
-    pages = number = 1
-    while number <= pages:
-        query = {**parameters, "page": str(number), "limit": str(PAGE)}
-        _, feed = get_xml(client, with_query(url, query))
-        count = feed.get(f"{_GPF}pagecount", "1")
-        pages = int(count) if count.isdecimal() else 1
-        if pages > MAX_PAGES:
-            raise FetchError(f"feed has {pages} pages, more than are read: {url}")
-        found += feed.findall(f"{_ATOM}entry")
-        number += 1
-    return found
+    for number in range(1, MAX_PAGES + 1):
+        feed = web.get_xml(with_query(url, parameters | {"page": str(number), "limit": str(PAGE)}))
+        found += feed.findall("entry")
+        pages = feed.get("pagecount", "1")
+        if not pages.isdecimal() or number >= int(pages):
+            return found
+    raise FetchError(f"feed has more pages than are read: {url}")
 
 
 def _centimetres(package: Package) -> int:
     """Pixel width in a name: 0M20 is 20 cm."""
     found = re.search(r"-(\d+)M(\d+)_", package.name)
     return int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6
-
-
-def _part(folder: Path, file: PackageFile) -> Path:
-    return folder / f"{file.name}.part"

@@ -1,5 +1,10 @@
-"""Services known by name, read from `presets.toml` in this package. Needs no extra."""
+"""What `--source` means: a service known by name, from `presets.toml`, or an address.
 
+Needs no extra.
+"""
+
+import os
+import re
 import tomllib
 from dataclasses import dataclass, fields
 from functools import cache
@@ -7,8 +12,17 @@ from importlib import resources
 from typing import Any
 
 from orthonav.core.errors import FetchError
-from orthonav.ground.fetch.options import ImageryOptions, listed
+from orthonav.ground.fetch.options import ImageryOptions, Provenance, SourceSpec, listed
+from orthonav.ground.fetch.urls import (
+    KEY,
+    Secret,
+    checked_url,
+    origin_of,
+    shown,
+    without_literal_keys,
+)
 
+_DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?")
 PROTOCOLS = ("wmts", "wms", "xyz", "tms", "stac", "cog")
 CURRENT = "current"
 _OPTIONS = {field.name for field in fields(ImageryOptions)}
@@ -21,12 +35,9 @@ class PresetLayer:
     """One layer of a service, selected by `id` after the colon."""
 
     id: str
-    date: str | None
-    """As in `Provenance`."""
-    gsd_m: float
-    """Ground resolution of the imagery, metres per pixel."""
-    options: ImageryOptions
-    """Options of the service and the layer."""
+    date: str | None  # as in `Provenance`
+    gsd_m: float  # ground resolution of the imagery, metres per pixel
+    options: ImageryOptions  # of the service and the layer
     note: str | None = None
 
 
@@ -42,16 +53,12 @@ class Preset:
     licence: str
     licence_url: str
     attribution: str
-    source_page: str
-    """Documentation that the preset was collected from."""
+    source_page: str  # documentation that the preset was collected from
     layers: dict[str, PresetLayer]
-    token_url: str | None = None
-    """Address of a signing service for files."""
-    key_env: str | None = None
-    """Environment variable that holds the key."""
+    token_url: str | None = None  # address of a signing service for files
+    key_env: str | None = None  # environment variable that holds the key
     note: str | None = None
-    datum: str | None = None
-    """What the heights of a terrain model count from (`--dem-datum`); None for imagery."""
+    datum: str | None = None  # as in `Provenance`
 
     def layer(self, id_: str | None) -> PresetLayer:
         """The layer of that id, or the current one. Raises `FetchError` with the available ones."""
@@ -66,13 +73,11 @@ class Preset:
         """Plain values for JSON; options that are not set are left out."""
         layers = [
             {
-                **{name: value for name, value in vars(layer).items() if name != "options"},
-                **{
-                    name: value
-                    for name, value in vars(layer.options).items()
-                    if value != getattr(ImageryOptions, name)
-                },
+                name: value
+                for name, value in (vars(layer) | vars(layer.options)).items()
+                if name != "options" and (value is not None or name in ("date", "note"))
             }
+            | {"gsd_m": layer.gsd_m}
             for layer in self.layers.values()
         ]
         return {**vars(self), "layers": layers}
@@ -81,11 +86,7 @@ class Preset:
 @cache
 def presets() -> dict[str, Preset]:
     """All services by name."""
-    text = (
-        resources.files("orthonav.ground.fetch")
-        .joinpath("presets.toml")
-        .read_text(encoding="utf-8")
-    )
+    text = resources.files(__package__).joinpath("presets.toml").read_text(encoding="utf-8")
     return {name: _preset(name, values) for name, values in tomllib.loads(text).items()}
 
 
@@ -97,30 +98,72 @@ def find_preset(name: str) -> Preset:
     return known[name]
 
 
+def parse_source(
+    text: str,
+    options: ImageryOptions,
+    *,
+    date: str | None = None,
+    licence: str | None = None,
+    attribution: str | None = None,
+    key_env: str | None = None,
+) -> SourceSpec:
+    """`NAME[:YEAR]` of a service known by name, or `wmts|wms|xyz|tms|stac|cog:ADDRESS`.
+
+    Raises `FetchError` for unknown names, addresses that are not http or https, and missing keys.
+    """
+    if date is not None:
+        check_date(date)
+    head, _, rest = text.partition(":")
+    if head in PROTOCOLS and rest:
+        checked_url(re.sub(r"\{[^{}]*\}", "0", rest))
+        if head not in ("xyz", "tms") and set(re.findall(r"\{[^{}]*\}", rest)) - {KEY}:
+            raise FetchError(f"only {KEY} may stand in this address: {shown(rest)}")
+        url, literal = without_literal_keys(rest)
+        provenance = Provenance(shown(url), options.layer or "", date, licence, attribution)
+        secrets = _secrets(url, key_env, literal)
+        return SourceSpec(head, url, options, provenance, secrets)
+    if head.lower() in ("http", "https", "file"):
+        raise FetchError(
+            f"write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): {shown(text)}"
+        )
+    preset = find_preset(head)
+    layer = preset.layer(rest or None)
+    options = options.over(layer.options)
+    provenance = Provenance(
+        shown(preset.url),
+        options.layer or options.collection or "",
+        date or layer.date,
+        licence or f"{preset.licence} ({preset.licence_url})",
+        attribution or preset.attribution,
+        "; ".join(note for note in (layer.note, preset.note) if note) or None,
+        preset.datum,
+    )
+    secrets = _secrets(preset.url, key_env or preset.key_env, None)
+    return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)
+
+
+def check_date(text: str) -> None:
+    """Raise `FetchError` unless a date is YYYY[-MM[-DD]], or two with a slash between."""
+    if not all(_DATE.fullmatch(part) for part in text.split("/", 1)):
+        raise FetchError(f"date must be YYYY, YYYY-MM or YYYY-MM-DD, or two with /, got '{text}'")
+
+
 def _preset(name: str, values: dict[str, Any]) -> Preset:
-    shared = _options(values)
     layers: dict[str, PresetLayer] = {}
     for entry in values["layer"]:
-        for layer in _layers(entry, shared):
-            if layer.id in layers:
-                raise ValueError(f"preset {name} has {layer.id} twice")
-            layers[layer.id] = layer
+        for year in map(str, entry.get("years", [""])):
+            filled: dict[str, Any] = {
+                key: value.replace("{year}", year) if isinstance(value, str) else value
+                for key, value in entry.items()
+            }
+            options = _options(filled).over(_options(values))
+            if filled["id"] in layers:
+                raise ValueError(f"preset {name} has {filled['id']} twice")
+            layers[filled["id"]] = PresetLayer(
+                filled["id"], filled["date"] or None, filled["gsd_m"], options, filled.get("note")
+            )
     rest = {key: value for key, value in values.items() if key not in _OPTIONS}
     return Preset(name=name, layers=layers, **rest)
-
-
-def _layers(entry: dict[str, Any], shared: ImageryOptions) -> list[PresetLayer]:
-    """One layer, or one for each of its years."""
-    made = []
-    for year in entry.get("years", [None]):
-        values: dict[str, Any] = {
-            key: value.replace("{year}", str(year)) if isinstance(value, str) else value
-            for key, value in entry.items()
-        }
-        date, note = values["date"] or None, values.get("note")
-        options = _options(values).over(shared)
-        made.append(PresetLayer(values["id"], date, values["gsd_m"], options, note))
-    return made
 
 
 def _options(values: dict[str, Any]) -> ImageryOptions:
@@ -131,3 +174,21 @@ def _options(values: dict[str, Any]) -> ImageryOptions:
         if key in _OPTIONS and key != "gsd_m" and not (key == "layer" and isinstance(value, list))
     }
     return ImageryOptions(**chosen)
+
+
+def _secrets(url: str, key_env: str | None, literal: str | None) -> tuple[Secret, ...]:
+    """The key for `{key}` in an address. Raises `FetchError` where it is missing."""
+    if literal is None and key_env is None:
+        if KEY in url:
+            raise FetchError(
+                f"address contains {KEY}; name the environment variable with --key-env"
+            )
+        return ()
+    if KEY not in url:
+        raise FetchError(f"--key-env needs {KEY} in the address, where the key goes: {shown(url)}")
+    value = literal or os.environ.get(key_env or "", "").strip()
+    if not value:
+        raise FetchError(
+            f"this service needs a key; put yours into the environment variable {key_env}"
+        )
+    return (Secret(KEY, origin_of(url), value),)

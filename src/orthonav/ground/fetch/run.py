@@ -2,23 +2,27 @@
 
 import logging
 import math
+import re
 import shutil
+import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from orthonav.core.errors import AreaError, FetchError, OutputError
-from orthonav.core.files import Progress, no_progress, with_paths
+from orthonav.core.files import Progress, no_progress, not_written, with_paths
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.fetch.client import Client
-from orthonav.ground.fetch.download import FetchedCells, FileCache, fetch_cells
+from orthonav.ground.fetch.cog import cog_source
 from orthonav.ground.fetch.grid import Selection, select
+from orthonav.ground.fetch.mosaic import CellCounts, Packing, write_mosaic
 from orthonav.ground.fetch.options import Provenance, SourceSpec
-from orthonav.ground.fetch.politeness import RequestLimits, Stopped
 from orthonav.ground.fetch.service import CellSource
-from orthonav.ground.fetch.sources import open_cells
-from orthonav.ground.fetch.write import Packing, write_mosaic
+from orthonav.ground.fetch.stac import find_files
+from orthonav.ground.fetch.web import RequestLimits, Web
+from orthonav.ground.fetch.wms import wms_cells
+from orthonav.ground.fetch.wmts import wmts_tiles
+from orthonav.ground.fetch.xyz import xyz_tiles
 from orthonav.ground.planning.area import Area
 
 DEFAULT_MAX_TILES = 50_000
@@ -30,6 +34,8 @@ _SECONDS_PER_TILE = 0.3
 """Usual latency of a tile service; an assumption for the estimate."""
 _BYTES_PER_SECOND = 3e6
 """Usual throughput of a connection; an assumption for the estimate."""
+_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")
+"""Names in a cache that GDAL and this program make."""
 log = logging.getLogger(__name__)
 
 
@@ -38,25 +44,15 @@ class FetchRequest:
     """Which imagery is fetched, and where it is written."""
 
     spec: SourceSpec
-    """The service and the imagery requested of it."""
     area: Area
-    """The area to cover."""
-    out: Path
-    """The GeoTIFF, .tif or .tiff."""
-    margin_m: float = DEFAULT_MARGIN_M
-    """Fetched beyond the area, metres."""
+    out: Path  # the GeoTIFF, .tif or .tiff
+    margin_m: float = DEFAULT_MARGIN_M  # fetched beyond the area
     packing: Packing = field(default_factory=Packing)
-    """Compression of the file."""
-    cache: Path | None = None
-    """Folder of fetched cells; None: one beside `out` that is removed at the end."""
-    max_tiles: int = DEFAULT_MAX_TILES
-    """A fetch of more tiles is refused before it starts."""
-    max_mb: float = DEFAULT_MAX_MB
-    """A fetch of more megabytes (estimated) is refused before it starts."""
-    allow_holes: bool = False
-    """Whether the file is written although tiles failed; they are masked."""
+    cache: Path | None = None  # folder of tiles; None: beside `out`, removed at the end
+    max_tiles: int = DEFAULT_MAX_TILES  # a fetch of more is refused before it starts
+    max_mb: float = DEFAULT_MAX_MB  # likewise, as estimated
+    allow_holes: bool = False  # whether the file is written although tiles failed
     limits: RequestLimits = field(default_factory=RequestLimits)
-    """How the service is asked."""
 
     def __post_init__(self) -> None:
         with_paths(self, "out", "cache")
@@ -88,9 +84,8 @@ class FetchResult:
     """What was fetched: cells by outcome, and the share of valid pixels, 0 to 1."""
 
     estimate: CostEstimate
-    cells: FetchedCells
+    cells: CellCounts
     valid_share: float
-    received_mb: float
     size_bytes: int
 
     def describe(self) -> dict[str, Any]:
@@ -101,32 +96,20 @@ class FetchResult:
             "width_px": self.estimate.width_px,
             "height_px": self.estimate.height_px,
             "images": self.cells.images,
-            "from_cache": self.cells.from_cache,
             "not_covered": self.cells.absent,
             "blank": self.cells.blank,
             "placeholders": self.cells.placeholders,
             "failed": dict(self.cells.failed),
             "valid_share": round(self.valid_share, 4),
-            "received_mb": round(self.received_mb, 3),
             "size_bytes": self.size_bytes,
             **vars(self.estimate.provenance),
         }
 
-    def holes(self) -> str:
-        """Cells without imagery by reason, on one line; empty where there are none."""
-        numbers = {
-            "failed": self.cells.failed.total(),
-            "not covered": self.cells.absent,
-            "blank": self.cells.blank,
-            "placeholders": self.cells.placeholders,
-        }
-        return ", ".join(f"{count} {reason}" for reason, count in numbers.items() if count)
-
 
 def estimate_fetch(request: FetchRequest) -> CostEstimate:
     """Read the service's capabilities and estimate the cost of a fetch. Raises as `fetch` does."""
-    with Client(request.limits, request.spec.secrets) as client:
-        return _planned(client, request)[2]
+    with Web(request.limits, request.spec.secrets) as web:
+        return _planned(web, request)[2]
 
 
 def fetch(
@@ -142,43 +125,89 @@ def fetch(
     `OutputError` where the file cannot be written.
     """
     _check_out(request.out)
-    with Client(request.limits, request.spec.secrets) as client:
-        source, selection, estimate = _planned(client, request)
-        _refuse_large(request, estimate)
+    cache = request.cache or request.out.resolve().with_name(f"{request.out.name}.tiles")
+    with Web(request.limits, request.spec.secrets) as web:
+        source, selection, estimate = _planned(web, request)
+        limits = {
+            f"--max-tiles {request.max_tiles}": estimate.tiles > request.max_tiles,
+            f"--max-mb {request.max_mb:g}": estimate.megabytes > request.max_mb,
+        }
+        for limit in (name for name, exceeded in limits.items() if exceeded):
+            raise FetchError(
+                f"this would fetch {estimate.text()}: more than {limit}; choose coarser pixels "
+                "(--gsd-m), a part of the area, or raise the limit"
+            )
         started(estimate)
-        cache = FileCache(request.cache or request.out.with_name(f"{request.out.name}.tiles"))
-        fetched = _fetched(source, selection, client, cache, progress)
-        _refuse_holes(request, fetched)
-        write_mosaic(request.out, fetched, request.packing, progress)
-        received_mb = client.received_bytes / 1e6
-    if request.cache is None:
-        cache.remove()
+        if selection.is_cut:
+            log.warning("part of the area lies outside what the service covers")
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:
+                cells = write_mosaic(
+                    request.out,
+                    source,
+                    selection,
+                    source.reader(web, selection, cache),
+                    Path(folder),
+                    request.packing,
+                    progress,
+                    parallel=request.limits.parallel,
+                    allow_holes=request.allow_holes,
+                )
+        except FetchError as error:
+            if any(cache.iterdir()):
+                stored = f"fetched tiles are stored, rerun the command to resume: {cache}"
+                raise FetchError(f"{error}; {stored}") from None
+            cache.rmdir()
+            raise
+        except OutputError:
+            raise
+        except OSError as error:
+            raise not_written(error, cache) from error
+    if request.cache is None and all(_OURS.fullmatch(path.name) for path in cache.iterdir()):
+        shutil.rmtree(cache, ignore_errors=True)
     grid = selection.grid
-    share = fetched.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)
-    size = request.out.stat().st_size
-    result = FetchResult(estimate, fetched, share, received_mb, size)
-    if result.holes():
-        log.warning("of %d tiles: %s; masked in the file", estimate.tiles, result.holes())
-    return result
+    share = cells.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)
+    if cells.holes():
+        log.warning("of %d tiles: %s; masked in the file", estimate.tiles, cells.holes())
+    return FetchResult(estimate, cells, share, request.out.stat().st_size)
 
 
-def _planned(client: Client, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
+def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
-    source = open_cells(client, request.spec, request.area)
+    source = open_cells(web, request.spec, request.area)
     selection = _selected(source, request)
     height, width = selection.shape_px
     tiles = len(selection.cells)
     size = tiles * source.cell_bytes
-    seconds = max(
-        tiles / request.limits.per_second,
-        tiles * _SECONDS_PER_TILE / max(1, request.limits.parallel),
-        size / _BYTES_PER_SECOND,
-    )
+    seconds = max(tiles * _SECONDS_PER_TILE / request.limits.parallel, size / _BYTES_PER_SECOND)
     estimate = CostEstimate(
         tiles, selection.gsd_m, width, height, size / 1e6, seconds / 60, source.provenance
     )
     return source, selection, estimate
+
+
+def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+    """The cells of the imagery requested, after reading the service's capabilities.
+
+    Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
+    """
+    if spec.protocol == "wmts":
+        return wmts_tiles(web, spec, area)
+    if spec.protocol == "wms":
+        return wms_cells(web, spec, area)
+    if spec.protocol in ("xyz", "tms"):
+        return xyz_tiles(spec, area)
+    if spec.protocol == "cog":
+        return cog_source(web, spec, area, [spec.url])
+    west, south, east, north = area.extent_en_m
+    corners = [(west, south), (west, north), (east, south), (east, north)]
+    lat, lon = area.frame.latlon_from_en(corners)
+    box = (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max()))
+    urls, date = find_files(web, spec, box)
+    provenance = replace(spec.provenance, date=date or spec.provenance.date)
+    return cog_source(web, replace(spec, provenance=provenance), area, urls)
 
 
 def _selected(source: CellSource, request: FetchRequest) -> Selection:
@@ -199,47 +228,6 @@ def _selected(source: CellSource, request: FetchRequest) -> Selection:
     except AreaError as error:
         hint = swapped_hint(frame.lat_deg, frame.lon_deg, covered)
         raise AreaError(f"{error}{hint}") from None
-
-
-def _refuse_large(request: FetchRequest, estimate: CostEstimate) -> None:
-    limit = ""
-    if estimate.tiles > request.max_tiles:
-        limit = f"--max-tiles {request.max_tiles}"
-    elif estimate.megabytes > request.max_mb:
-        limit = f"--max-mb {request.max_mb:g}"
-    if limit:
-        raise FetchError(
-            f"this would fetch {estimate.text()}: more than {limit}; choose coarser pixels "
-            "(--gsd-m), a part of the area, or raise the limit"
-        )
-
-
-def _fetched(
-    source: CellSource, selection: Selection, client: Client, cache: FileCache, progress: Progress
-) -> FetchedCells:
-    try:
-        return fetch_cells(source, selection, client, cache, progress)
-    except Stopped:
-        raise KeyboardInterrupt from None
-    except FetchError as error:
-        raise FetchError(f"{error}; {_resume_hint(cache)}") from None
-
-
-def _refuse_holes(request: FetchRequest, fetched: FetchedCells) -> None:
-    failed = fetched.failed.total()
-    if not failed or request.allow_holes:
-        return
-    common = fetched.failed.most_common(4)
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in common)
-    raise FetchError(
-        f"{failed} of {len(fetched.digests)} tiles failed ({reasons}; for example "
-        f"{fetched.examples[common[0][0]]}); nothing was written; {_resume_hint(fetched.cache)}; "
-        "--allow-holes writes the file without them"
-    )
-
-
-def _resume_hint(cache: FileCache) -> str:
-    return f"fetched tiles are stored, rerun the command to resume: {cache.folder}"
 
 
 def _check_out(out: Path) -> None:

@@ -1,7 +1,6 @@
 """Addresses of services: only http and https, and never with a key where stored or shown.
 
-An address holds `{key}` in place of a key. The client inserts the value when it sends a request,
-and only for the origin that the key belongs to.
+An address holds `{key}` in place of a key, until it is requested from the origin of the key.
 """
 
 import re
@@ -20,7 +19,6 @@ _SECRET_NAME = re.compile(
     r"|subscription-key|ocp-apim-subscription-key)$",
     re.IGNORECASE,
 )
-_PLACEHOLDERS = "{}"
 
 
 @dataclass(frozen=True)
@@ -69,11 +67,6 @@ def origin_of(url: str) -> str:
     return f"{scheme}://{(parts.hostname or '').lower()}:{port}"
 
 
-def host_of(url: str) -> str:
-    """Host and port, which share one rate limit for both schemes."""
-    return origin_of(url).partition("://")[2]
-
-
 def without_literal_keys(url: str) -> tuple[str, str | None]:
     """The address with `{key}` for a key written into its query, and that key.
 
@@ -81,14 +74,14 @@ def without_literal_keys(url: str) -> tuple[str, str | None]:
     """
     parts = urlsplit(url)
     query = parse_qsl(parts.query, keep_blank_values=True)
-    secret = [value for name, value in query if _SECRET_NAME.match(name) and "{" not in value]
-    secret = [value for value in secret if value]
+    secret = {value for name, value in query if _SECRET_NAME.match(name) and "{" not in value}
+    secret -= {""}
     if not secret:
         return url, None
-    if len(set(secret)) > 1 or KEY in url:
+    if len(secret) > 1 or KEY in url:
         raise FetchError(f"address contains several keys; one is supported: {shown(url)}")
-    plain = [(name, KEY if value == secret[0] else value) for name, value in query]
-    return urlunsplit(parts._replace(query=_encoded(plain))), secret[0]
+    plain = [(name, KEY if value in secret else value) for name, value in query]
+    return urlunsplit(parts._replace(query=_encoded(plain))), secret.pop()
 
 
 def shown(url: str) -> str:
@@ -117,36 +110,25 @@ def with_query(url: str, parameters: dict[str, str]) -> str:
     return urlunsplit(parts._replace(query=_encoded([*others, *parameters.items()]), fragment=""))
 
 
-def joined(base: str, reference: str) -> str:
-    """A reference in a document as an absolute address, with https where the document has it.
+def linked(base: str, reference: str) -> str:
+    """A reference in the document at `base` as an absolute address.
 
-    Documents of services behind a proxy often refer to themselves with `http://`.
+    It has https and the key parameter where `base` has them and is on the same server: documents
+    of services behind a proxy often refer to themselves with `http://`.
     """
     try:
         url = urljoin(base, reference.strip())
     except ValueError as error:
         raise FetchError(f"not an address ({error}): {reference!r:.200}") from error
     if base.startswith("https://") and url.startswith("http://"):
-        secure = "https://" + url[len("http://") :]
-        if host_of(secure) == host_of(base):
+        secure = "https://" + url[len("http://") :].replace(":80/", ":443/", 1)
+        if urlsplit(secure).hostname == urlsplit(base).hostname:
             url = secure
-    return checked_url(url)
-
-
-def carrying_key(base: str, url: str) -> str:
-    """`url` with the key parameter of `base` where both have the same origin, else unchanged."""
-    if KEY not in base or KEY in url or origin_of(base) != origin_of(url):
-        return url
-    for name, value in parse_qsl(urlsplit(base).query):
-        if value == KEY:
-            return with_query(url, {name: KEY})
+    if KEY in base and KEY not in url and origin_of(base) == origin_of(url):
+        names = [name for name, value in parse_qsl(urlsplit(base).query) if value == KEY]
+        url = with_query(url, dict.fromkeys(names, KEY))
     return url
 
 
-def quoted(value: str) -> str:
-    """A value for a path or a query; `{...}` stays unchanged."""
-    return quote(value, safe=_PLACEHOLDERS + ":,-._~")
-
-
 def _encoded(query: list[tuple[str, str]]) -> str:
-    return urlencode(query, safe=_PLACEHOLDERS + ":/,", quote_via=quote)
+    return urlencode(query, safe="{}:/,", quote_via=quote)

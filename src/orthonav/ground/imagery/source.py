@@ -1,9 +1,12 @@
 """Inspection of an orthophoto file: usability, georeference, and the bands that are used."""
 
 import logging
+import threading
+import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,13 +25,11 @@ try:
     import rasterio
     from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
-    from rasterio.enums import ColorInterp
-    from rasterio.errors import RasterioError
+    from rasterio.enums import ColorInterp, MaskFlags
+    from rasterio.errors import NodataShadowWarning, NotGeoreferencedWarning, RasterioError
     from rasterio.transform import Affine
     from rasterio.warp import transform as transform_coordinates
     from rasterio.windows import Window
-
-    from orthonav.ground.imagery.quiet import quiet
 except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
@@ -86,12 +87,14 @@ class Source:
     """The border (N, 2), latitude and longitude in degrees."""
     date: str | None
     """Date of acquisition, YYYY[-MM[-DD]]."""
-    palette: NDArray[np.uint8] | None = None
-    """Colours (N, 3) of a colour-mapped image."""
+    has_palette: bool = False
+    """Whether pixels are indexes of colours."""
     marked_alpha: bool = False
     """Whether a band is marked as alpha."""
-    false_alpha: bool = False
-    """Whether that band is an image, such as near infrared, and not a mask."""
+    masks: tuple[str, ...] = ()
+    """Bands that tell where it is valid, as GDAL's VRT names them; empty where it is everywhere."""
+    other_masks: tuple[str, ...] = ()
+    """The same where the alpha band is an image, such as near infrared."""
     folder: Path | None = None
     """The folder given by the user that it was found in."""
     stamp: tuple[tuple[str, int, int], ...] = ()
@@ -102,7 +105,7 @@ class Source:
     @property
     def colours(self) -> int:
         """Bands that are read: 1 for grey, 3 for colours."""
-        return 3 if self.palette is not None else len(self.bands)
+        return 3 if self.has_palette else len(self.bands)
 
     def describe(self) -> dict[str, Any]:
         """Entry of the map's manifest."""
@@ -198,8 +201,8 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
         )
-    palette = _palette(dataset) if dataset.colorinterp[0] == ColorInterp.palette else None
     outline, gsd_m = _outline(path, dataset, system, transform)
+    masks, other_masks = _masks(dataset, bands)
     return Source(
         path=path,
         name=str(dataset.name),
@@ -214,8 +217,10 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         gsd_m=gsd_m,
         outline_latlon_deg=outline,
         date=date_of(dataset.tags(), names),
-        palette=palette,
+        has_palette=dataset.colorinterp[0] == ColorInterp.palette,
         marked_alpha=ColorInterp.alpha in dataset.colorinterp and dataset.count > 1,
+        masks=masks,
+        other_masks=other_masks,
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
@@ -297,8 +302,20 @@ def _bands(dataset: Any) -> tuple[int, ...]:
     return tuple(colours[:3]) if len(colours) >= 3 else tuple(colours[:1])
 
 
+def _masks(dataset: Any, bands: tuple[int, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """`Source.masks` and `Source.other_masks`."""
+    flags = dataset.mask_flag_enums[bands[0] - 1]
+    if MaskFlags.per_dataset in flags:
+        masks = (f"mask,{bands[0]}",)
+        return masks, () if MaskFlags.alpha in flags else masks
+    others = () if MaskFlags.all_valid in flags else tuple(f"mask,{band}" for band in bands)
+    if dataset.count == 4 and ColorInterp.alpha in dataset.colorinterp:  # beside a nodata value
+        return (str(dataset.colorinterp.index(ColorInterp.alpha) + 1),), others
+    return others, others
+
+
 def _without_false_alpha(sources: list[Source]) -> list[Source]:
-    """The sources, with `false_alpha` where their alpha band is not a mask.
+    """The sources, without `masks` where these are an alpha band that is an image.
 
     Of many files of one kind only the first `ALPHA_CHECKS` are checked.
     """
@@ -310,9 +327,8 @@ def _without_false_alpha(sources: list[Source]) -> list[Source]:
             found = verdicts.setdefault(alike, [])
             if len(found) < ALPHA_CHECKS:
                 found.append(_has_false_alpha(source))
-            source = replace(
-                source, false_alpha=found[-1] if len(found) < ALPHA_CHECKS else any(found)
-            )
+            if found[-1] if len(found) < ALPHA_CHECKS else any(found):
+                source = replace(source, masks=source.other_masks)
         checked.append(source)
     return checked
 
@@ -356,15 +372,6 @@ def _sample(dataset: Any, band: int) -> NDArray[Any]:
     return np.concatenate([dataset.read(band, window=window).ravel() for window in windows])
 
 
-def _palette(dataset: Any) -> NDArray[np.uint8]:
-    size = 256 if dataset.dtypes[0] == "uint8" else 65_536
-    table = np.zeros((size, 3), dtype=np.uint8)
-    for value, colour in dataset.colormap(1).items():
-        if 0 <= value < size:
-            table[value] = colour[:3]
-    return table
-
-
 def _outline(
     path: Path, dataset: Any, system: Any, transform: Affine
 ) -> tuple[NDArray[np.float64], float]:
@@ -404,6 +411,22 @@ def _outline(
     corner = frame.en_from_latlon(latlon[-3:, 0], latlon[-3:, 1])
     right, down = corner[1] - corner[0], corner[2] - corner[0]
     return latlon[:-3], float(np.sqrt(abs(right[0] * down[1] - right[1] * down[0])))
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppress rasterio's warnings of cases that are checked or intended, in all threads.
+
+    Warning filters belong to the process, and threads that change them would interfere. So this
+    does nothing outside the main thread; callers that start threads enter it for them.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        warnings.simplefilter("ignore", NodataShadowWarning)
+        yield
 
 
 def unreadable(path: Path, error: Exception) -> ImageryError:

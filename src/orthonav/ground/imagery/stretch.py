@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from orthonav.core.errors import ImageryError
-from orthonav.ground.imagery.quiet import quiet
-from orthonav.ground.imagery.source import Source, unreadable
-from orthonav.ground.imagery.thin import read_mask
+from orthonav.ground.imagery.joined import lattices_of
+from orthonav.ground.imagery.source import Source, quiet, unreadable
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +44,7 @@ def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None,
     """
     alike: dict[Any, list[int]] = {}
     for index, source in enumerate(sources):
-        if source.dtype != "uint8" and source.palette is None:
+        if source.dtype != "uint8" and not source.has_palette:
             kind = source.dtype, source.colours, round(source.gsd_m, 2), source.crs
             alike.setdefault(kind, []).append(index)
     found: list[ContrastStretch | None] = [None] * len(sources)
@@ -81,9 +79,10 @@ def _common(sources: list[Source]) -> ContrastStretch:
 
 def _valid_values(source: Source) -> NDArray[Any]:
     """Finite values (N,) of valid pixels of a decimated read."""
-    with quiet(), rasterio.open(source.name) as data:
+    (lattice,) = lattices_of([source])
+    with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
         shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
-        pixels = data.read(list(source.bands), out_shape=(len(source.bands), *shape))
-        valid = read_mask(data, source, out_shape=shape) > 0
+        pixels = data.read(lattice.bands, out_shape=(source.colours, *shape))
+        valid = data.dataset_mask(out_shape=shape) > 0
     sampled = pixels[:, valid].ravel()
     return np.asarray(sampled[np.isfinite(sampled)])

@@ -1,18 +1,41 @@
-"""Latency of a camera, estimated from a recorded flight."""
+"""Latency of a camera, from exposure to arrival, estimated from a recorded flight.
+
+The motion between consecutive pictures is compared with the motion that follows from attitude,
+velocity and height reported at the times of arrival less a candidate of the latency, over windows
+of half a minute: a grid of candidates first, then refined. What is known only nearly (height,
+direction of the velocity, orientation of the camera) is estimated with it. A window in which many
+candidates fit, as in straight and level flight, gives no number.
+
+For a latency d, the seen turn of a pair of pictures is the reported one, `turn(d)`, and the seen
+shift is
+
+    tilt(d) + scale velocity(d) + across J velocity(d) + mount J tilt(d) + constant seconds
+
+with J the rotation by 90 deg. These five linear parameters have Gaussian priors.
+"""
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.latency import CameraLatency
+from orthonav.core.flight.mount import CameraLatency
 from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.recordings.flightlog import LoggedFlight
-from orthonav.onboard.delay import MOST_S, DelayEstimate, DelayEstimator
-from orthonav.onboard.history import StateHistory
-from orthonav.onboard.motion import LONGEST_S, PictureOdometry
+from orthonav.onboard.motion import (
+    LONGEST_S,
+    SHIFT_STD,
+    TURN_STD_RAD,
+    ImageMotion,
+    PictureOdometry,
+    StateHistory,
+    explained_share,
+)
 
 GAP_S = 1.0
 """Longest interval between views over which telemetry is interpolated."""
@@ -25,6 +48,44 @@ NEEDED = (
     "fly at least two minutes at a height where the ground is textured, with turns of 10 deg/s or "
     "more or banking every 10 s, and log at least 2 views a second (`orthonav fly --log`)"
 )
+LEAST_S, MOST_S, STEP_S = -0.5, 12.0, 0.1
+"""Candidates of the latency. Below 0: an exposure after the arrival shows clocks that disagree."""
+WINDOW_S = 30.0
+MOST_PAIRS, LEAST_PAIRS = 300, 12
+PAIR_SHARE, KNOWN_SHARE = 0.9, 0.6
+"""Share of candidates for which the motion of a pair must be known, and of pairs for one
+candidate."""
+SCALE_STD, ACROSS_STD, MOUNT_STD_RAD = 0.25, 0.2, 0.08
+"""Prior of errors: height (share), direction of the velocity, orientation of the camera (rad)."""
+ANY_STD = 1.5
+"""Prior of scale and direction where the heading is not known."""
+CONSTANT_STD, FREE_STD = 0.01, 0.5
+"""Prior of a constant shift per second: by the tilt of the mount; by an unknown velocity."""
+SHARE_STD = 0.08
+"""Standard deviation of the shift by velocity as a share of it: relief, changes of height."""
+NEAR_S, NEAR_MASS = 0.35, 0.99
+"""A latency is found where this probability lies this close to it."""
+LARGEST_STD_S, FLOOR_S = 0.3, 0.025
+"""Largest standard deviation of an answer; least one: half an interval of the stored states."""
+EXPLAINED, STANDS_OUT = 0.6, 2.0
+"""Least share of motion of so many least standard deviations that the latency must explain."""
+UNEXPLAINED, MANY_PAIRS, STANDS_FAR_OUT = 0.3, 40, 4.0
+"""Pictures contradict the autopilot where so many pairs, with motion of so many least standard
+deviations, are explained by less than this share at any latency."""
+SCALES, ACROSS, CLEAR_STD = (0.5, 2.0), 0.6, 0.3
+"""Fitted scale and direction (rad) of the velocity beyond which pictures contradict the autopilot,
+and the standard deviation of the scale below which they can."""
+LEAST_WEIGHT = 0.5
+"""Least mean weight of the pairs: 1 without outliers."""
+OUTLIER, MAD_TO_STD = 3.0, 1.4826
+"""Scale of the Cauchy weights, in standard deviations."""
+ALIKE = 4.0
+"""Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
+the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""
+STEPS = 5
+CANDIDATES_S = np.arange(round((MOST_S - LEAST_S) / STEP_S) + 1) * STEP_S + LEAST_S
+_CANDIDATES_NS = np.round(CANDIDATES_S * 1e9).astype(np.int64)
+Array = NDArray[np.float64]
 
 
 def arrivals_of(flight: Flight) -> Iterator[tuple[RecordedView, float]]:
@@ -44,12 +105,13 @@ def calibrate_latency(
 ) -> CameraLatency:
     """Latency of a camera from views and the latency (s) that their times already contain.
 
-    Telemetry is interpolated between the exposures of the views. Raises `FlightError` where the
-    flight shows too little motion, or estimates disagree.
+    Telemetry is interpolated between the exposures of the views. `heading_known`: whether the
+    reported heading gives the direction of the velocity. Raises `FlightError` where the flight
+    shows too little motion, or estimates disagree.
     """
     history = StateHistory(GAP_S)
-    odometry, estimator = PictureOdometry(), DelayEstimator(heading_known=heading_known)
-    estimates: list[DelayEstimate] = []
+    odometry, estimator = PictureOdometry(), LatencyEstimator(heading_known=heading_known)
+    estimates: list[LatencyEstimate] = []
     due_ns: float = -math.inf
     intervals = []
     before_ns = None
@@ -80,7 +142,270 @@ def calibrate_latency(
     return _agreed(estimates, intervals)
 
 
-def _agreed(estimates: list[DelayEstimate], intervals: list[float]) -> CameraLatency:
+@dataclass(frozen=True)
+class LatencyEstimate:
+    """The latency in one window.
+
+    `delay_s`, `std_s`: exposure to arrival and its standard deviation; NaN where not observable.
+    `contradicted`: whether pictures do not move as the autopilot reports, at any latency.
+    `pairs`: number of compared pairs of pictures.
+    """
+
+    delay_s: float = math.nan
+    std_s: float = math.nan
+    contradicted: bool = False
+    pairs: int = 0
+
+    @property
+    def found(self) -> bool:
+        """Whether the latency was observable."""
+        return math.isfinite(self.delay_s)
+
+
+class LatencyEstimator:
+    """Estimates the latency over a sliding window. Mutable; the same values give the same."""
+
+    def __init__(self, *, heading_known: bool = True) -> None:
+        self._heading_known = heading_known
+        self._waiting: deque[ImageMotion] = deque(maxlen=MOST_PAIRS)
+        self._pairs: deque[tuple[ImageMotion, Array]] = deque(maxlen=MOST_PAIRS)
+
+    def add(self, motion: ImageMotion | None, history: StateHistory) -> None:
+        """Add the motion of a pair. It counts once the history reaches beyond all candidates."""
+        if motion is not None:
+            self._waiting.append(motion)
+        reach_ns = round(-LEAST_S * 1e9)
+        while self._waiting and self._waiting[0].end_ns + reach_ns <= history.newest_ns:
+            one = self._waiting.popleft()
+            moved = history.motion(one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS)
+            if np.isfinite(moved.turn_rad).mean() < PAIR_SHARE:
+                continue
+            parts = moved.turn_rad[:, None], moved.tilt_shift, moved.velocity_shift
+            self._pairs.append((one, np.concatenate(parts, axis=1)))
+            while self._pairs[0][0].start_ns < one.end_ns - WINDOW_S * 1e9:
+                self._pairs.popleft()
+
+    def estimate(self) -> LatencyEstimate:
+        """The latency in the window."""
+        if len(self._pairs) < LEAST_PAIRS:
+            return LatencyEstimate(pairs=len(self._pairs))
+        motions, reported = zip(*self._pairs, strict=True)
+        pairs = _Pairs(
+            np.array([each.seconds for each in motions]),
+            np.array([each.turn_rad for each in motions]),
+            np.array([each.shift for each in motions]),
+            np.array(reported),
+        )
+        return _estimate(pairs, heading_known=self._heading_known)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """N pairs of pictures and the motion reported for C candidates of the latency.
+
+    `seconds` (N,): duration. `turn` (N,), `shift` (N, 2): seen. `reported` (N, C, 5): turn, tilt
+    (2), velocity (2), NaN where not known.
+    """
+
+    seconds: Array
+    turn: Array
+    shift: Array
+    reported: Array
+
+    def least_noise(self) -> Array:
+        """Least standard deviations (2,) of turn and shift."""
+        some = np.nan_to_num(self.reported[:, ::20, 3:])
+        size = np.sqrt(np.square(some).sum(axis=-1).mean())
+        return np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, SHARE_STD * size)])
+
+    def explained(self, fit: "_Fit", stands_out: float) -> float:
+        """`explained_share` of a fit."""
+        off = fit.turn_off, fit.shift_off
+        return explained_share(self.seconds, self.turn, self.shift, *off, stands_out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """Mean (5,) and precision (5, 5) of the linear parameters."""
+
+    mean: Array
+    precision: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fit of one latency: `linear` (5,), differences `turn_off` (N,) and `shift_off` (N, 2),
+    `weights` (N,), and derivatives `columns` (N, 2, 5)."""
+
+    linear: Array
+    turn_off: Array
+    shift_off: Array
+    weights: Array
+    columns: Array
+
+    def scatter(self, least: Array) -> Array:
+        """Standard deviations (2,) of turn and shift by the differences."""
+        known = self.weights > 0
+        if not known.any():
+            return least
+        middle = [np.median(np.abs(off[known])) for off in (self.turn_off, self.shift_off)]
+        return np.asarray(np.maximum(least, MAD_TO_STD * np.array(middle)))
+
+
+def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate:
+    count = len(pairs.turn)
+    nothing = LatencyEstimate(pairs=count)
+    contradicted = LatencyEstimate(contradicted=True, pairs=count)
+    prior = _prior(pairs.reported, heading_known=heading_known)
+    noise, weights = pairs.least_noise(), np.ones(count)
+    least = noise
+    for _ in range(3):  # robust: pairs that the best candidate does not explain count less
+        cost, linear, covariance = _coarse(pairs, weights, noise, prior)
+        best = int(np.argmin(cost))
+        fit = _fitted(pairs, pairs.reported[:, best], noise, prior)
+        noise, weights = fit.scatter(least), fit.weights
+    if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < KNOWN_SHARE).any():
+        return nothing  # a latency that cannot be excluded
+    std = 2 * np.sqrt(np.diag(covariance[best])[:2])
+    if _contradicts(linear[best], std, heading_known=heading_known):
+        return contradicted
+    if count >= MANY_PAIRS and pairs.explained(fit, STANDS_FAR_OUT) < UNEXPLAINED:
+        return contradicted
+    if weights.mean() < LEAST_WEIGHT:
+        return nothing  # too many outliers
+    chance = np.exp((cost[best] - cost) / (2 * ALIKE))
+    near = np.abs(CANDIDATES_S - CANDIDATES_S[best]) <= NEAR_S
+    if chance[near].sum() < NEAR_MASS * chance.sum():
+        return nothing
+    if not _possible(fit.linear, heading_known=heading_known):
+        return nothing
+    delay_s, variance, fit = _refined(pairs, float(CANDIDATES_S[best]), noise, prior)
+    std_s = math.hypot(FLOOR_S, math.sqrt(variance))
+    lost = abs(delay_s - CANDIDATES_S[best]) > NEAR_S
+    if lost or std_s > LARGEST_STD_S or not pairs.explained(fit, STANDS_OUT) >= EXPLAINED:
+        return nothing
+    return LatencyEstimate(delay_s, std_s, pairs=count)
+
+
+def _prior(reported: Array, *, heading_known: bool) -> _Prior:
+    unknown = ~np.isfinite(reported[..., 3]) & np.isfinite(reported[..., 0])
+    constant = FREE_STD if unknown.any() else CONSTANT_STD
+    gain = (SCALE_STD, ACROSS_STD) if heading_known else (ANY_STD, ANY_STD)
+    mean = np.array([1.0 if heading_known else 0.0, 0.0, 0.0, 0.0, 0.0])
+    std = np.array([*gain, MOUNT_STD_RAD, constant, constant])
+    return _Prior(mean, np.diag(1 / np.square(std)))
+
+
+def _columns(seconds: Array, reported: Array) -> Array:
+    """Derivatives (..., 2, 5) of the shift by the linear parameters; `reported` (..., 5)."""
+    tilt, velocity = reported[..., 1:3], reported[..., 3:5]
+    made = np.zeros((*reported.shape[:-1], 2, 5))
+    made[..., 0], made[..., 1], made[..., 2] = velocity, _rotated(velocity), _rotated(tilt)
+    made[..., 0, 3] = made[..., 1, 4] = seconds
+    return made
+
+
+def _rotated(vectors: Array) -> Array:
+    """Vectors (..., 2) turned by 90 deg, from right to down."""
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
+
+
+def _coarse(
+    pairs: _Pairs, weights: Array, noise: Array, prior: _Prior
+) -> tuple[Array, Array, Array]:
+    """Cost (C,), linear parameters (C, 5) and their covariance (C, 5, 5) of every candidate, with
+    `weights` (N,) of the pairs."""
+    known = np.isfinite(pairs.reported[..., :3]).all(axis=-1)
+    reported = np.nan_to_num(pairs.reported)
+    share = weights[:, None] * known
+    share = share * (weights.sum() / np.maximum(share.sum(axis=0), 1e-9))
+    precise = share / noise[1] ** 2
+    lines = _columns(pairs.seconds[:, None], reported)
+    wanted = pairs.shift[:, None] - reported[..., 1:3]
+    normal = np.einsum("nc,ncij,ncik->cjk", precise, lines, lines, optimize=True) + prior.precision
+    right = np.einsum("nc,ncij,nci->cj", precise, lines, wanted, optimize=True)
+    right = right + prior.precision @ prior.mean
+    linear = np.linalg.solve(normal, right[..., None])[..., 0]
+    squares = np.einsum("nc,nci,nci->c", precise, wanted, wanted, optimize=True)
+    turned = np.einsum("nc,nc->c", share, np.square(pairs.turn[:, None] - reported[..., 0]))
+    least = squares + prior.mean @ prior.precision @ prior.mean
+    cost = least - (linear * right).sum(axis=1) + turned / noise[0] ** 2
+    return cost, linear, np.linalg.inv(normal) * ALIKE
+
+
+def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: _Prior) -> _Fit:
+    """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
+    known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
+    reported = np.nan_to_num(reported)
+    lines = _columns(pairs.seconds, reported)
+    turn_off = pairs.turn - reported[:, 0]
+    wanted = pairs.shift - reported[:, 1:3]
+    weights: Array = known
+    for _ in range(3):
+        flat = (lines * (weights / noise[1] ** 2)[:, None, None]).reshape(-1, 5)
+        normal = flat.T @ lines.reshape(-1, 5) + prior.precision
+        linear = np.linalg.solve(normal, flat.T @ wanted.reshape(-1) + prior.precision @ prior.mean)
+        shift_off = wanted - lines @ linear
+        square: Array = np.square(turn_off / noise[0])
+        square = square + np.square(shift_off / noise[1]).sum(axis=1)
+        weights = known / (1 + square / OUTLIER**2)
+    return _Fit(linear, turn_off, shift_off, weights, lines)
+
+
+def _at_delay(pairs: _Pairs, delay_s: float) -> tuple[Array, Array]:
+    """Reported motion (N, 5) at a latency, and its derivative, by parabolas through candidates."""
+    place = (delay_s - LEAST_S) / STEP_S
+    middle = min(max(round(place), 1), len(CANDIDATES_S) - 2)
+    off = place - middle
+    before, at, after = (pairs.reported[:, middle + i] for i in (-1, 0, 1))
+    slope, bend = (after - before) / 2, (after - 2 * at + before) / 2
+    return at + off * slope + off**2 * bend, (slope + 2 * off * bend) / STEP_S
+
+
+def _refined(
+    pairs: _Pairs, delay_s: float, noise: Array, prior: _Prior
+) -> tuple[float, float, _Fit]:
+    """Latency, its variance, and the fit, by Gauss-Newton steps from a latency."""
+    precision = np.zeros((6, 6))
+    precision[0, 0], precision[1:, 1:] = 1e-6, prior.precision
+    for _ in range(STEPS):
+        reported, slope = _at_delay(pairs, delay_s)
+        fit, slope = _fitted(pairs, reported, noise, prior), np.nan_to_num(slope)
+        tilt, velocity = slope[:, 1:3], slope[:, 3:5]
+        scale, across, mount = fit.linear[:3]
+        shifted = tilt + mount * _rotated(tilt) + scale * velocity + across * _rotated(velocity)
+        design = np.zeros((len(slope), 3, 6))
+        design[:, :, 0] = np.concatenate([slope[:, :1], shifted], axis=1)
+        design[:, 1:, 1:] = fit.columns
+        off = np.concatenate([fit.turn_off[:, None], fit.shift_off], axis=1)
+        precise = fit.weights[:, None] / np.square(noise[[0, 1, 1]]) / ALIKE
+        flat = (design * precise[..., None]).reshape(-1, 6)
+        right = flat.T @ off.reshape(-1) - precision @ [0.0, *(fit.linear - prior.mean)]
+        covariance = np.linalg.inv(flat.T @ design.reshape(-1, 6) + precision)
+        delay_s += float(np.clip((covariance @ right)[0], -STEP_S, STEP_S))
+    return delay_s, float(covariance[0, 0]), fit
+
+
+def _contradicts(linear: Array, std: Array, *, heading_known: bool) -> bool:
+    """Whether the fitted scale or direction of the velocity is impossible; `std` (2,): twice their
+    standard deviations."""
+    if not std.max() < 2 * CLEAR_STD:
+        return False
+    scale, across = linear[:2].tolist()
+    size = scale if heading_known else math.hypot(scale, across)
+    if not SCALES[0] - std[0] < size < SCALES[1] + std[0]:
+        return True
+    return heading_known and abs(across) > math.tan(ACROSS) * max(size, SCALES[0]) + std[1]
+
+
+def _possible(linear: Array, *, heading_known: bool) -> bool:
+    """Whether fitted scale and direction of the velocity are those of usual errors."""
+    scale, across = linear[:2].tolist()
+    turned = abs(math.atan2(across, scale)) if heading_known else 0.0
+    return SCALES[0] < math.hypot(scale, across) < SCALES[1] and turned < ACROSS
+
+
+def _agreed(estimates: list[LatencyEstimate], intervals: list[float]) -> CameraLatency:
     if not intervals or float(np.median(intervals)) > LONGEST_S / 2:
         usual_s = float(np.median(intervals)) if intervals else math.inf
         raise FlightError(

@@ -1,8 +1,15 @@
-"""Metadata of a photograph: EXIF (CIPA DC-008, Exif 2.32), XMP and maker notes."""
+"""Metadata of a photograph: EXIF (CIPA DC-008, Exif 2.32), XMP and maker notes.
+
+Values of XMP are searched by the names of DJI, Autel, senseFly and Pix4D in the text of the packet:
+some firmware writes undeclared prefixes, which no XML parser accepts. Conventions of angles:
+`docs/flights.md`.
+"""
 
 import math
 import re
+import struct
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.flight.telemetry_track import measured
+from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
 from orthonav.ground.recordings.focal import Optics
-from orthonav.ground.recordings.makernotes import read_maker_notes
-from orthonav.ground.recordings.xmp import Xmp
+from orthonav.ground.recordings.image_table import ImageRow
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_TAG, _MAKE, _MODEL, _SOFTWARE = 700, 0x010F, 0x0110, 0x0131
@@ -25,12 +32,43 @@ _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 _ZOOM = 0xA404
 _QUARTER_HOUR = timedelta(minutes=15)
+_FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
+_BODY_YAW, _CAMERA_PITCH, _CAMERA_YAW, _CAMERA_ROLL = 7, 9, 10, 11
+_VALUE = re.compile(
+    r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
+)
+_NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
+"""A number with a decimal point or comma, or a fraction."""
+_ANGLE_OR_PLACE = re.compile(
+    r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
+)
+"""Values that a view is worse off without."""
+_EXPOSED = re.compile(
+    r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
+    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
+)
+_WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
+
+
+@dataclass(frozen=True)
+class PhotoPose:
+    """Attitude of a photograph in the convention of orthonav; NaN where it is unknown."""
+
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+    yaw_std_deg: float | None = None
+    """Standard deviation of the heading, None for the usual one."""
+    tilt_std_deg: float | None = None
+    """Standard deviation of pitch and roll by what recorded them, None where they are unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
     """Metadata of one photograph; NaN and None where it has none."""
 
+    path: Path
     width_px: int
     """Columns of the image."""
     height_px: int
@@ -65,6 +103,10 @@ class Photo:
     """Height above ground, where a table states it."""
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
+    row: ImageRow | None = None
+    """What a table says of it."""
+    pose: PhotoPose = PhotoPose()
+    """Its attitude, once all photographs of the flight are known."""
 
 
 def read_photo(path: Path) -> Photo:
@@ -84,31 +126,39 @@ def read_photo(path: Path) -> Photo:
     # Some thermal cameras have XMP in the Exif directory.
     xmp = Xmp.of(packet or tags.get(_XMP_TAG) or more.get(_XMP_TAG) or b"")
     make = _word(tags.get(_MAKE))
-    notes = read_maker_notes(_bytes(more.get(_MAKER_NOTE)), make)
+    notes = more.get(_MAKER_NOTE)
+    gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
     time_ns, zone_known = xmp.time_ns, True
     if time_ns is None:
         time_ns, zone_known = _time(tags, more, gps)
     latlon, alt = _place(gps)
+    rtk = xmp.first("drone-dji:RtkFlag") > 0
+    north, east = (
+        xmp.first(f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
+    )
     body_yaw = xmp.body_yaw_deg()
     if math.isnan(body_yaw) and not xmp.unread:
-        body_yaw = notes.body_yaw_deg
+        body_yaw = heading
     doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
     if latlon is None and _lacks_references(gps):
         doubts.append("GPS position without N or S, or without E or W")
     return Photo(
+        path=path,
         width_px=width,
         height_px=height,
         time_ns=time_ns,
         zone_known=zone_known,
         latlon_deg=xmp.latlon_deg() or latlon,
         alt_m=alt,
-        gimbal_deg=xmp.gimbal_deg() or notes.gimbal_deg,
+        gimbal_deg=xmp.gimbal_deg() or gimbal,
         rotation=xmp.rotation(make),
         body_yaw_deg=body_yaw,
-        home_m=xmp.home_m(),
+        home_m=measured(
+            xmp.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
+        ),
         amsl_m=xmp.first("sensefly:AltitudeAMSL"),
-        hae_m=xmp.hae_m(),
-        vel_en_mps=xmp.velocity_en_mps(),
+        hae_m=xmp.first("drone-dji:AbsoluteAltitude" if rtk else "sensefly:AltitudeWGS84"),
+        vel_en_mps=(east, north) if math.isfinite(east + north) else None,
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
         doubts=tuple(doubts),
@@ -131,10 +181,6 @@ def _optics(tags: dict[int, Any], more: dict[int, Any]) -> Optics:
 
 def _word(value: Any) -> str:
     return "" if value is None else str(value).strip("\0 ")
-
-
-def _bytes(value: Any) -> bytes:
-    return value if isinstance(value, bytes) else b""
 
 
 def _time(
@@ -162,11 +208,10 @@ def _time(
 
 
 def _offset(text: str) -> timedelta | None:
-    found = re.fullmatch(r"([+-])(\d\d):(\d\d)", text)
-    if found is None:
-        return timedelta() if text == "Z" else None
-    offset = timedelta(hours=int(found[2]), minutes=int(found[3]))
-    return -offset if found[1] == "-" else offset
+    try:
+        return datetime.strptime(text, "%z").utcoffset()
+    except ValueError:
+        return None
 
 
 def _gps_time(gps: dict[int, Any]) -> datetime | None:
@@ -211,3 +256,131 @@ def _number(value: Any) -> float:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):
         return math.nan
+
+
+def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float] | None, float]:
+    """Yaw, pitch and roll of the gimbal, as in DJI's XMP, and heading of the aircraft.
+
+    They are in the maker notes of DJI's older models; other makers' are not read. An IFD of TIFF
+    without a header: the number of entries, then 12 bytes each. Tags as ExifTool lists them
+    (`Image::ExifTool::DJI`): 6 to 8 pitch, yaw and roll of the aircraft, 9 to 11 of the camera.
+    """
+    if make.upper() != "DJI":
+        return None, math.nan
+    # Programs that rewrite EXIF may change its byte order but not that of the notes.
+    values = next(filter(None, (_floats(data, order) for order in "<>")), {})
+    yaw, pitch, roll = (
+        values.get(tag, math.nan) for tag in (_CAMERA_YAW, _CAMERA_PITCH, _CAMERA_ROLL)
+    )
+    known = math.isfinite(yaw + pitch + roll)
+    return (yaw, pitch, roll) if known else None, values.get(_BODY_YAW, math.nan)
+
+
+def _floats(data: bytes, order: str) -> Mapping[int, float]:
+    """Single floats by tag; empty where this is no IFD of that byte order."""
+    if len(data) < 2:
+        return {}
+    (count,) = struct.unpack_from(f"{order}H", data)
+    if not 1 <= count <= _MAX_ENTRIES or len(data) < 2 + count * _ENTRY_BYTES:
+        return {}
+    found = {}
+    for number in range(count):
+        entry = struct.unpack_from(f"{order}HHIf", data, 2 + number * _ENTRY_BYTES)
+        tag, kind, values, value = entry
+        if kind == _FLOAT and values == 1 and abs(value) <= 360:
+            found[tag] = value
+    return found
+
+
+@dataclass(frozen=True)
+class Xmp:
+    """The values of a packet by prefix and name, and what they mean; NaN and None for missing."""
+
+    values: Mapping[str, float]
+    time_ns: int | None
+    """UTC at exposure."""
+    writer: str
+    """Program that wrote the packet, empty where it is not named."""
+    unread: tuple[str, ...] = ()
+    """Angles, heights and positions that are not numbers, as name and value."""
+
+    @classmethod
+    def of(cls, packet: str | bytes) -> "Xmp":
+        """The values in a packet, which may be empty."""
+        text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
+        texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(text)}
+        found = {name: _stated(value) for name, value in texts.items()}
+        values = {name: value for name, value in found.items() if math.isfinite(value)}
+        unread = tuple(
+            f"{name}={texts[name]!r:.40}"
+            for name in found.keys() - values.keys()
+            if _ANGLE_OR_PLACE.match(name.partition(":")[2])
+        )
+        writer = _WRITER.search(text)
+        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
+
+    def first(self, *names: str) -> float:
+        """The first of these values that is there, else NaN."""
+        return next((self.values[name] for name in names if name in self.values), math.nan)
+
+    def latlon_deg(self) -> tuple[float, float] | None:
+        """The position, which may be of RTK; `GpsLongtitude` is a common misspelling."""
+        for names in (
+            ("drone-dji:GpsLatitude", "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude"),
+            ("drone:GpsLatitude", "drone:GpsLongitude", "drone:GpsLongtitude"),
+            ("sensefly:Latitude", "sensefly:Longitude"),
+        ):
+            lat, lon = self.first(names[0]), self.first(*names[1:])
+            if abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0):
+                return lat, lon
+        return None
+
+    def gimbal_deg(self) -> tuple[float, float, float] | None:
+        """Yaw, pitch and roll of the gimbal, of a camera that looks ahead at 0, 0, 0."""
+        return self._angles("drone-dji:Gimbal{}Degree") or self._angles("drone:Gimbal{}Degree")
+
+    def body_yaw_deg(self) -> float:
+        """Heading of the aircraft; NaN where a gimbal has another one that cannot be read."""
+        if any("Gimbal" in value for value in self.unread):
+            return math.nan
+        return self.first("drone-dji:FlightYawDegree", "drone:FlightYawDegree")
+
+    def rotation(self, make: str) -> NDArray[np.float64] | None:
+        """`enu_from_camera` of a camera without a gimbal, whose maker is `make`."""
+        heading, pitch, roll = (
+            self.first(f"sensefly:{name}") for name in ("Heading", "PitchAngle", "RollAngle")
+        )
+        if math.isfinite(heading + pitch + roll):  # of the body; the camera looks straight down
+            return enu_from_camera(heading, pitch, roll)
+        angles = self._angles("Camera:{}")
+        if angles is None:
+            return None
+        # senseFly uses the names of Pix4D with the opposite sign of roll.
+        yaw, pitch, roll = angles
+        return enu_from_camera(yaw, pitch, -roll if "sensefly" in make.lower() else roll)
+
+    def _angles(self, pattern: str) -> tuple[float, float, float] | None:
+        yaw, pitch, roll = (self.first(pattern.format(name)) for name in ("Yaw", "Pitch", "Roll"))
+        return (yaw, pitch, roll) if math.isfinite(yaw + pitch + roll) else None
+
+
+def _stated(text: str) -> float:
+    """The number in a text, NaN where it is none."""
+    found = _NUMBER.fullmatch(text)
+    if found is None:
+        return math.nan
+    over, under = (float((part or "1").replace(",", ".")) for part in found.groups())
+    return over / under if under else math.nan
+
+
+def _exposed_ns(text: str) -> int | None:
+    """UTC in ns at exposure, as survey cameras of DJI and senseFly write it."""
+    found = _EXPOSED.search(text)
+    if found is None:
+        return None
+    try:
+        year, month, day, hour, minute, second = map(int, found.groups()[:6])
+        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError:
+        return None
+    return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))

@@ -32,28 +32,23 @@ _YEAR_2000_NS = 946_684_800 * 10**9
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraPosition:
-    """Where a picture was taken.
+    """Where a picture was taken: a view and its confident fix.
 
-    `lat_deg`, `lon_deg`: WGS84. `height_m`: above mean sea level, NaN without a terrain. `agl_m`:
-    above ground. `heading_deg`: of the top of the picture, clockwise from north. `std_m`: standard
-    deviation of the position along its worst axis, the displacement of the map included.
-    `confidence`: probability in 0..1. `time_ns`: exposure. `pitch_deg`, `roll_deg`: of the camera,
-    NaN where unknown.
+    `height_m`: above mean sea level, NaN without a terrain. `std_m`: standard deviation of the
+    position along its worst axis, the displacement of the map included.
     """
 
-    frame: str
-    lat_deg: float
-    lon_deg: float
+    view: ViewResult
+    fix: Fix
     height_m: float
-    agl_m: float
-    heading_deg: float
     std_m: float
-    confidence: float
-    time_ns: int = 0
-    pitch_deg: float = math.nan
-    roll_deg: float = math.nan
+
+    @property
+    def frame(self) -> str:
+        """Name of the picture."""
+        return self.view.frame
 
 
 def camera_positions(
@@ -61,31 +56,17 @@ def camera_positions(
 ) -> list[CameraPosition]:
     """The confident positions of a flight; heights above sea by the ground of `terrain`."""
     found = []
-    for result in results:
-        fix = result.outcome
-        if not isinstance(fix, Fix) or not result.is_confident:
+    for view in results:
+        fix = view.outcome
+        if not isinstance(fix, Fix) or not view.is_confident:
             continue
         ground_m = math.nan
         if terrain is not None:
             ground_m = float(terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
         worst = max(float(np.linalg.eigvalsh(fix.cov_en_m2)[-1]), 0.0)
-        if result.state is None:  # that of a track has it already
+        if view.state is None:  # that of a track has it already
             worst += MAP_STD_M**2
-        found.append(
-            CameraPosition(
-                result.frame,
-                fix.lat_deg,
-                fix.lon_deg,
-                ground_m + fix.agl_m,
-                fix.agl_m,
-                fix.heading_deg,
-                math.sqrt(worst),
-                fix.confidence,
-                result.time_ns,
-                fix.pitch_deg,
-                fix.roll_deg,
-            )
-        )
+        found.append(CameraPosition(view, fix, ground_m + fix.agl_m, math.sqrt(worst)))
     return found
 
 
@@ -120,11 +101,11 @@ def _csv(positions: Sequence[CameraPosition]) -> str:
     rows = [
         [
             each.frame,
-            f"{each.lat_deg:.8f}",
-            f"{each.lon_deg:.8f}",
+            f"{each.fix.lat_deg:.8f}",
+            f"{each.fix.lon_deg:.8f}",
             *(
                 "" if math.isnan(value) else f"{value:.3f}"
-                for value in (each.height_m, each.agl_m, each.heading_deg, each.std_m)
+                for value in (each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m)
             ),
         ]
         for each in positions
@@ -136,15 +117,15 @@ def _geojson(positions: Sequence[CameraPosition]) -> str:
     """Points (RFC 7946), with heights above sea where they are known."""
     features = []
     for each in positions:
-        point = [round(each.lon_deg, 8), round(each.lat_deg, 8)]
+        point = [round(each.fix.lon_deg, 8), round(each.fix.lat_deg, 8)]
         if not math.isnan(each.height_m):
             point.append(round(each.height_m, 3))
         about: dict[str, Any] = {
             "frame": each.frame,
-            "agl_m": round(each.agl_m, 3),
-            "heading_deg": round(each.heading_deg, 3),
+            "agl_m": round(each.fix.agl_m, 3),
+            "heading_deg": round(each.fix.heading_deg, 3),
             "std_m": round(each.std_m, 3),
-            "confidence": round(each.confidence, 4),
+            "confidence": round(each.fix.confidence, 4),
         }
         about = {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -165,7 +146,7 @@ def _odm_geo(positions: Sequence[CameraPosition]) -> str:
     for each in positions:
         if any(character.isspace() for character in each.frame):
             raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.frame!r}")
-        line = f"{each.frame} {each.lon_deg:.8f} {each.lat_deg:.8f}"
+        line = f"{each.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}"
         if not math.isnan(each.height_m):
             line += f" {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
         lines.append(line)
@@ -188,15 +169,15 @@ def _exif(positions: Sequence[CameraPosition]) -> str:
                 "Above Sea Level" if each.height_m >= 0 else "Below Sea Level",
             ]
         heading = ["", ""]
-        if not math.isnan(each.heading_deg):
-            heading = [f"{each.heading_deg:.2f}", "True North"]
+        if not math.isnan(each.fix.heading_deg):
+            heading = [f"{each.fix.heading_deg:.2f}", "True North"]
         rows.append(
             [
                 each.frame,
-                f"{abs(each.lat_deg):.8f}",
-                "North" if each.lat_deg >= 0 else "South",
-                f"{abs(each.lon_deg):.8f}",
-                "East" if each.lon_deg >= 0 else "West",
+                f"{abs(each.fix.lat_deg):.8f}",
+                "North" if each.fix.lat_deg >= 0 else "South",
+                f"{abs(each.fix.lon_deg):.8f}",
+                "East" if each.fix.lon_deg >= 0 else "West",
                 *height,
                 *heading,
                 f"{each.std_m:.3f}",
@@ -215,16 +196,18 @@ def _tum(positions: Sequence[CameraPosition]) -> str:
     """
     if not positions:
         return ""
-    origin = positions[0].lat_deg, positions[0].lon_deg
+    origin = positions[0].fix.lat_deg, positions[0].fix.lon_deg
     plane, above_sea = LocalFrame(*origin), _are_above_sea(positions)
     lines = [f"# east, north, up (m) of {origin[0]:.8f}, {origin[1]:.8f} (WGS84)"]
     for each in positions:
-        east, north = plane.en_from_latlon(each.lat_deg, each.lon_deg).tolist()
-        up = each.height_m if above_sea else each.agl_m
-        angles = np.nan_to_num([each.heading_deg, each.pitch_deg, each.roll_deg]).tolist()
+        east, north = plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()
+        up = each.height_m if above_sea else each.fix.agl_m
+        angles = np.nan_to_num(
+            [each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg]
+        ).tolist()
         numbers = " ".join(f"{value:.9f}" for value in _quaternion(enu_from_camera(*angles)))
         lines.append(
-            f"{Decimal(each.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
+            f"{Decimal(each.view.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
         )
     return "\n".join(lines) + "\n"
 
@@ -245,9 +228,10 @@ def _kml(positions: Sequence[CameraPosition]) -> str:
     """The track and a place for each picture; heights are absolute where all are above sea."""
     above_sea = _are_above_sea(positions)
     mode = "absolute" if above_sea else "relativeToGround"
+    heights_m = [each.height_m if above_sea else each.fix.agl_m for each in positions]
     points = [
-        f"{each.lon_deg:.8f},{each.lat_deg:.8f},{each.height_m if above_sea else each.agl_m:.2f}"
-        for each in positions
+        f"{each.fix.lon_deg:.8f},{each.fix.lat_deg:.8f},{height_m:.2f}"
+        for each, height_m in zip(positions, heights_m, strict=True)
     ]
 
     def placemark(name: str, about: str, kind: str, coordinates: str) -> str:
@@ -274,12 +258,12 @@ def _gpx(positions: Sequence[CameraPosition]) -> str:
     for each in positions:
         height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
         time = ""
-        if each.time_ns >= _YEAR_2000_NS:
-            seconds = datetime.fromtimestamp(each.time_ns // 10**9, UTC).strftime(
+        if each.view.time_ns >= _YEAR_2000_NS:
+            seconds = datetime.fromtimestamp(each.view.time_ns // 10**9, UTC).strftime(
                 "%Y-%m-%dT%H:%M:%S"
             )
-            time = f"<time>{seconds}.{each.time_ns % 10**9 // 10**6:03d}Z</time>"
-        place = f'lat="{each.lat_deg:.8f}" lon="{each.lon_deg:.8f}"'
+            time = f"<time>{seconds}.{each.view.time_ns % 10**9 // 10**6:03d}Z</time>"
+        place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
         lines.append(f"<trkpt {place}>{height}{time}<name>{escape(each.frame)}</name></trkpt>")
     body = "\n".join(lines)
     return (

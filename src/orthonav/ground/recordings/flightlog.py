@@ -5,13 +5,15 @@ anywhere: all chunks that are complete are read.
 """
 
 import re
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.errors import CameraError, FlightError, OrthonavError
+from orthonav.core.flight import decode_image
 from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.flight.logged import (
     FORMAT,
@@ -20,30 +22,22 @@ from orthonav.core.flight.logged import (
     RESULT,
     SESSION,
     TELEMETRY,
+    THUMBNAIL,
     VIEW,
     LoggedView,
     camera_of,
     from_json,
+    grey_of_png,
     picture_of,
     view_of,
 )
-from orthonav.core.flight.png import grey_of_png
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import ViewResult
-from orthonav.ground.recordings.mcap_chunks import (
-    Chunk,
-    LastChunk,
-    MessageLocation,
-    MessageSpan,
-    Walk,
-    chunks,
-    messages,
-    profile_of,
-)
+from orthonav.ground.recordings.mcap_files import Walk, chunk_at, chunks, messages, profile_of
 from orthonav.ground.recordings.recording import (
     Grey,
     Recording,
+    SourceOptions,
     SourceView,
     given_camera,
     with_options,
@@ -53,6 +47,7 @@ MAX_VIEWS = 500_000
 """Ten a second for 14 hours; a small damaged file can claim far more."""
 MAX_MESSAGES = 10 * MAX_VIEWS
 MAX_NAME = 200
+MAX_THUMBNAIL_BYTES = 2**20
 _NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
 
 
@@ -70,14 +65,105 @@ class LoggedFlight(Recording):
 
 
 @dataclass
-class _Index:
-    """Content of the files, collected in one pass."""
+class LogFile:
+    """A file of a log and how far it was read."""
 
-    session: dict[str, Any] = field(default_factory=dict)
-    views: list[LoggedView] = field(default_factory=list)
-    pictures: dict[int, MessageLocation] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-    messages: int = 0
+    path: Path
+    walk: Walk = field(default_factory=Walk)
+    channels: dict[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ImagePlace:
+    """Where the image of a view is: file, offset of its chunk, first and last byte in the chunk.
+
+    `whole`: whether it is the full image, not a thumbnail.
+    """
+
+    path: Path
+    offset: int
+    first: int
+    last: int
+    whole: bool
+
+
+class BrokenLogError(FlightError):
+    """A log that cannot be read any further: of a newer format, or beyond the limits."""
+
+
+class LogContent:
+    """What the files of one flight hold, collected as they are read.
+
+    `session`: of the last message; `views`: in order; `places`: of images by index of the view.
+    `broken`: number of messages that were skipped; `problem`: about the first one.
+    """
+
+    def __init__(self) -> None:
+        self.session: dict[str, Any] = {}
+        self.views: list[LoggedView] = []
+        self.places: dict[int, ImagePlace] = {}
+        self.broken, self.problem = 0, ""
+        self._messages = 0
+        self._lock = threading.Lock()
+        self._held: tuple[Path, int] | None = None
+        self._chunk = b""
+
+    def read(
+        self, file: LogFile, take: Callable[[str, bytes], None] = lambda topic, data: None
+    ) -> None:
+        """Read what is new in a file; `take` gets topic and data of every message but images.
+
+        Messages that are damaged, or for which `take` raises, are skipped. Raises `BrokenLogError`.
+        """
+        for offset, data in chunks(file.path, file.walk):
+            for found in messages(data, file.channels):
+                if found.topic in (VIEW.name, THUMBNAIL.name):
+                    whole = found.topic == VIEW.name
+                    place = ImagePlace(file.path, offset, found.first, found.last, whole)
+                    self.places.setdefault(found.number, place)
+                else:
+                    self._try(found.topic, data[found.first : found.last], file.path, take)
+                self._messages += 1
+                views = max(len(self.views), len(self.places))
+                if views > MAX_VIEWS or self._messages > MAX_MESSAGES:
+                    raise BrokenLogError(
+                        f"flight log holds more than {MAX_VIEWS} views: {file.path}"
+                    )
+
+    def _try(self, topic: str, data: bytes, path: Path, take: Callable[[str, bytes], None]) -> None:
+        try:
+            if topic == TELEMETRY.name:
+                self.views.append(view_of(data))
+            elif topic == SESSION.name:
+                self.session = _session(data, path)
+            take(topic, data)
+        except BrokenLogError:
+            raise
+        except (OrthonavError, UnicodeDecodeError) as error:
+            self.broken += 1
+            self.problem = self.problem or f"a message was skipped ({error}): {path}"
+
+    def grey(self, place: ImagePlace, camera: Camera, where: str) -> Grey:
+        """The image at a place; raises `FlightError` where it cannot be decoded."""
+        try:
+            data, kind = picture_of(self._message(place))
+        except FlightError as error:
+            raise FlightError(f"{error}: {where}") from error
+        except OSError as error:
+            raise FlightError(f"flight log cannot be read ({error.strerror}): {where}") from error
+        if place.whole and kind == "png":
+            return grey_of_png(data, camera.width_px, camera.height_px, where)
+        if place.whole or kind != "jpeg" or len(data) > MAX_THUMBNAIL_BYTES:
+            raise FlightError(f"image has an unknown format, {kind!r:.20}: {where}")
+        return decode_image(data, where)
+
+    def _message(self, place: ImagePlace) -> bytes:
+        """The data at a place, empty where its chunk is damaged; the last chunk is cached."""
+        with self._lock:
+            if self._held != (place.path, place.offset):
+                self._chunk = chunk_at(place.path, place.offset)
+                self._held = place.path, place.offset
+            return self._chunk[place.first : place.last]
 
 
 def is_flight_log(path: Path) -> bool:
@@ -94,29 +180,29 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     """
     if options.telemetry is not None:
         raise FlightError(f"a flight log has its own telemetry; omit --telemetry: {path}")
-    files = files_of_run(path)
-    index = _Index()
+    files, content, warnings = files_of_run(path), LogContent(), list[str]()
     for file in files:
-        _read_file(file, index)
-    if not index.session:
+        warnings += _warnings_of_file(LogFile(file), content)
+    if not content.session:
         raise FlightError(f"no chunk of the flight log is complete: {path}")
-    camera = _camera(index.session, path)
-    replayable = _replayable(index, path)
-    images = _LoggedImages(index.pictures, camera)
+    try:
+        camera = camera_of(content.session["camera"])
+    except (FlightError, CameraError) as error:
+        raise type(error)(f"{error}: {path}") from error
+    replayable = _replayable(content, path)
     used = given_camera(options, camera.width_px, camera.height_px, str(path)) or camera
-    _warn_of_gaps(index, replayable)
-    run, version = index.session.get("run"), index.session.get("version")
+    run, version = content.session.get("run"), content.session.get("version")
     return LoggedFlight(
         kind="log",
         path=path,
         camera=used,
         note=f"{path.name}: flight log {run!s:.40} of orthonav {version!s:.40}",
         expected=len(replayable),
-        stream=partial(_stream, replayable, images, options),
-        warnings=tuple(index.warnings),
-        session=index.session,
+        stream=lambda: (_view(each, content, camera, options) for each in replayable),
+        warnings=(*warnings, *_gaps(content.views, replayable)),
+        session=content.session,
         results=partial(_results, files),
-        arrivals=partial(_arrivals, index, images, options),
+        arrivals=partial(_arrivals, content, camera, options),
     )
 
 
@@ -152,98 +238,68 @@ def _order(path: Path) -> tuple[str, int]:
 
 def run_of(path: Path) -> str | None:
     """The run that a file belongs to; None where no chunk states it."""
-    for chunk in chunks(path, Walk()):
-        for found in messages(chunk, {}):
+    for _, data in chunks(path, Walk()):
+        for found in messages(data, {}):
             if found.topic == SESSION.name:
-                return str(from_json(chunk.data[found.first : found.last]).get("run"))
+                return str(from_json(data[found.first : found.last]).get("run"))
     return None
 
 
-def _read_file(path: Path, index: _Index) -> None:
-    walk, channels, broken = Walk(), dict[int, str](), 0
-    for chunk in chunks(path, walk):
-        for found in messages(chunk, channels):
-            index.messages += 1
-            try:
-                _take(found, chunk, path, index)
-            except NewerFormatError:
-                raise
-            except FlightError:
-                broken += 1
-            views = max(len(index.views), len(index.pictures))
-            if views > MAX_VIEWS or index.messages > MAX_MESSAGES:
-                raise FlightError(f"flight log holds more than {MAX_VIEWS} views: {path}")
-    if walk.damaged or broken:
-        index.warnings.append(
-            f"{walk.damaged} chunks and {broken} messages are damaged and ignored: {path}"
+def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
+    """Read a file; warnings about its damage."""
+    before, warnings = content.broken, []
+    content.read(file)
+    damaged, broken = file.walk.damaged, content.broken - before
+    if damaged or broken:
+        warnings.append(
+            f"{damaged} chunks and {broken} messages are damaged and ignored: {file.path}"
         )
-    if not walk.ended:
-        index.warnings.append(
-            f"flight log was cut short, {walk.lost_bytes} bytes after its last complete chunk are "
-            f"lost: {path}"
+    if not file.walk.ended:
+        warnings.append(
+            f"flight log was cut short, {file.walk.lost_bytes} bytes after its last complete chunk "
+            f"are lost: {file.path}"
         )
-
-
-def _take(found: MessageSpan, chunk: Chunk, path: Path, index: _Index) -> None:
-    if found.topic == VIEW.name:
-        place = MessageLocation(path, chunk.offset, found.first, found.last)
-        index.pictures.setdefault(found.number, place)
-    elif found.topic == TELEMETRY.name:
-        index.views.append(view_of(chunk.data[found.first : found.last]))
-    elif found.topic == SESSION.name:
-        index.session = _session(chunk.data[found.first : found.last], path)
-
-
-class NewerFormatError(FlightError):
-    """A log of a newer format."""
-
-
-def session_of(data: bytes, path: Path) -> dict[str, Any]:
-    """The session of a log. Raises `NewerFormatError`, or `FlightError` where it is damaged."""
-    plain = from_json(data)
-    number = plain.get("format")
-    if isinstance(number, int) and number > FORMAT:
-        raise NewerFormatError(
-            f"flight log has format {number!s:.20}, this program reads up to {FORMAT}; update "
-            f"orthonav: {path}"
-        )
-    return plain
+    return warnings
 
 
 def _session(data: bytes, path: Path) -> dict[str, Any]:
-    plain = session_of(data, path)
+    """The session of a log. Raises `FlightError` where it is damaged, or of a newer format."""
+    plain = from_json(data)
+    number = plain.get("format")
+    if isinstance(number, int) and number > FORMAT:
+        raise BrokenLogError(
+            f"flight log has format {number!s:.20}, this program reads up to {FORMAT}; update "
+            f"orthonav: {path}"
+        )
     if not isinstance(plain.get("camera"), dict):
         raise FlightError("session of the log is damaged")
     return plain
 
 
-def _camera(session: Mapping[str, Any], path: Path) -> Camera:
-    try:
-        return camera_of(session["camera"])
-    except (FlightError, CameraError) as error:
-        raise type(error)(f"{error}: {path}") from error
-
-
-def _replayable(index: _Index, path: Path) -> list[LoggedView]:
+def _replayable(content: LogContent, path: Path) -> list[LoggedView]:
     """The views that can be localized again: image logged, or unusable in flight already."""
     seen: set[str] = set()
-    for view in index.views:
+    for view in content.views:
         if not _is_name(view.frame):
             raise FlightError(f"{view.frame!r:.80} is not a valid name of a view: {path}")
         if view.frame in seen:
             raise FlightError(f"view {view.frame} appears twice: {path}")
         seen.add(view.frame)
-    replayable = [
-        each
-        for each in index.views
-        if not each.withheld and (each.index in index.pictures or each.picture == "bad")
-    ]
-    if not index.pictures:
+    if not any(place.whole for place in content.places.values()):
         raise FlightError(
-            f"flight log holds no full images (views: {index.session.get('views')!s:.20}), so "
+            f"flight log holds no full images (views: {content.session.get('views')!s:.20}), so "
             f"nothing can be localized again: {path}"
         )
-    return replayable
+    return [
+        each
+        for each in content.views
+        if not each.withheld and (_has_image(each, content) or each.picture == "bad")
+    ]
+
+
+def _has_image(view: LoggedView, content: LogContent) -> bool:
+    place = content.places.get(view.index)
+    return place is not None and place.whole
 
 
 def _is_name(frame: str) -> bool:
@@ -260,86 +316,69 @@ def _is_name(frame: str) -> bool:
     )
 
 
-def _warn_of_gaps(index: _Index, replayable: list[LoggedView]) -> None:
-    """Warn of missing views: without them the track differs from the one in flight."""
-    logged = sorted(view.index for view in index.views)
+def _gaps(views: list[LoggedView], replayable: list[LoggedView]) -> list[str]:
+    """Warnings about missing views: without them the track differs from the one in flight."""
+    logged = sorted(view.index for view in views)
     begin, end = logged[0], logged[-1] + 1
+    warnings = []
     if begin > 0:
-        index.warnings.append(
+        warnings.append(
             f"the first {begin} views of the flight are not in the log: a track begins later than "
             "in flight"
         )
-    withheld = sum(view.withheld for view in index.views)
+    withheld = sum(view.withheld for view in views)
     missing = end - begin - len(replayable) - withheld
     if withheld:
-        index.warnings.append(
+        warnings.append(
             f"{withheld} views were not located in flight, because the latency of the camera was "
             "not known; only `orthonav calibrate --latency` uses them"
         )
     if missing > 0:
-        index.warnings.append(
+        warnings.append(
             f"{missing} views lack a full image and are left out: a track differs after them"
         )
+    return warnings
 
 
-def _stream(
-    replayable: list[LoggedView], pictures: "_LoggedImages", options: SourceOptions
-) -> Iterator[SourceView]:
-    for view in replayable:
-        where = f"view {view.frame} of {pictures.where(view.index)}"
-        yield SourceView(
-            frame=view.frame,
-            telemetry=with_options(view.telemetry, None, options),
-            truth_latlon_deg=None,
-            where=where,
-            load=partial(pictures.grey, view.index, where),
-        )
+def _view(
+    view: LoggedView, content: LogContent, camera: Camera, options: SourceOptions
+) -> SourceView:
+    place = content.places.get(view.index) if _has_image(view, content) else None
+    where = f"view {view.frame} of {'the flight log' if place is None else place.path}"
+    load = (
+        partial(_unusable, where) if place is None else partial(content.grey, place, camera, where)
+    )
+    return SourceView(view.frame, with_options(view.telemetry, None, options), None, where, load)
+
+
+def _unusable(where: str) -> Grey:
+    raise FlightError(f"the camera delivered no usable image in flight: {where}")
 
 
 def _arrivals(
-    index: _Index, pictures: "_LoggedImages", options: SourceOptions
+    content: LogContent, camera: Camera, options: SourceOptions
 ) -> Iterator[tuple[SourceView, float]]:
     """Views with an image, and the latency (s) that was subtracted from their arrival."""
-    views = [each for each in index.views if each.index in index.pictures]
-    latencies = [(each.camera_latency_ms or 0.0) / 1e3 for each in views]
-    yield from zip(_stream(views, pictures, options), latencies, strict=True)
-
-
-class _LoggedImages:
-    """Reads images on request; caches the chunk of the last one."""
-
-    def __init__(self, places: Mapping[int, MessageLocation], camera: Camera) -> None:
-        self._places, self._camera = places, camera
-        self._chunk = LastChunk()
-
-    def where(self, index: int) -> str:
-        place = self._places.get(index)
-        return "the flight log" if place is None else str(place.path)
-
-    def grey(self, index: int, where: str) -> Grey:
-        """Raises `FlightError` where it cannot be decoded."""
-        place = self._places.get(index)
-        if place is None:
-            raise FlightError(f"the camera delivered no usable image in flight: {where}")
-        message = self._chunk.message(place, where)
-        try:
-            data, kind = picture_of(message)
-        except FlightError as error:
-            raise FlightError(f"{error}: {where}") from error
-        if kind != "png":
-            raise FlightError(f"expected a PNG, got {kind!r:.20}: {where}")
-        return grey_of_png(data, self._camera.width_px, self._camera.height_px, where)
+    for each in content.views:
+        if _has_image(each, content):
+            yield _view(each, content, camera, options), (each.camera_latency_ms or 0.0) / 1e3
 
 
 def _results(files: list[Path]) -> Iterator[ViewResult]:
     """The results of the flight; damaged ones are skipped."""
     for path in files:
         channels: dict[int, str] = {}
-        for chunk in chunks(path, Walk()):
-            for found in messages(chunk, channels):
-                if found.topic == RESULT.name and found.last - found.first <= MAX_JSON_BYTES:
+        for _, data in chunks(path, Walk()):
+            for found in messages(data, channels):
+                if found.topic == RESULT.name:
                     try:
-                        text = chunk.data[found.first : found.last].decode("utf-8")
-                        yield result_from_json(text)
+                        yield logged_result(data[found.first : found.last])
                     except (FlightError, UnicodeDecodeError):
                         continue
+
+
+def logged_result(data: bytes) -> ViewResult:
+    """The result in a message of `RESULT`. Raises `FlightError` or `UnicodeDecodeError`."""
+    if len(data) > MAX_JSON_BYTES:
+        raise FlightError(f"result of the log has {len(data)} bytes")
+    return result_from_json(data.decode("utf-8"))

@@ -1,21 +1,33 @@
-"""Detection of the kind of a recording, and opening it."""
+"""Opening a recording of any kind, importing it, and its heights over a terrain."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from orthonav.core.errors import FlightError, MissingFileError
-from orthonav.core.files import require_file
-from orthonav.core.flight import FlightFolder, open_flight, read_truth
-from orthonav.core.flight.source_options import SourceOptions
+from orthonav.core.files import replacing_folder, require_file
+from orthonav.core.flight import FlightFolder, FlightWriter, open_flight, read_truth
+from orthonav.core.flight.folder import encoded
+from orthonav.core.flight.heights import (
+    GroundHeights,
+    Undulation,
+    assumed_heights,
+    is_measured,
+    warn_of_mismatch,
+)
+from orthonav.core.geo.ground import TerrainHeights, ground_around
+from orthonav.core.geo.headings import seem_radians
 from orthonav.ground.recordings.flightlog import is_flight_log, open_flight_log
 from orthonav.ground.recordings.image_table import is_image_table
-from orthonav.ground.recordings.photo_files import is_photo, photo_paths
-from orthonav.ground.recordings.photos import open_photos
+from orthonav.ground.recordings.photos import is_photo, open_photos, photo_paths
 from orthonav.ground.recordings.recording import (
     Recording,
+    SourceOptions,
     SourceView,
     given_camera,
+    rounded,
     time_warnings,
     with_options,
 )
@@ -25,6 +37,7 @@ from orthonav.ground.recordings.video import open_video
 
 _VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")
 _TS_PACKET_BYTES = 188
+READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 def open_source(path: Path | Sequence[Path], options: SourceOptions | None = None) -> Recording:
@@ -141,3 +154,124 @@ def _flight_views(
             load=view.grey,
             data=view.path.read_bytes,
         )
+
+
+@dataclass(frozen=True)
+class Imported:
+    """Number of views that were written."""
+
+    views: int
+    """All of them."""
+    with_truth: int
+    """Those with a true position."""
+    complete: int
+    """Those with all telemetry that a fix needs."""
+    broken: int
+    """Views left out because their image cannot be decoded, or has another size."""
+    first_broken: str
+    """The error of the first one of them."""
+    radians: bool
+    """Whether the headings look like radians."""
+
+
+def import_flight(
+    recording: Recording,
+    out: Path,
+    jpeg_quality: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Imported:
+    """Write the views of `recording` as a flight folder `out`, whole or not at all.
+
+    Encoded images are copied unchanged; others are written grey, as PNG or, with `jpeg_quality`,
+    as JPEG. Views whose image cannot be decoded, or has another size than the camera, are left out
+    and counted. Raises `FlightError` where none is left, `OutputError` where `out` cannot be
+    written.
+    """
+    views = truths = complete = broken = 0
+    first_broken, yaw_deg = "", []
+    with replacing_folder(Path(out)) as folder:
+        writer = FlightWriter(folder, recording.camera, recording.note)
+        for view in recording.views:
+            try:
+                frame, data = _encoded_image(view, recording, jpeg_quality)
+            except FlightError as error:
+                broken, first_broken = broken + 1, first_broken or str(error)
+                continue
+            writer.add_encoded(frame, data, view.telemetry, view.truth_latlon_deg)
+            views += 1
+            yaw_deg.append(view.telemetry.yaw_deg)
+            truths += view.truth_latlon_deg is not None
+            complete += not view.telemetry.missing()
+            if recording.expected:
+                progress(min(1.0, (views + broken) / recording.expected))
+        if views == 0:
+            raise FlightError(first_broken or f"recording has no view: {recording.path}")
+        writer.close()
+    return Imported(views, truths, complete, broken, first_broken, seem_radians(yaw_deg))
+
+
+def _encoded_image(
+    view: SourceView, recording: Recording, jpeg_quality: int | None
+) -> tuple[str, bytes]:
+    """Name and bytes of the image as it is written, once it is decoded."""
+    grey, camera = view.grey(), recording.camera
+    if grey.shape != (camera.height_px, camera.width_px):
+        raise FlightError(
+            f"camera is {camera.width_px} x {camera.height_px} px, the image is "
+            f"{grey.shape[1]} x {grey.shape[0]} px: {view.where}"
+        )
+    if view.data is not None and view.frame.lower().endswith(READABLE):
+        return view.frame, view.data()
+    suffix = ".png" if jpeg_quality is None else ".jpg"
+    frame = str(PurePosixPath(view.frame).with_suffix(suffix))
+    return frame, encoded(grey, frame, jpeg_quality or 0)
+
+
+@dataclass(eq=False)
+class OverTerrain:
+    """Heights above ground of the views of a recording. Mutable: it counts.
+
+    `terrain`: heights above mean sea level. `name`: the terrain in words. `geoid`: None where
+    heights above the ellipsoid cannot be used. `without`: number of views without a height above
+    ground, because no height or no position was recorded, or because it lies over a hole of the
+    terrain or outside it.
+    """
+
+    terrain: TerrainHeights
+    name: str
+    geoid: Undulation | None = None
+    without: int = field(default=0, init=False)
+
+    def recording(self, recording: Recording) -> Recording:
+        """The same recording with heights above ground; its note says how.
+
+        Raises `FlightError` where no position was recorded.
+        """
+        first = next((v for v in recording.views if v.truth_latlon_deg is not None), None)
+        if first is None or first.truth_latlon_deg is None:
+            raise FlightError(
+                "--dem needs recorded positions, and the recording has none: import without it, "
+                f"and give it to orthonav localize: {recording.path}"
+            )
+        take_off = ground_around(
+            self.terrain, recording.take_off_latlon_deg or first.truth_latlon_deg, 0.0
+        )
+        heights = GroundHeights(self.terrain, take_off, self.geoid)
+        off_m = heights.mismatch_m(first.telemetry)
+        if math.isfinite(off_m):
+            warn_of_mismatch(off_m)
+        assumed = assumed_heights(first.telemetry, self.name)
+        note = "; ".join(filter(None, [recording.note, assumed]))
+        return replace(recording, stream=lambda: self._views(recording, heights), note=note)
+
+    def _views(self, recording: Recording, heights: GroundHeights) -> Iterator[SourceView]:
+        self.without = 0
+        for view in recording.views:
+            telemetry, place = view.telemetry, view.truth_latlon_deg
+            below = None if place is None else ground_around(self.terrain, place, 0.0)
+            if below is not None and place is not None:
+                telemetry = heights.above(telemetry, below, place)
+            if telemetry is view.telemetry and not is_measured(telemetry):
+                telemetry = replace(telemetry, agl_m=math.nan)  # level ground is not assumed
+            self.without += math.isnan(telemetry.agl_m)
+            yield replace(view, telemetry=rounded(telemetry))

@@ -1,17 +1,18 @@
-"""A recorded flight that is read view by view."""
+"""A recorded flight that is read view by view, how it is read, and doubts about it."""
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
+from orthonav.core.files import with_paths
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.flight.telemetry_track import RecordedTrack, measured
 from orthonav.core.geo.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.core.geo.camera import Camera
@@ -19,11 +20,87 @@ from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.records import Prior, Telemetry
 
+KINDS = ("flight", "photos", "video", "ros", "log")
+ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
+MAX_FOV_DEG = 150.0
+LEVEL_GROUND = (
+    "height above ground is taken from the height above take-off: level ground is assumed"
+)
+LEVEL_GROUND_IN_GAPS = (
+    "where no height above ground was measured, it is taken from the height above take-off: level "
+    "ground is assumed there"
+)
 Grey = NDArray[np.uint8]
 DECIMALS = 8
+_ROUNDED = (
+    *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
+    *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
+)
 JUMP_M, JUMP_MPS = 500.0, 150.0
 """Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
 that this program is for flies slower, and logs round positions to some metres."""
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How a recording is read. Raises `FlightError` for invalid values."""
+
+    kind: str | None = None
+    """One of `KINDS`; None: detected by content."""
+    camera: Path | None = None
+    """Camera file; None: the recording's own camera."""
+    rate_hz: float = 1.0
+    """Views per second of a video."""
+    telemetry: Path | None = None
+    """Log to join by time; None: the recording's own telemetry."""
+    time_offset_s: float = 0.0
+    """Added to the times of images to get times of the log, seconds."""
+    mount_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Yaw, pitch, roll of the camera in the body; 0, 0, 0 looks straight down, top forward."""
+    topics: Mapping[str, str] = field(default_factory=dict)
+    """ROS topics by role, one of `ROLES`."""
+    prior_std_m: float | None = None
+    """Use the recorded position as the prior, with this standard deviation per axis."""
+    sensor_width_mm: float | None = None
+    """Longer side of the sensor, for the focal length of photographs."""
+    ground_alt_m: float | None = None
+    """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
+    agl_m: float | None = None
+    """Height above ground of all views, in place of a recorded one."""
+    fov_deg: float | None = None
+    """Field of view across the width of the image, where there is no camera file."""
+    looks_down: bool = False
+    """Whether the camera looked straight down where pitch and roll were not recorded."""
+    over_terrain: bool = False
+    """Whether a terrain turns the heights of the recording into heights above ground later on."""
+    skip_bad_images: bool = False
+    """Whether images that a flight folder names may be missing."""
+
+    def __post_init__(self) -> None:
+        with_paths(self, "camera", "telemetry")
+        for name in ("rate_hz", "prior_std_m", "sensor_width_mm", "agl_m", "fov_deg"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise FlightError(f"{name} must be above 0, got {value}")
+        if self.fov_deg is not None and self.fov_deg > MAX_FOV_DEG:
+            raise FlightError(f"fov_deg must be at most {MAX_FOV_DEG:g}, got {self.fov_deg:g}")
+        if self.fov_deg is not None and self.camera is not None:
+            raise FlightError("give a camera file or a field of view, not both")
+        if self.agl_m is not None and self.ground_alt_m is not None:
+            raise FlightError("give a height above ground or an altitude of the ground, not both")
+        numbers = (self.time_offset_s, *self.mount_deg, self.ground_alt_m or 0.0)
+        if not all(math.isfinite(number) for number in numbers):
+            raise FlightError("time offset, mount and ground altitude must be finite numbers")
+        if self.kind is not None and self.kind not in KINDS:
+            raise FlightError(f"kind must be one of {', '.join(KINDS)}, got '{self.kind}'")
+        unknown = [role for role in self.topics if role not in ROLES]
+        if unknown:
+            raise FlightError(f"topics are for {', '.join(ROLES)}, got '{unknown[0]}'")
+
+    @property
+    def time_offset_ns(self) -> int:
+        """The offset in nanoseconds."""
+        return round(self.time_offset_s * 1e9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,24 +166,14 @@ def with_options(
 
 def rounded(telemetry: Telemetry) -> Telemetry:
     """The telemetry at the precision of a flight folder, so that import changes no result."""
-    prior, velocity = telemetry.prior, telemetry.vel_en_mps
-    return replace(
-        telemetry,
-        yaw_deg=round(telemetry.yaw_deg, DECIMALS),
-        pitch_deg=round(telemetry.pitch_deg, DECIMALS),
-        roll_deg=round(telemetry.roll_deg, DECIMALS),
-        agl_m=round(telemetry.agl_m, DECIMALS),
-        yaw_std_deg=_rounded(telemetry.yaw_std_deg),
-        agl_std_m=_rounded(telemetry.agl_std_m),
-        prior=prior and Prior(*(round(number, DECIMALS) for number in astuple(prior))),
-        vel_en_mps=velocity and (round(velocity[0], DECIMALS), round(velocity[1], DECIMALS)),
-        home_m=_rounded(telemetry.home_m),
-        amsl_m=_rounded(telemetry.amsl_m),
-        hae_m=_rounded(telemetry.hae_m),
-    )
+    return replace(telemetry, **{name: _rounded(getattr(telemetry, name)) for name in _ROUNDED})
 
 
-def _rounded(value: float | None) -> float | None:
+def _rounded(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_rounded, value))
+    if isinstance(value, Prior):
+        return Prior(*map(_rounded, astuple(value)))
     return None if value is None else round(value, DECIMALS)
 
 
@@ -163,15 +230,6 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
         "order of their names, and a track over them is of little use, because it needs the time "
         "of each"
     ]
-
-
-LEVEL_GROUND = (
-    "height above ground is taken from the height above take-off: level ground is assumed"
-)
-LEVEL_GROUND_IN_GAPS = (
-    "where no height above ground was measured, it is taken from the height above take-off: level "
-    "ground is assumed there"
-)
 
 
 def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:

@@ -4,28 +4,41 @@
 end without a copy.
 """
 
+import bz2
 import contextlib
 import io
+import logging
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
-from orthonav.core.flight.ros_topics import ParsableReader
+from orthonav.core.flight.logged import MAX_CHUNK_BYTES
 from orthonav.core.guard import needed, reading, without_plea
-from orthonav.ground.recordings.mcap_chunks import MAGIC, complete_bytes, partial_records
-from orthonav.ground.recordings.ros_limits import bound_inflation, check_held
+from orthonav.ground.recordings.mcap_files import (
+    MAGIC,
+    complete_bytes,
+    inflated,
+    partial_records,
+)
 
 MAGICS = {b"#ROSBAG V": ".bag", MAGIC: ".mcap", b"SQLite format 3\0": ".db3"}
 METADATA = "metadata.yaml"
+MAX_HELD_BYTES = 2**30
+WHAT = "ROS recordings"
 _ROS_2 = (".mcap", ".db3")
 _SPLIT = re.compile(r"(.+)_(\d{1,9})")
 _END = b"\x0f" + (4).to_bytes(8, "little") + bytes(4)  # data end
 _END += b"\x02" + (20).to_bytes(8, "little") + bytes(20) + MAGIC  # footer without a summary
+
+
+log = logging.getLogger(__name__)
 
 
 def bag_suffix(path: Path) -> str | None:
@@ -102,8 +115,8 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> Any:
-    highlevel = needed("rosbags.highlevel", "ROS recordings")
-    typesys = needed("rosbags.typesys", "ROS recordings")
+    highlevel = needed("rosbags.highlevel", WHAT)
+    typesys = needed("rosbags.typesys", WHAT)
     known = typesys.get_typestore(typesys.Stores.LATEST)  # for old bags without definitions
     reader = highlevel.AnyReader(paths, default_typestore=known)
     reader.readers = [ParsableReader(each) for each in reader.readers]
@@ -123,6 +136,49 @@ def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> An
         raise
     check_held(reader.readers)
     return reader
+
+
+class ParsableReader:
+    """A reader of `rosbags` without the connections whose messages it cannot describe.
+
+    `rosbags` refuses a whole recording for one of them. Such are events of services and actions:
+    their definitions refer to types that messages do not have.
+    """
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+
+    def __enter__(self) -> "ParsableReader":
+        self._reader.__enter__()
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._reader.__exit__(*raised)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._reader, name)
+
+    @cached_property
+    def connections(self) -> list[Any]:
+        """The connections whose messages can be parsed, once the reader is open."""
+        return [one for one in self._reader.connections if _is_parsable(one)]
+
+
+def _is_parsable(connection: Any) -> bool:
+    """Whether a topic carries messages whose definition is complete."""
+    typesys = needed("rosbags.typesys", WHAT)
+    parsable = "/msg/" in connection.msgtype
+    if parsable and connection.msgdef.format.name == "MSG":
+        store = typesys.get_typestore(typesys.Stores.EMPTY)
+        try:
+            store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            store.hash_rihs01(connection.msgtype)
+        except Exception as error:  # of the parser, or of a type that is not defined
+            log.info("%s cannot be parsed: %s", connection.msgtype, error)
+            parsable = False
+    if not parsable:
+        log.info("topic is ignored: %s carries %s", connection.topic, connection.msgtype)
+    return parsable
 
 
 def _named(path: Path, stack: contextlib.ExitStack) -> Path:
@@ -196,11 +252,7 @@ class _Ended(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        starts = {
-            io.SEEK_SET: 0,
-            io.SEEK_CUR: self._at,
-            io.SEEK_END: self._complete + len(self._end),
-        }
+        starts = 0, self._at, self._complete + len(self._end)
         self._at = max(0, starts[whence] + offset)
         return self._at
 
@@ -218,3 +270,72 @@ class _Ended(io.RawIOBase):
     def close(self) -> None:
         self._stream.close()
         super().close()
+
+
+def bound_inflation() -> None:
+    """Limit decompression by `rosbags` to the stated size of a chunk and `MAX_CHUNK_BYTES`.
+
+    It decompresses a whole chunk before it compares its size with the stated one, so a small
+    malicious file could exhaust memory. Violations raise `ValueError`, as damage does there.
+    """
+    mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
+    mcap.DECOMPRESSORS.update(lz4=_lz4, zstd=_zstd)
+    bag = needed("rosbags.rosbag1.reader", WHAT)
+    bag.decompressors.update(lz4=lambda data: _lz4(data, MAX_CHUNK_BYTES), bz2=_bz2)
+
+
+def check_held(readers: Iterable[Any]) -> None:
+    """Raises `ValueError` where chunks state too many bytes, singly or those of the same time,
+    which are held at once.
+
+    `readers` are those of an opened recording (`AnyReader.readers`).
+    """
+    for reader in readers:
+        storage = getattr(reader, "storage", None)  # a ROS 1 bag has none: one chunk at a time
+        for one in getattr(storage, "storages", [storage]):
+            chunks = getattr(one, "chunks", [])
+            _require(max((chunk.uncompressed_size for chunk in chunks), default=0))
+            if (held := _most_held(chunks)) > MAX_HELD_BYTES:
+                raise ValueError(
+                    f"chunks of the same time state {held} bytes, more than {MAX_HELD_BYTES}"
+                )
+
+
+def _most_held(chunks: Sequence[Any]) -> int:
+    """Largest total of chunks that overlap at one time."""
+    edges = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
+    edges += [
+        (max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size)
+        for chunk in chunks
+    ]
+    return max(accumulate(step for _, _, step in sorted(edges)), default=0)
+
+
+def _require(size: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk states {size} bytes, more than {MAX_CHUNK_BYTES}")
+
+
+def _zstd(data: bytes, size: int) -> bytes:
+    _require(size)
+    return inflated(b"zstd", data, size + 1)
+
+
+def _lz4(data: bytes, size: int) -> bytes:
+    _require(size)
+    return _decompressed(needed("lz4.frame", WHAT).LZ4FrameDecompressor(), data, size)
+
+
+def _bz2(data: bytes) -> bytes:
+    return _decompressed(bz2.BZ2Decompressor(), data, MAX_CHUNK_BYTES)
+
+
+def _decompressed(decompressor: Any, data: bytes, size: int) -> bytes:
+    """`data` decompressed; raises `ValueError` beyond `size` bytes or where it is incomplete.
+
+    One byte more than allowed is requested, so that the end after exactly `size` bytes is seen.
+    """
+    plain: bytes = decompressor.decompress(data, max_length=size + 1)
+    if len(plain) > size or not decompressor.eof:
+        raise ValueError(f"a chunk is cut, or takes more than the {size} bytes it may")
+    return plain

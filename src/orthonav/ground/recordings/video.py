@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight.source_options import SourceOptions
 from orthonav.core.flight.telemetry_track import RecordedTrack
-from orthonav.ground.recordings.logs import log_kind, read_log
+from orthonav.ground.recordings.logs import end_ns, log_kind, read_log
 from orthonav.ground.recordings.recording import (
     Recording,
+    SourceOptions,
     SourceView,
     check_overlap,
     given_camera,
@@ -28,11 +28,12 @@ from orthonav.ground.recordings.recording import (
     warnings_of,
     with_mean_velocities,
 )
-from orthonav.ground.recordings.subtitles import end_ns
 
 SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
 _SHORT_NS = 1_000_000_000
 _MISSING_FRAMES = 0.01
+SILENT = 0
+"""OpenCV's level of logging at which it writes nothing."""
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -125,10 +126,6 @@ def _grey(frame: NDArray[Any] | None, where: str) -> NDArray[np.uint8]:
 def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
     width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
     return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-
-
-SILENT = 0
-"""OpenCV's level of logging at which it writes nothing."""
 
 
 @contextmanager

@@ -20,8 +20,8 @@ from orthonav.core.geo.camera import (
     footprint_en_m,
     seen_px,
 )
-from orthonav.core.localize.checks import check_telemetry
 from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
+from orthonav.core.localize.view import check_telemetry
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import TerrainLayer

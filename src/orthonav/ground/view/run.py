@@ -19,9 +19,8 @@ from orthonav import __version__
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.core.files import with_paths
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.fixes import STATES
+from orthonav.core.flight.fixes import STATES, Identity, flight_digest, read_identity
 from orthonav.core.flight.gnss import fault_of, gnss_of
-from orthonav.core.flight.identity import Identity, flight_digest, read_identity
 from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.signature import map_digest
@@ -29,7 +28,7 @@ from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.calibration import is_covariance
 from orthonav.ground.evaluate.metrics import FAR_M, check_truth
 from orthonav.ground.recordings.flightlog import is_flight_log
-from orthonav.ground.recordings.pixel import locate_pixel
+from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 from orthonav.ground.report.imagery import (
     GroundWindow,
     SheetImagery,
@@ -45,7 +44,6 @@ from orthonav.ground.report.numbers import to_plain
 from orthonav.ground.view.feed import Batch, Feed, LineFeed
 from orthonav.ground.view.images import FolderImages, NoImages, Shot, ViewImages
 from orthonav.ground.view.logs import LogReader
-from orthonav.onboard.messages.estimate import ellipse_95
 
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]

@@ -5,7 +5,7 @@ number that looks like a measurement.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import OrthonavError
 from orthonav.core.geo.ellipse import error_ellipse
-from orthonav.core.records import CONFIDENT, Fix, ViewResult
+from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
 
-ELLIPSE_95 = math.sqrt(5.991)
-"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
+AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
+"""Time over which the filters of autopilots average positions, s, where their claim should come to
+the standard deviation `AT_STD_M`; it grows with this power of it. Derived from the default process
+noise of PX4 and ArduPilot, 5.5 s, and chosen on generated flights
+(docs/decisions/correlated-errors.md)."""
 
 
 class EstimateError(OrthonavError, ValueError):
@@ -177,22 +180,6 @@ def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
 
 
-def ellipse_95(cov_en: NDArray[np.float64]) -> dict[str, float] | None:
-    """The 95 % ellipse of a (2, 2) covariance in m^2, as commands and pages write it.
-
-    Semi-axes `major_m` and `minor_m` to a millimetre, `direction_deg` of the major one to a tenth
-    of a degree clockwise from north. None where `error_ellipse` has NaN.
-    """
-    major_m, minor_m, direction_deg = error_ellipse(cov_en)
-    if math.isnan(major_m):
-        return None
-    return {
-        "major_m": round(ELLIPSE_95 * major_m, 3),
-        "minor_m": round(ELLIPSE_95 * minor_m, 3),
-        "direction_deg": round(direction_deg, 1),
-    }
-
-
 def _both_clocks(
     time_ns: int, clock: Clock, utc_minus_boot_ns: int | None
 ) -> tuple[int | None, int | None]:
@@ -211,3 +198,62 @@ def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
     """Covariance from a track, which reports the standard deviation along the worst direction."""
     std_mps = fix.evidence.get("vel_std_mps", math.nan)
     return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None
+
+
+def messages_averaged(std_m: float, interval_s: float) -> float:
+    """Number of messages, 1 or more, that a receiver averages.
+
+    The errors of consecutive fixes are nearly the same: the displacement of the map, the tilt of
+    the camera and the memory of the track last longer than a receiver averages. One that takes n
+    such fixes as independent claims n times too small a variance.
+
+    `std_m`: standard deviation that its claim should come to, m. `interval_s`: time since the
+    message before, s; infinite for the first. A time that is not positive, after a clock was set
+    back, counts as infinite.
+    """
+    if not interval_s > 0:
+        return 1.0
+    return max(AVERAGING_S * math.pow(std_m / AT_STD_M, EXPONENT) / interval_s, 1.0)
+
+
+def for_filter(
+    estimate: NavigationEstimate, interval_s: float, min_std_m: float = 0.0
+) -> NavigationEstimate:
+    """The estimate with the covariance that makes the claim of a receiving filter right.
+
+    `interval_s`: time since the message before, see `messages_averaged`. `min_std_m`: lower bound
+    of the standard deviation of the fix, at least that of the map's displacement, which does not
+    average out. An invalid covariance stays
+    as it is.
+    """
+    if math.isnan(estimate.horizontal_std_m()):
+        return estimate
+    cov = floored(estimate.cov_en_m2, max(MAP_STD_M, min_std_m))
+    count = messages_averaged(error_ellipse(cov)[0], interval_s)
+    return replace(estimate, cov_en_m2=cov * count)
+
+
+@dataclass
+class FilterCovariance:
+    """Prepares the estimates of several messages, each by its own rate. Mutable.
+
+    `min_std_m`: see `for_filter`.
+    """
+
+    min_std_m: float = 0.0
+    _sent_ns: dict[str, int] = field(default_factory=dict)
+
+    def interval_s(self, message: str, exposed_ns: int) -> float:
+        """Time from the exposure of the last `message` sent, s; infinite for the first."""
+        before = self._sent_ns.get(message)
+        return math.inf if before is None else (exposed_ns - before) / 1e9
+
+    def prepare(
+        self, message: str, estimate: NavigationEstimate, exposed_ns: int
+    ) -> NavigationEstimate:
+        """The estimate for a `message` with an exposure at `exposed_ns` of a steady clock."""
+        return for_filter(estimate, self.interval_s(message, exposed_ns), self.min_std_m)
+
+    def sent(self, message: str, exposed_ns: int) -> None:
+        """Note that `message` was sent."""
+        self._sent_ns[message] = exposed_ns

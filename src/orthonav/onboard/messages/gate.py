@@ -27,6 +27,10 @@ FUTURE_S = 0.1
 JITTER = 0.1
 """Share of an interval by which a message may be early, so that views with a small jitter all pass
 at their nominal rate."""
+VELOCITY_STD_MPS = 1.0
+"""Standard deviation of a velocity that has no covariance."""
+MAX_ACCEL_MPS2, MAX_SPEED_MPS = 10.0, 60.0
+"""Possible manoeuvre where the velocity is known, and where it is not."""
 _MOST_NORTH_DEG = 89.8
 Array = NDArray[np.float64]
 
@@ -43,9 +47,6 @@ class GateRules:
     deviations plus the possible manoeuvre is a jump.
     `jump_views`: a jump is withheld until so many views in a row agree on the new place.
     `send_coasting`: admit dead reckoning of a track too; messages mark it.
-    `velocity_std_mps`: standard deviation of a velocity that has no covariance.
-    `max_accel_mps2`: acceleration of the possible manoeuvre where the velocity is known.
-    `max_speed_mps`: speed of the possible manoeuvre where it is not.
 
     Raises `EstimateError` for limits that are not positive, or a confidence outside 0 to 1.
     """
@@ -57,9 +58,6 @@ class GateRules:
     jump_sigmas: float = 5.0
     jump_views: int = 3
     send_coasting: bool = False
-    velocity_std_mps: float = 1.0
-    max_accel_mps2: float = 10.0
-    max_speed_mps: float = 60.0
 
     def __post_init__(self) -> None:
         limits = {
@@ -191,11 +189,11 @@ class Gate:
         if velocities:
             moved = moved - np.mean(velocities, axis=0) * seconds
             known = now.vel_cov_en if now.vel_cov_en is not None else before.vel_cov_en
-            spread = np.eye(2) * self.rules.velocity_std_mps**2 if known is None else known
+            spread = np.eye(2) * VELOCITY_STD_MPS**2 if known is None else known
             cov = cov + np.asarray(spread) * seconds**2
-            free_m = self.rules.max_accel_mps2 * seconds**2 / 2
+            free_m = MAX_ACCEL_MPS2 * seconds**2 / 2
         else:
-            free_m = self.rules.max_speed_mps * seconds
+            free_m = MAX_SPEED_MPS * seconds
         allowed_m = self.rules.jump_sigmas * error_ellipse(cov)[0] + free_m
         return not float(np.hypot(*moved)) <= allowed_m  # true for an invalid covariance, too
 

@@ -9,7 +9,9 @@ pymavlink (extra `autopilot`) is loaded with the first message.
 """
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any
 
 from orthonav.core.errors import MissingExtraError
@@ -21,7 +23,6 @@ from orthonav.onboard.messages.estimate import (
     EstimateError,
     NavigationEstimate,
 )
-from orthonav.onboard.messages.gpstime import gps_time
 
 Message = Any
 """A `MAVLink_message` of pymavlink, which has no types."""
@@ -45,6 +46,13 @@ _FRAME_GLOBAL = 0
 _CMD_EXTERNAL_POSITION_ESTIMATE, _CMD_REQUEST_MESSAGE = 43003, 512
 TEXT_MAX = 50
 """Characters of one STATUSTEXT."""
+_LEAPS = (
+    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01"),
+    *("1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01"),
+    *("1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
+)
+"""Days that began after a leap second, by IERS Bulletin C; a new one must be added. GPS time
+equalled UTC on 1980-01-06 and has none."""
 
 
 @dataclass(frozen=True)
@@ -343,3 +351,25 @@ def _yaw_cdeg(heading_deg: float) -> int:
     if not math.isfinite(heading_deg):
         return 0
     return round(heading_deg * 100) % 36000 or 36000
+
+
+def _unix_s(day: str) -> int:
+    return int(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp())
+
+
+_LEAPS_UNIX_S = tuple(_unix_s(day) for day in _LEAPS)
+_EPOCH_UNIX_S = _unix_s("1980-01-06")
+_WEEK_MS = 7 * 86_400_000
+
+
+def gps_time(utc_ns: int) -> tuple[int, int]:
+    """GPS week (without rollover at 1024) and time of week in ms, of a UTC time in ns since 1970.
+
+    (0, 0), which receivers read as "not known", before 1980-01-06.
+    """
+    utc_ms = utc_ns // 1_000_000
+    leaps = bisect_right(_LEAPS_UNIX_S, utc_ms // 1000)
+    since_epoch_ms = utc_ms - _EPOCH_UNIX_S * 1000 + leaps * 1000
+    if since_epoch_ms < 0:
+        return 0, 0
+    return divmod(since_epoch_ms, _WEEK_MS)

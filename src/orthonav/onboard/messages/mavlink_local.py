@@ -7,13 +7,15 @@ must fuse the horizontal position only (docs/autopilots.md).
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate, floored
-from orthonav.onboard.messages.local import Autopilot, Origin, ardupilot_variance, north_east_m
 from orthonav.onboard.messages.mavlink import (
     Message,
     clamped,
@@ -23,6 +25,7 @@ from orthonav.onboard.messages.mavlink import (
     microseconds,
     require_confident,
 )
+from orthonav.onboard.telemetry import wxyz_of_angles
 
 _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
 _ESTIMATOR_VISION = 2
@@ -30,6 +33,37 @@ _INT32_MIN, _INT32_MAX = -(2**31), 2**31 - 1
 _NAN3 = (math.nan, math.nan, math.nan)
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
+PX4_RADIUS_M = 6371000.0
+ARDUPILOT_M_PER_DEG = 0.011131884502145034 * 1e7
+_LEAST_SCALE = 0.01  # ArduPilot's, near the poles
+
+
+class Autopilot(Enum):
+    """Autopilot whose conventions a message in a local frame follows."""
+
+    PX4 = "px4"
+    ARDUPILOT = "ardupilot"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Origin of an autopilot's local frame.
+
+    `lat_deg`, `lon_deg`: WGS84. `alt_amsl_m`: metres above mean sea level; needed, because the
+    message that sets the origin cannot omit it. Raises `EstimateError` for invalid values.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+
+    def __post_init__(self) -> None:
+        placed = abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180
+        if not (placed and math.isfinite(self.alt_amsl_m)):
+            raise EstimateError(
+                f"an origin needs latitude, longitude and altitude, got {self.lat_deg}, "
+                f"{self.lon_deg}, {self.alt_amsl_m}{swapped_hint(self.lat_deg, self.lon_deg)}"
+            )
 
 
 @dataclass(frozen=True)
@@ -74,7 +108,8 @@ def odometry(
     frames = (_LOCAL_NED, _LOCAL_NED)
     velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
     if autopilot is Autopilot.ARDUPILOT:
-        body_from_ned = _body_from_ned(pose.attitude_rad)
+        roll, pitch, yaw = pose.attitude_rad
+        body_from_ned = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix().T
         frames = (_LOCAL_FRD, _BODY_FRD)
         velocity = body_from_ned @ velocity_ned
         velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
@@ -90,7 +125,7 @@ def odometry(
         x=float32(position[0]),
         y=float32(position[1]),
         z=float32(position[2]),
-        q=[float32(value) for value in _quaternion(pose.attitude_rad)],
+        q=[float32(value) for value in wxyz_of_angles(*pose.attitude_rad).tolist()],
         vx=float32(velocity[0]),
         vy=float32(velocity[1]),
         vz=float32(velocity[2]),
@@ -209,27 +244,41 @@ def _triangle(upper: Array, lower_std: Triple) -> list[float]:
     return [float32(value) for value in cov[np.triu_indices(6)].tolist()]
 
 
-def _quaternion(attitude_rad: Triple) -> tuple[float, float, float, float]:
-    """Quaternion w, x, y, z of the rotation from body to NED; NaN where not known."""
-    roll, pitch, yaw = (angle / 2 for angle in attitude_rad)
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+def north_east_m(
+    origin: Origin, lat_deg: float, lon_deg: float, autopilot: Autopilot
+) -> tuple[float, float]:
+    """Metres north and east of `origin` that `autopilot` converts to this position.
+
+    PX4 converts metres on an azimuthal-equidistant plane of a sphere of 6371 km, ArduPilot by a
+    constant per degree; neither uses the ellipsoid. True metres, 10 km from the origin, would
+    become positions up to 67 m away. Sources: PX4-Autopilot `src/lib/geo/geo.cpp`
+    (`MapProjection::project`); ArduPilot `libraries/AP_Common/Location.cpp`.
+    """
+    if autopilot is Autopilot.PX4:
+        return _px4(origin, lat_deg, lon_deg)
+    turned_deg = (lon_deg - origin.lon_deg + 180.0) % 360.0 - 180.0
+    scale = max(math.cos(math.radians((lat_deg + origin.lat_deg) / 2)), _LEAST_SCALE)
+    north_m = (lat_deg - origin.lat_deg) * ARDUPILOT_M_PER_DEG
+    return north_m, turned_deg * ARDUPILOT_M_PER_DEG * scale
 
 
-def _body_from_ned(attitude_rad: Triple) -> Array:
-    """Rotation matrix (3, 3) from NED to forward, right, down."""
-    w, x, y, z = _quaternion(attitude_rad)
-    ned_from_body = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return ned_from_body.T
+def ardupilot_variance(std_m: float) -> float:
+    """Variance of each of three axes that ArduPilot reads as the standard deviation `std_m`.
+
+    It takes the root of the sum of the variances of all three axes; older versions the cube root of
+    the sum of their squares, which gives `std_m` at 3 m and more than it above
+    (`libraries/GCS_MAVLink/GCS_Common.cpp`).
+    """
+    return std_m**2 / 3
+
+
+def _px4(origin: Origin, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+    """Azimuthal-equidistant projection of a sphere; atan2 is also accurate near zero."""
+    lat, lat0 = math.radians(lat_deg), math.radians(origin.lat_deg)
+    turned = math.radians(lon_deg - origin.lon_deg)
+    north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(turned)
+    east = math.cos(lat) * math.sin(turned)
+    along = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(turned)
+    across = math.hypot(north, east)
+    scale = math.atan2(across, along) / across if across > 0 else 1.0
+    return north * scale * PX4_RADIUS_M, east * scale * PX4_RADIUS_M

@@ -38,7 +38,6 @@ class Quality(Enum):
 def gga(
     estimate: NavigationEstimate | None,
     *,
-    talker: str = "GP",
     quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
     hdop_m: float | None = None,
@@ -51,7 +50,7 @@ def gga(
     """
     time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
     if estimate is None or not confident:
-        return _sentence(talker, ["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
+        return _sentence(["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
     altitude, hdop = _altitude(estimate.alt_amsl_m), ""
     if hdop_m is not None:
         if not hdop_m > 0:
@@ -59,13 +58,12 @@ def gga(
         hdop = _number(estimate.horizontal_std_m() / hdop_m, 99.99)
     place = _place(estimate)
     tail = [altitude, "M" if altitude else "", "", "", "", ""]
-    return _sentence(talker, ["GGA", _time(time_ns), *place, quality.value[0], "00", hdop, *tail])
+    return _sentence(["GGA", _time(time_ns), *place, quality.value[0], "00", hdop, *tail])
 
 
 def rmc(
     estimate: NavigationEstimate | None,
     *,
-    talker: str = "GP",
     quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
     min_confidence: float = CONFIDENT,
@@ -78,13 +76,12 @@ def rmc(
         _, status, mode = quality.value
         speed, course = _speed_and_course(estimate.vel_en_mps)
         fields = [status, *_place(estimate), speed, course, _date(time_ns), "", "", mode]
-    return _sentence(talker, ["RMC", _time(time_ns), *fields])
+    return _sentence(["RMC", _time(time_ns), *fields])
 
 
 def gst(
     estimate: NavigationEstimate | None,
     *,
-    talker: str = "GP",
     utc_ns: int | None = None,
     min_confidence: float = CONFIDENT,
 ) -> bytes:
@@ -92,13 +89,13 @@ def gst(
     deviations of latitude, longitude and altitude (m). The RMS of ranges is empty."""
     time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
     if estimate is None or not confident:
-        return _sentence(talker, ["GST", _time(time_ns), *[""] * 7])
+        return _sentence(["GST", _time(time_ns), *[""] * 7])
     major, minor, direction_deg = error_ellipse(estimate.cov_en_m2)
     direction = f"{round(direction_deg, 1) % 180.0:.1f}"
     north, east = (math.sqrt(max(float(estimate.cov_en_m2[i, i]), 0.0)) for i in (1, 0))
     axes = [_number(major, _LARGEST_M), _number(minor, _LARGEST_M), direction]
     spread = [_number(value, _LARGEST_M) for value in (north, east, estimate.alt_std_m)]
-    return _sentence(talker, ["GST", _time(time_ns), "", *axes, *spread])
+    return _sentence(["GST", _time(time_ns), "", *axes, *spread])
 
 
 def checksum(body: str) -> str:
@@ -112,10 +109,8 @@ def checksum(body: str) -> str:
 _NO_PLACE = ("", "", "", "")
 
 
-def _sentence(talker: str, fields: list[str]) -> bytes:
-    if not (len(talker) == 2 and talker.isascii() and talker.isalpha() and talker.isupper()):
-        raise EstimateError(f"talker: expected two capital letters such as GP, got {talker!r}")
-    body = talker + ",".join(fields)
+def _sentence(fields: list[str]) -> bytes:
+    body = "GP" + ",".join(fields)
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
 
 

@@ -13,9 +13,10 @@ from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, StoppedError
 from orthonav.core.flight.gnss import FIX_3D, GnssSample
-from orthonav.core.flight.ros_images import camera_of_info, grey_of_message
-from orthonav.core.flight.ros_track import (
+from orthonav.core.flight.ros_messages import (
     attitude_of_message,
+    camera_of_info,
+    grey_of_message,
     height_of_message,
     stamp_ns,
     tilt_std_of_message,

@@ -6,8 +6,14 @@ from typing import Any
 
 from orthonav.core.errors import RouteError
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
-from orthonav.ground.planning.routes.record import Height, HeightFrame, Route, require_few_waypoints
-from orthonav.ground.planning.routes.values import decoded, parsed
+from orthonav.ground.planning.routes.record import (
+    Height,
+    HeightFrame,
+    Route,
+    decoded,
+    parsed,
+    require_few_waypoints,
+)
 
 _LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
 _LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
@@ -78,7 +84,7 @@ def _heights(
                 None if value is None else Height(factor * value, each)
                 for value, each in zip(found, frames, strict=True)
             )
-            return heights if any(heights) else ()
+            return heights
     return ()
 
 

@@ -10,8 +10,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from orthonav.core.errors import RouteError
-from orthonav.ground.planning.routes.record import Height, Route, require_few_waypoints
-from orthonav.ground.planning.routes.values import json_object, number, number_or_none
+from orthonav.ground.planning.routes.record import (
+    Height,
+    Route,
+    json_object,
+    number,
+    number_or_none,
+    require_few_waypoints,
+)
 
 
 def read_geojson(data: bytes) -> list[Route]:
@@ -99,7 +105,7 @@ def _route(coordinates: Any, properties: dict[str, Any]) -> Route:
     name = properties.get("name")
     return Route(
         tuple((lat, lon) for lat, lon, _ in points),
-        heights if any(heights) else (),
+        heights,
         _bands_m(properties.get("band_m"), max(1, len(points) - 1)),
         name if isinstance(name, str) else None,
         number_or_none(properties.get("home_amsl_m"), "home_amsl_m"),

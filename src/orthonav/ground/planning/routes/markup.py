@@ -1,22 +1,52 @@
-"""Safe reading of XML of unknown origin: no DTD, hence no entities and no external files.
+"""Routes in XML: GPX 1.0 and 1.1 (topografix.com/GPX/1/1), KML (OGC 07-147r2, and Google's
+gx:Track), KMZ, which is KML in a zip archive, and waylines of DJI's waypoint missions (WPML:
+https://developer.dji.com/doc/cloud-api-tutorial/en/api-reference/dji-wpml/waylines-wpml.html).
 
-defusedxml and gpxpy are not used here: neither limits the number and depth of elements, and 20 MB
-of empty elements would take gigabytes.
+Files are of unknown origin: no DTD is read, hence no entities and no external files. defusedxml and
+gpxpy are not used: neither limits the number and depth of elements, and 20 MB of empty elements
+would take gigabytes.
 """
 
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 from orthonav.core.errors import RouteError
+from orthonav.ground.planning.routes.record import (
+    Height,
+    HeightFrame,
+    Route,
+    numbers_in,
+    parsed,
+    require_few_waypoints,
+)
 
 MAX_ELEMENTS = 1_000_000
 MAX_DEPTH = 100
+MAX_KML_BYTES = 20_000_000
+MAX_MEMBERS = 10_000
+_KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
+"""With other altitude modes, or none, the altitude is ignored, as KML specifies."""
+_POINTLESS = ("Point", "Polygon", "LinearRing", "Model")
+_END = struct.Struct("<4s4H2LH")
+_WPML_FRAMES: dict[str, HeightFrame] = {
+    "relativeToStartPoint": "home",
+    "WGS84": "hae",
+    "realTimeFollowSurface": "agl",
+}
+"""By `executeHeightMode`."""
+_Place = tuple[float, float, Height | None]
 
 
-def read_markup(data: bytes, kind: str) -> Element:
-    """The root of a document, with namespaces removed from its tags.
+def read_markup(data: bytes, kind: str, root: str) -> Element:
+    """The root of a document, with namespaces removed from its tags: `gx:Track` is Track.
 
-    `kind` is the expected document type, for messages. Raises `RouteError` on invalid XML, a
+    `kind`: of the document, for messages. Raises `RouteError` on invalid XML, another root, a
     DOCTYPE, more than `MAX_ELEMENTS` elements or more than `MAX_DEPTH` levels.
     """
     if not data.strip():
@@ -27,19 +57,17 @@ def read_markup(data: bytes, kind: str) -> Element:
     parser.StartDoctypeDeclHandler = builder.doctype
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.text
+    parser.CharacterDataHandler = builder.data
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
         raise RouteError(f"{kind} file is not well-formed XML ({error})") from error
     except (ValueError, LookupError) as error:  # unknown encoding
         raise RouteError(f"{kind} file cannot be read ({error})") from error
-    return builder.tree.close()
-
-
-def local_name(tag: str) -> str:
-    """A tag without its prefix: `gx:Track` is Track."""
-    return tag.rpartition(":")[2]
+    found = builder.close()
+    if found.tag != root:
+        raise RouteError(f"{kind} must begin with <{root}>, got <{found.tag:.40}>")
+    return found
 
 
 def text_of(element: Element, tag: str) -> str | None:
@@ -47,29 +75,226 @@ def text_of(element: Element, tag: str) -> str | None:
     return (element.findtext(tag) or "").strip() or None
 
 
-class _Builder:
+class _Builder(TreeBuilder):
     """Builds a tree from parser events, within limits."""
 
     def __init__(self, kind: str) -> None:
-        self.tree = TreeBuilder()
+        super().__init__()
         self._kind = kind
         self._count = self._depth = 0
 
     def doctype(self, *_: object) -> None:
         raise RouteError(f"{self._kind} file has a DOCTYPE, which is not read; remove it")
 
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
+    def start(self, tag: str, attributes: dict[str, str]) -> Element:
         self._count += 1
         self._depth += 1
         if self._count > MAX_ELEMENTS or self._depth > MAX_DEPTH:
             raise RouteError(
                 f"{self._kind} file has more than {MAX_ELEMENTS:,} elements or {MAX_DEPTH} levels"
             )
-        self.tree.start(local_name(tag), attributes)
+        return super().start(tag.rpartition(":")[2], attributes)
 
-    def end(self, tag: str) -> None:
+    def end(self, tag: str) -> Element:
         self._depth -= 1
-        self.tree.end(local_name(tag))
+        return super().end(tag.rpartition(":")[2])
 
-    def text(self, data: str) -> None:
-        self.tree.data(data)
+
+def read_gpx(data: bytes) -> list[Route]:
+    """All routes (`rte`), and after them all tracks (`trk`), the segments of each joined.
+
+    Heights are above mean sea level. Raises `RouteError` where there are only waypoints.
+    """
+    root = read_markup(data, "GPX", "gpx")
+    planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
+    flown = [
+        _gpx_route(each, "trkseg/trkpt")
+        for each in root.iterfind("trk")
+        if each.find("trkseg/trkpt") is not None
+    ]
+    if not planned and not flown:
+        waypoints = len(root.findall("wpt"))
+        held = f"only {waypoints} waypoints (wpt) without an order" if waypoints else "nothing else"
+        raise RouteError(f"GPX holds no route (rte) and no track (trk); it holds {held}")
+    points = [
+        (_called("waypoint", each), numbers_in(f"{each.get('lon')},{each.get('lat')}"))
+        for each in root.iterfind("wpt")
+    ]
+    # Planned routes take precedence over recorded tracks.
+    points += [(_called("track", each), []) for each in root.iterfind("trk") if planned]
+    return [route.leaving_out(points) for route in planned or flown]
+
+
+def _called(kind: str, element: Element, tag: str = "name") -> str:
+    return f"{kind} {text_of(element, tag) or f'(no {tag})':.40}"
+
+
+def _gpx_route(element: Element, points: str) -> Route:
+    waypoints, heights = [], []
+    for point in element.iterfind(points):
+        lat, lon = (_degrees(point, name) for name in ("lat", "lon"))
+        waypoints.append((lat, lon))
+        height = text_of(point, "ele")
+        heights.append(None if height is None else Height(parsed(height, "GPX ele"), "amsl"))
+    return Route(tuple(waypoints), tuple(heights), name=text_of(element, "name"))
+
+
+def _degrees(point: Element, name: str) -> float:
+    value = point.get(name)
+    if value is None:
+        raise RouteError(f"GPX point has no {name}")
+    return parsed(value, f"GPX {name}")
+
+
+def read_kmz(data: bytes) -> list[Route]:
+    """Lines and tracks of the archive's `doc.kml`, else of its only KML file; of a mission of DJI
+    its waylines.
+
+    Raises `RouteError`, also on archives that would unpack to more than `MAX_KML_BYTES`.
+    """
+    _check_archive(data)
+    try:
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            chosen = _chosen_members(archive.namelist())
+            if len(chosen) != 1:
+                raise RouteError(f"KMZ must hold one KML file, got {len(chosen)}")
+            with archive.open(chosen[0]) as member:
+                text = member.read(MAX_KML_BYTES + 1)
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
+        raise RouteError(f"KMZ is not a complete zip archive ({error})") from error
+    except (NotImplementedError, RuntimeError, ValueError) as error:  # encrypted, odd compression
+        if isinstance(error, RouteError):
+            raise
+        raise RouteError(f"KMZ cannot be unpacked ({error})") from error
+    if len(text) > MAX_KML_BYTES:
+        raise RouteError(f"KML in the KMZ is larger than {MAX_KML_BYTES // 10**6} MB")
+    return read_wpml(text) if chosen[0].lower().endswith(".wpml") else read_kml(text)
+
+
+def _chosen_members(members: list[str]) -> list[str]:
+    """The members with the route: waylines of DJI (beside a template in KML), else `doc.kml`."""
+    waylines = [name for name in members if name.lower().endswith(".wpml")]
+    names = [name for name in members if name.lower().endswith(".kml")]
+    return waylines or [name for name in names if name.lower() == "doc.kml"] or names
+
+
+def read_kml(data: bytes) -> list[Route]:
+    """Lines and tracks of all placemarks, those of one placemark joined. Raises `RouteError`."""
+    root = read_markup(data, "KML", "kml")
+    marks = list(root.iter("Placemark"))
+    found = [route for mark in marks for route in _kml_routes(mark)]
+    if found:
+        points = [
+            (_called("point", mark), numbers_in(text_of(point, "coordinates") or ""))
+            for mark in marks
+            for point in mark.iter("Point")
+        ]
+        return [route.leaving_out(points) for route in found]
+    if any(element.tag == "missionConfig" for element in root.iter()):
+        raise RouteError(
+            "KML is the template of a DJI mission; give its waylines.wpml, or the whole KMZ"
+        )
+    kinds = sorted({each.tag for mark in marks for each in mark.iter()})
+    held = [kind for kind in kinds if kind in _POINTLESS] or ["no placemark with a geometry"]
+    raise RouteError(f"KML holds no LineString and no gx:Track; it holds {', '.join(held)}")
+
+
+def _kml_routes(mark: Element) -> list[Route]:
+    places = [
+        place
+        for element in mark.iter()
+        if element.tag in ("LineString", "Track")
+        for place in (_line(element) if element.tag == "LineString" else _track(element))
+    ]
+    if not places:
+        return []
+    heights = tuple(height for _, _, height in places)
+    waypoints = tuple((lat, lon) for lat, lon, _ in places)
+    return [Route(waypoints, heights, name=text_of(mark, "name"))]
+
+
+def _line(element: Element) -> Iterator[_Place]:
+    """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces at commas are accepted."""
+    frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
+    text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
+    text = text.replace(" ,", ",").replace(", ", ",")
+    for number, found in enumerate(re.finditer(r"\S+", text), 1):
+        require_few_waypoints(number)
+        yield _kml_place(found.group().split(","), frame, found.group())
+
+
+def _track(element: Element) -> Iterator[_Place]:
+    frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
+    for coordinates in element.iter("coord"):
+        text = (coordinates.text or "").strip()
+        if text:  # the schema allows gaps
+            yield _kml_place(text.split(), frame, text)
+
+
+def _kml_place(values: list[str], frame: HeightFrame | None, text: str) -> _Place:
+    if not 2 <= len(values) <= 3:
+        raise RouteError(f"KML position must be longitude,latitude[,altitude], got {text!r:.60}")
+    lon, lat, *rest = (parsed(value, "KML position") for value in values)
+    height = Height(rest[0], frame) if rest and frame is not None else None
+    return lat, lon, height
+
+
+def _check_archive(data: bytes) -> None:
+    """Refuse archives with so many members that their list alone would exhaust memory."""
+    at = data.rfind(b"PK\x05\x06")
+    if at < 0 or len(data) - at < _END.size:
+        raise RouteError("KMZ is not a complete zip archive (its end is missing)")
+    members = _END.unpack_from(data, at)[4]
+    if members > MAX_MEMBERS or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
+        raise RouteError(f"KMZ has more than {MAX_MEMBERS:,} members")
+
+
+def read_wpml(data: bytes) -> list[Route]:
+    """The waylines of a mission, one route per folder, their waypoints by index.
+
+    Raises `RouteError`, also for a height mode that is not known.
+    """
+    root = read_markup(data, "WPML", "kml")
+    folders = list(root.iter("Folder"))
+    found = [route for folder in folders for route in _waylines(folder)]
+    if not found:
+        raise RouteError("WPML holds no wayline with waypoints")
+    read = {mark for folder in folders for mark in folder.iterfind("Placemark[Point]")}
+    points = [
+        (
+            _called("placemark", mark, "index"),
+            numbers_in(mark.findtext("Point/coordinates") or ""),
+        )
+        for mark in root.iterfind(".//Placemark[Point]")
+        if mark not in read
+    ]
+    return [route.leaving_out(points) for route in found]
+
+
+def _waylines(folder: Element) -> Iterator[Route]:
+    mode = text_of(folder, "executeHeightMode")
+    if mode is not None and mode not in _WPML_FRAMES:
+        raise RouteError(
+            f"WPML executeHeightMode must be {', '.join(_WPML_FRAMES)}, got {mode!r:.60}"
+        )
+    frame = None if mode is None else _WPML_FRAMES[mode]
+    marks = folder.findall("Placemark[Point]")
+    require_few_waypoints(len(marks))
+    marks.sort(key=lambda mark: parsed(text_of(mark, "index") or "", "WPML index"))
+    if marks:
+        heights = tuple(_wpml_height(mark, frame) for mark in marks)
+        yield Route(tuple(map(_wpml_latlon, marks)), heights, name=text_of(folder, "waylineId"))
+
+
+def _wpml_latlon(mark: Element) -> tuple[float, float]:
+    values = (mark.findtext("Point/coordinates") or "").strip().split(",")
+    if not 2 <= len(values) <= 3:
+        raise RouteError(f"WPML position must be longitude,latitude, got {values!r:.60}")
+    lon, lat = (parsed(value, "WPML position") for value in values[:2])
+    return lat, lon
+
+
+def _wpml_height(mark: Element, frame: HeightFrame | None) -> Height | None:
+    """The height that is flown; the third coordinate of the point is not."""
+    text = text_of(mark, "executeHeight")
+    return None if text is None else Height(parsed(text, "WPML executeHeight"), frame)

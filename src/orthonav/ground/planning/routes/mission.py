@@ -1,14 +1,37 @@
-"""MAVLink missions, independent of their file format.
+"""MAVLink missions: plans of QGroundControl, and waypoint files of ground stations.
+
+`.plan` (JSON): QGroundControl developer guide, "Plan File Format", and where that is silent the
+code that writes and reads it (`MissionItem`, `SimpleMissionItem`, `TransectStyleComplexItem`,
+`CameraCalc`, `CorridorScanComplexItem`, `LandingComplexItem`).
+
+Text that begins "QGC WPL 110": a line an item, twelve numbers: index, current, frame, command, four
+parameters, latitude, longitude, altitude, autocontinue (mavlink.io, "Mission Plain-Text File
+Format"). In version 110 the first item, with number 0, is the planned home position, in the older
+120 of QGroundControl there is none (QGroundControl, `MissionController::_loadTextMissionFile`).
 
 Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml.
 """
 
+import io
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from orthonav.core.errors import RouteError
-from orthonav.ground.planning.routes.record import MAX_NAMED, Height, HeightFrame, Route
+from orthonav.core.tables import TableError, bounded_lines
+from orthonav.ground.planning.routes.record import (
+    MAX_NAMED,
+    Height,
+    HeightFrame,
+    Route,
+    decoded,
+    json_object,
+    number,
+    number_or_none,
+    parsed,
+    require_few_waypoints,
+)
 
 WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 84, 85
 _CIRCLES = (17, 18, 19, 31, 34)
@@ -113,7 +136,7 @@ def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
     )
     return Route(
         tuple((stop.lat_deg or 0.0, stop.lon_deg or 0.0) for stop in stops),
-        heights if any(heights) else (),
+        heights,
         bands if any(bands) else (),
         home_amsl_m=None if home is None else home.amsl_m,
         left_out=tuple(left_out),
@@ -143,3 +166,188 @@ def _height(item: MissionItem) -> Height | None:
     if item.height_m is None:
         return None
     return Height(item.height_m, height_frame(item.frame))
+
+
+_AMSL, _ABOVE_HOME, _TERRAIN = 0, 3, 10
+_FRAME_OF_MODE = {1: _ABOVE_HOME, 2: _AMSL, 3: _TERRAIN, 4: _TERRAIN}
+"""MAV_FRAME of QGroundControl's altitude modes; 3 is its own sum of terrain and a height."""
+_ABOVE_TERRAIN_MODE = 3
+_TRANSECTS = ("survey", "CorridorScan")
+_LANDINGS = ("fwLandingPattern", "vtolLandingPattern")
+
+
+def read_plan(data: bytes) -> list[Route]:
+    """The route of a plan. Raises `RouteError`, naming items that cannot be flown with a map."""
+    return [plan_route(json_object(data))]
+
+
+def is_plan(plain: dict[str, Any]) -> bool:
+    """Whether a JSON object is a plan."""
+    return plain.get("fileType") == "Plan"
+
+
+def plan_route(plain: dict[str, Any]) -> Route:
+    """The route of a plan read as JSON. Raises `RouteError`."""
+    if not is_plan(plain):
+        raise RouteError(f"plan must have fileType 'Plan', got {plain.get('fileType')!r:.40}")
+    mission = plain.get("mission")
+    items = mission.get("items") if isinstance(mission, dict) else None
+    if not isinstance(mission, dict) or not isinstance(items, list):
+        raise RouteError("plan must hold a mission with a list of items")
+    home = _plan_home(mission.get("plannedHomePosition"))
+    flown = [item for index, raw in enumerate(items) for item in _plan_items(raw, index)]
+    return route_of(flown, home)
+
+
+def _plan_home(raw: Any) -> Home | None:
+    if not isinstance(raw, list) or len(raw) < 2:
+        return None
+    lat, lon = (number(raw[index], "plannedHomePosition") for index in (0, 1))
+    if lat == 0 and lon == 0:
+        return None
+    return Home(lat, lon, number_or_none(raw[2] if len(raw) > 2 else None, "height of home"))
+
+
+def _plan_items(raw: Any, index: int) -> list[MissionItem]:
+    where = f"item {index + 1} of the plan"
+    if not isinstance(raw, dict):
+        raise RouteError(f"{where} must be an object, got {raw!r:.60}")
+    kind = raw.get("type")
+    if kind == "SimpleItem":
+        return [_simple(raw, index + 1, where)]
+    if kind != "ComplexItem":
+        raise RouteError(f"{where} must be a SimpleItem or a ComplexItem, got {kind!r:.40}")
+    name = raw.get("complexItemType")
+    if name in _TRANSECTS:
+        return _transects(raw, index, f"{where} ({name})")
+    if name in _LANDINGS:
+        return _landing(raw, f"{where} ({name})")
+    raise RouteError(
+        f"{where} is a {name!r:.40}: only surveys, corridor scans and landing patterns are read "
+        "besides waypoints, because in others the camera does not look down; remove it from the "
+        "plan"
+    )
+
+
+def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
+    params = raw.get("params")
+    place = params[4:7] if isinstance(params, list) and len(params) >= 7 else raw.get("coordinate")
+    if not isinstance(place, list) or len(place) < 3:
+        raise RouteError(f"{where} must have 7 params, got {params!r:.80}")
+    command, frame = (int(number(raw.get(key), f"{where}: {key}")) for key in ("command", "frame"))
+    lat, lon, height = (number_or_none(value, f"{where}: params") for value in place[:3])
+    if raw.get("AltitudeMode") == _ABOVE_TERRAIN_MODE:
+        frame, height = _TERRAIN, number_or_none(raw.get("Altitude"), f"{where}: Altitude")
+    return MissionItem(command, frame, lat, lon, height, item)
+
+
+def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]:
+    """Flight lines of a survey or corridor scan; the corridor width is the band of its legs."""
+    inner = raw.get("TransectStyleComplexItem")
+    points = inner.get("VisualTransectPoints") if isinstance(inner, dict) else None
+    if not isinstance(inner, dict) or not isinstance(points, list) or not points:
+        raise RouteError(
+            f"{where} has no VisualTransectPoints; open the plan with a later QGroundControl, let "
+            "it draw the flight lines, and save it"
+        )
+    camera = inner.get("CameraCalc")
+    frame, height_m = _survey_height(camera if isinstance(camera, dict) else {}, inner, where)
+    width_m = number_or_none(raw.get("CorridorWidth"), f"{where}: CorridorWidth") or None
+    items = []
+    for point in points:
+        lat, lon = _latlon(point, f"{where}: VisualTransectPoints")
+        items.append(
+            MissionItem(WAYPOINT, frame, lat, lon, height_m, pattern=index, band_m=width_m)
+        )
+    return items
+
+
+def _survey_height(
+    camera: dict[str, Any], inner: dict[str, Any], where: str
+) -> tuple[int, float | None]:
+    """MAV_FRAME and height of a survey, from its camera calculation."""
+    height_m = number_or_none(camera.get("DistanceToSurface"), f"{where}: DistanceToSurface")
+    mode = camera.get("DistanceMode")
+    if mode in _FRAME_OF_MODE:
+        return _FRAME_OF_MODE[mode], height_m
+    if inner.get("FollowTerrain") is True:
+        return _TERRAIN, height_m
+    return (_ABOVE_HOME if camera.get("DistanceToSurfaceRelative", True) else _AMSL), height_m
+
+
+def _landing(raw: dict[str, Any], where: str) -> list[MissionItem]:
+    approach = raw.get("landingApproachCoordinate", raw.get("loiterCoordinate"))
+    relative = raw.get("altitudesAreRelative", raw.get("landingAltitudeRelative", True))
+    frame = _ABOVE_HOME if relative else _AMSL
+    items = []
+    ends: list[tuple[int, Any]] = [(WAYPOINT, approach), (LAND, raw.get("landCoordinate"))]
+    for command, point in ends:
+        lat, lon = _latlon(point, where)
+        height = number_or_none(next(iter(point[2:]), None), where)
+        items.append(MissionItem(command, frame, lat, lon, height))
+    return items
+
+
+def _latlon(point: Any, what: str) -> tuple[float, float]:
+    if not isinstance(point, list) or len(point) < 2:
+        raise RouteError(f"{what} must be [latitude, longitude], got {point!r:.60}")
+    return number(point[0], what), number(point[1], what)
+
+
+_COLUMNS = 12
+_MAGIC = b"QGC WPL"
+_HOMES = (0, WAYPOINT, 179)
+"""Commands of the home position: none, a waypoint, or one that sets it."""
+
+
+def is_wpl(data: bytes) -> bool:
+    """Whether a file begins like a waypoint file."""
+    return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_MAGIC)
+
+
+def read_wpl(data: bytes) -> list[Route]:
+    """The route of a waypoint file. Raises `RouteError`."""
+    lines = bounded_lines(io.StringIO(decoded(data).lstrip(), newline=None))
+    try:
+        first_line = next(lines)
+        version = first_line.split()
+        if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
+            raise RouteError(
+                f"waypoint file must begin with 'QGC WPL 110', got {first_line.rstrip()!r:.60}"
+            )
+        items = list(_wpl_items(lines))
+    except TableError as error:
+        raise RouteError(f"waypoint file cannot be read ({error})") from error
+    home = None
+    if version[2] == "110" and items and items[0].number == 0 and items[0].command in _HOMES:
+        first, *items = items
+        if first.lat_deg or first.lon_deg:
+            home = Home(first.lat_deg or 0.0, first.lon_deg or 0.0, first.height_m)
+    return [route_of(items, home)]
+
+
+def _wpl_items(lines: Iterator[str]) -> Iterator[MissionItem]:
+    for count, line in enumerate(lines, 2):
+        require_few_waypoints(count - 2)  # the first line is the home position
+        if line.strip() and not line.startswith("#"):
+            yield _wpl_item(line.split(), count)
+
+
+def _wpl_item(values: list[str], line: int) -> MissionItem:
+    if len(values) != _COLUMNS:
+        raise RouteError(
+            f"line {line} of the waypoint file has {len(values)} values, expected {_COLUMNS}"
+        )
+    item, frame, command = (_whole(values[index], line) for index in (0, 2, 3))
+    lat_deg, lon_deg, height_m = (
+        parsed(values[index], f"line {line}, column {index + 1}") for index in (8, 9, 10)
+    )
+    return MissionItem(command, frame, lat_deg, lon_deg, height_m, item)
+
+
+def _whole(text: str, line: int) -> int:
+    what = f"line {line}: number, frame and command"
+    value = parsed(text, what)
+    if value != int(value):
+        raise RouteError(f"{what} must be whole numbers, got {text!r:.40}")
+    return int(value)

@@ -1,0 +1,62 @@
+"""Generate orthophotos of one area at three dates: `python -m lab.landscape --out area`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from lab.landscape import generate_area, generate_heights
+from orthonav.cli.common import Progress
+from orthonav.core.errors import OrthonavError
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Generate the files and print their names."""
+    options = _parser().parse_args(arguments)
+    area = {"size_m": tuple(options.size_m), "gsd_m": options.gsd_m, "seed": options.seed}
+    files: list[Path] = []
+    try:
+        with closing(Progress(quiet=False)) as shown:
+            if options.hills is not None:  # first, so that an impossible slope is refused at once
+                files = generate_heights(
+                    options.out,
+                    slope=options.hills,
+                    progress=lambda share: shown("heights", share),
+                    **area,
+                )
+            dates = generate_area(
+                options.out, progress=lambda share: shown("landscape", share), **area
+            )
+    except OrthonavError as error:
+        sys.exit(f"error: {error}")
+    print(*dates, *files, sep="\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m lab.landscape", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    parser.add_argument(
+        "--size-m",
+        type=float,
+        nargs=2,
+        default=(2000.0, 2000.0),
+        metavar=("EAST", "NORTH"),
+        help="extent of the area (default 2000 2000)",
+    )
+    parser.add_argument(
+        "--gsd-m", type=float, default=1.0, help="ground resolution, metres per pixel (default 1)"
+    )
+    parser.add_argument(
+        "--hills",
+        type=float,
+        metavar="SLOPE",
+        help="also write the terrain dem.tif, hills of this root mean square slope (0.15), "
+        "and for each date the surface model *_dsm.tif with its buildings and trees",
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
+    return parser
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

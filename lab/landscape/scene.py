@@ -1,0 +1,161 @@
+"""The landscape: renders any window at any date and resolution."""
+
+from collections import OrderedDict
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.landscape.crops import appearance_of
+from lab.landscape.epoch import Epoch
+from lab.landscape.network import Network
+from lab.landscape.noise import Float32
+from lab.landscape.plan import CellPlan, make_plan, outline_box
+from lab.landscape.relief import (
+    lighting,
+    paint_buildings,
+    paint_orchards,
+    paint_trees,
+    paint_wood,
+    shadow_reach_m,
+)
+from lab.landscape.sensor import develop, expose
+from lab.landscape.surface import label_parcels, paint_lines, paint_parcels
+from lab.landscape.window import Box, PixelWindow, chunks
+from orthonav.core.errors import AreaError
+
+ORIGIN_M = (652000.0, 6862000.0)
+"""Lambert-93 (EPSG:2154) east and north of the landscape's origin."""
+
+GSD_RANGE_M = (0.2, 10.0)
+"""Finest and coarsest ground resolution that can be rendered."""
+
+_CHUNK_PX = 1024
+_CACHED_CELLS = 96  # enough for one row of chunks
+
+
+class Landscape:
+    """An unbounded generated landscape; a pure function of its seed."""
+
+    def __init__(self, seed: int = 1) -> None:
+        if seed < 0:
+            raise AreaError(f"the seed of a landscape must not be negative, got {seed}")
+        self.seed = seed
+        self._network = Network(seed)
+        self._plans: OrderedDict[tuple[int, int], CellPlan] = OrderedDict()
+        self._boxes: OrderedDict[tuple[int, int], Box] = OrderedDict()
+
+    def render(
+        self,
+        date: Epoch,
+        west_m: float,
+        north_m: float,
+        width_px: int,
+        height_px: int,
+        gsd_m: float,
+    ) -> NDArray[np.uint8]:
+        """Return the image (H, W, 3) RGB of the window whose upper left corner is given.
+
+        west_m, north_m: outer corner of the first pixel in EPSG:2154, metres.
+        gsd_m: metres on the ground per pixel, 0.2..10. Windows on the same pixel grid agree where
+        they overlap. Raises `AreaError` on impossible sizes.
+        """
+        whole = _window(west_m, north_m, width_px, height_px, gsd_m)
+        out = np.empty((height_px, width_px, 3), np.uint8)
+        factor = ceil(gsd_m / 1.25)
+        for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
+            part = whole.part(col, row, width, height)
+            picture, _ = self._picture(part.finer(factor), date)
+            if factor > 1:
+                picture = _averaged(picture, factor)
+            out[row : row + height, col : col + width] = develop(picture, part, self.seed, date)
+        return out
+
+    def object_heights(
+        self,
+        date: Epoch,
+        west_m: float,
+        north_m: float,
+        width_px: int,
+        height_px: int,
+        gsd_m: float,
+    ) -> Float32:
+        """Return heights (H, W) of buildings, trees and woods above the ground, as `render`."""
+        whole = _window(west_m, north_m, width_px, height_px, gsd_m)
+        out = np.empty((height_px, width_px), np.float32)
+        factor = ceil(gsd_m / 1.25)
+        for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
+            _, heights = self._picture(whole.part(col, row, width, height).finer(factor), date)
+            out[row : row + height, col : col + width] = _averaged(heights[..., None], factor)[
+                ..., 0
+            ]
+        return out
+
+    def _picture(self, window: PixelWindow, date: Epoch) -> tuple[Float32, Float32]:
+        """Return the picture (H, W, 3) float of a window and the heights (H, W) of its objects,
+        drawn with a margin and cropped."""
+        margin = ceil(max(shadow_reach_m(date), 24.0) / window.gsd_m) + 4
+        wide = window.part(
+            -margin, -margin, window.width_px + 2 * margin, window.height_px + 2 * margin
+        )
+        plans = self._plans_in(wide)
+        labels = label_parcels(plans, wide)
+        appearance = appearance_of(plans, date)
+        rgb = paint_parcels(labels, appearance, wide, self.seed, date)
+        closed = paint_lines(rgb, plans, self._network, wide, date)
+        height = paint_wood(rgb, labels, appearance, closed, wide, self.seed, date)
+        paint_orchards(rgb, height, labels, appearance, closed, wide, date)
+        paint_trees(rgb, height, plans, wide, date)
+        image = np.clip(rgb, 0.0, 255.0).astype(np.uint8)
+        roofs = paint_buildings(image, height, plans, wide, date)
+        light = lighting(height, roofs, wide, date)
+        inner = np.s_[margin:-margin, margin:-margin]
+        return expose(image, light, wide, date)[inner], height[inner]
+
+    def _plans_in(self, window: PixelWindow) -> list[CellPlan]:
+        """Return the plans of the macro-cells that reach into a window, in a fixed order."""
+        cells = self._network.cells_near(window.bounds_m)
+        near = [cell for cell in cells if window.touches(self._box(cell))]
+        plans = [self._plan(cell) for cell in near]
+        while len(self._plans) > max(_CACHED_CELLS, len(near)):
+            self._plans.popitem(last=False)
+        while len(self._boxes) > 64 * _CACHED_CELLS:
+            self._boxes.popitem(last=False)
+        return plans
+
+    def _box(self, cell: tuple[int, int]) -> Box:
+        if cell not in self._boxes:
+            self._boxes[cell] = outline_box(self._network, *cell)
+        return self._boxes[cell]
+
+    def _plan(self, cell: tuple[int, int]) -> CellPlan:
+        if cell not in self._plans:
+            self._plans[cell] = make_plan(self._network, *cell)
+        self._plans.move_to_end(cell)
+        return self._plans[cell]
+
+
+def _window(
+    west_m: float, north_m: float, width_px: int, height_px: int, gsd_m: float
+) -> PixelWindow:
+    """Return a window by its corner in EPSG:2154; raise `AreaError` for impossible sizes."""
+    if width_px < 1 or height_px < 1:
+        raise AreaError(f"an image needs at least one pixel, got {width_px} x {height_px}")
+    check_gsd(gsd_m)
+    if not (np.isfinite(west_m) and np.isfinite(north_m)):
+        raise AreaError(f"the corner of an image must be finite, got {west_m}, {north_m}")
+    return PixelWindow.at(west_m - ORIGIN_M[0], north_m - ORIGIN_M[1], width_px, height_px, gsd_m)
+
+
+def _averaged(picture: Float32, factor: int) -> Float32:
+    """Return the picture with `factor` x `factor` pixels averaged into one."""
+    rows, cols, channels = picture.shape
+    blocks = picture.reshape(rows // factor, factor, cols // factor, factor, channels)
+    return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
+
+
+def check_gsd(gsd_m: float) -> None:
+    """Raise `AreaError` if a ground resolution cannot be rendered."""
+    low, high = GSD_RANGE_M
+    if not (low <= gsd_m <= high):
+        raise AreaError(f"gsd_m must be between {low} and {high} m per pixel, got {gsd_m}")

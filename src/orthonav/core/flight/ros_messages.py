@@ -1,0 +1,145 @@
+"""Images, cameras, attitudes and heights of ROS messages; axes: REP 103 and REP 105."""
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.flight import decode_image
+from orthonav.core.geo.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+)
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera_files import camera_from_numbers
+
+LEAST_TILT_STD_DEG, MOST_TILT_STD_DEG = 1.5, 10.0
+"""An orientation of an IMU counts as stated between them; MAVROS states 57 deg by default."""
+
+
+def stamp_ns(message: Any, recorded_ns: int) -> int:
+    """Time stamp of a message, or the time of its recording where it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    stamped = 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    return stamped or recorded_ns
+
+
+def attitude_of_message(message: Any) -> tuple[float, float, float, float] | None:
+    """The orientation w, x, y, z in a `sensor_msgs/Imu`, `nav_msgs/Odometry` or
+    `geometry_msgs/PoseStamped`: from forward-left-up to east-north-up (REP 103).
+
+    None for an `Imu` that says it has none.
+    """
+    if hasattr(message, "orientation_covariance"):
+        if message.orientation_covariance[0] == -1:
+            return None
+        turn = message.orientation
+    elif hasattr(message.pose, "pose"):
+        turn = message.pose.pose.orientation
+    else:
+        turn = message.pose.orientation
+    return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
+
+
+def tilt_std_of_message(message: Any) -> float:
+    """Standard deviation of pitch and roll (deg) by the covariance of a `sensor_msgs/Imu`.
+
+    That of an autopilot where it is not stated, or is a placeholder. A smaller one than
+    `LEAST_TILT_STD_DEG` leaves out the errors of the mount and of accelerations.
+    """
+    covariance = getattr(message, "orientation_covariance", (0.0,) * 9)
+    variance = max(float(covariance[0]), float(covariance[4]))
+    std_deg = math.degrees(math.sqrt(variance)) if variance > 0 else math.inf
+    if not std_deg <= MOST_TILT_STD_DEG:
+        return AUTOPILOT_TILT_STD_DEG
+    return max(std_deg, LEAST_TILT_STD_DEG)
+
+
+def height_of_message(message: Any) -> float | None:
+    """Metres above ground of a `sensor_msgs/Range`, `mavros_msgs/Altitude` or a plain number.
+
+    None for a range outside the limits of its sensor.
+    """
+    if hasattr(message, "range"):
+        sound = message.min_range <= message.range <= message.max_range
+        return float(message.range) if sound else None
+    if hasattr(message, "bottom_clearance"):
+        clearance = message.bottom_clearance
+        return float(clearance if math.isfinite(clearance) else message.relative)
+    return float(message.data)
+
+
+Grey = NDArray[np.uint8]
+# encoding: bytes per channel, channels, conversion to grey.
+_TO_GREY: dict[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 1, None),
+    "8uc1": (1, 1, None),
+    "mono16": (2, 1, None),
+    "16uc1": (2, 1, None),
+    "bgr8": (1, 3, cv2.COLOR_BGR2GRAY),
+    "8uc3": (1, 3, cv2.COLOR_BGR2GRAY),
+    "rgb8": (1, 3, cv2.COLOR_RGB2GRAY),
+    "bgra8": (1, 4, cv2.COLOR_BGRA2GRAY),
+    "8uc4": (1, 4, cv2.COLOR_BGRA2GRAY),
+    "rgba8": (1, 4, cv2.COLOR_RGBA2GRAY),
+    **{
+        f"bayer_{order}{8 * width}": (width, 1, getattr(cv2, f"COLOR_Bayer{order.upper()}2GRAY"))
+        for order in ("rggb", "bggr", "gbrg", "grbg")
+        for width in (1, 2)
+    },
+}
+
+
+def grey_of_message(message: Any, where: str) -> Grey:
+    """Grey levels (H, W) uint8 of a `sensor_msgs/Image` or `CompressedImage`.
+
+    Raises `FlightError` where it cannot be decoded.
+    """
+    if hasattr(message, "encoding"):
+        return grey_of_image(message, where)
+    return decode_image(np.asarray(message.data, dtype=np.uint8).tobytes(), where)
+
+
+def grey_of_image(message: Any, where: str) -> Grey:
+    """Grey levels (H, W) uint8 of a `sensor_msgs/Image`; 16-bit ones are scaled down.
+
+    Raises `FlightError` for unknown encodings and data of a wrong size.
+    """
+    encoding = str(message.encoding).lower()
+    if encoding not in _TO_GREY:
+        raise FlightError(f"image encoding '{message.encoding}' is not supported: {where}")
+    width, channels, conversion = _TO_GREY[encoding]
+    rows, columns, step = int(message.height), int(message.width), int(message.step)
+    data, row_bytes = np.asarray(message.data, dtype=np.uint8), columns * width * channels
+    if rows < 1 or columns < 1 or step < row_bytes or data.size < rows * step:
+        raise FlightError(f"image is cut short or has no size: {where}")
+    packed = np.ascontiguousarray(data[: rows * step].reshape(rows, step)[:, :row_bytes])
+    kind = np.uint8 if width == 1 else np.dtype(">u2" if message.is_bigendian else "<u2")
+    pixels: NDArray[Any] = packed.view(kind).reshape(rows, columns, channels)
+    if channels == 1:
+        pixels = pixels[..., 0]
+    if conversion is not None:
+        pixels = cv2.cvtColor(pixels.astype(pixels.dtype.newbyteorder("=")), conversion)
+    return np.asarray(pixels if width == 1 else pixels >> 8, dtype=np.uint8)
+
+
+def camera_of_info(message: Any) -> Camera:
+    """The camera of a `sensor_msgs/CameraInfo` (matrix K, not the rectified P).
+
+    Raises `CameraError` where it is not calibrated, or has an unsupported model.
+    """
+    matrix = np.asarray(getattr(message, "K", getattr(message, "k", None)), dtype=np.float64)
+    lens = np.asarray(getattr(message, "D", getattr(message, "d", None)), dtype=np.float64)
+    if matrix.size != 9 or matrix[0] <= 0:
+        raise CameraError("camera_info is not calibrated; give --camera FILE")
+    roi = message.roi
+    if message.binning_x > 1 or message.binning_y > 1 or roi.width or roi.height:
+        raise CameraError("camera_info with binning or a region of interest; give --camera FILE")
+    return camera_from_numbers(
+        (message.width, message.height),
+        matrix[[0, 4, 2, 5]].tolist(),
+        lens.ravel().tolist(),
+        str(message.distortion_model),
+    )

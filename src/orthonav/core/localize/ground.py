@@ -1,0 +1,289 @@
+"""A sheet with its ground, level or not, and a view over it: from a pose to what the camera sees.
+
+The pose of a candidate says where the middle of the view's window lies, its heading, and that the
+camera is `agl_m * exp(log_scale)` above the mean ground of that window.
+"""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthonav.core.geo.camera import enu_from_camera, undistort
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.geo.ground import sight_on_ground
+from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
+from orthonav.core.localize.rectify import Orientation, node_px, orthorectified
+from orthonav.core.localize.tiles import TileProposer
+from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
+from orthonav.core.mapfile.manifest import SheetInfo
+from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.records import DEFAULT_AGL_STD
+from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap
+from orthonav.core.register.search import SearchWindows
+from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import GreyPyramid, Reference
+
+MAP_NODES = 256
+"""Nodes across the map of expected scales, at most."""
+SLOPE_M = 10.0
+"""Slopes are those over twice this distance."""
+LARGEST_STD = 0.3
+"""Largest standard deviation of the scales searched: three are scales of 0.41 to 2.46."""
+Array = NDArray[np.float64]
+
+
+class Terrain(Protocol):
+    """Heights of the ground."""
+
+    def at_en_m(self, points_en_m: ArrayLike) -> Array:
+        """Heights (...) above sea level at points (..., 2), metres east and north; NaN where
+        unknown."""
+
+
+class LevelTerrain:
+    """Ground of one height, 0: that of maps without a terrain."""
+
+    def at_en_m(self, points_en_m: ArrayLike) -> Array:
+        """Zeros (...) at points (..., 2)."""
+        return np.zeros(np.shape(points_en_m)[:-1])
+
+
+class Relief:
+    """The ground of a sheet, for all views. Safe to share between threads."""
+
+    def __init__(self, terrain: Terrain, grid: TileGrid) -> None:
+        self.terrain, self.grid = terrain, grid
+        self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the ground is level, as without a terrain."""
+        return isinstance(self.terrain, LevelTerrain)
+
+    def en_m(self, map_px: Array) -> Array:
+        """Metres east and north (..., 2) of map coordinates at level 0."""
+        corner = np.array([self.grid.west_m, self.grid.north_m])
+        return np.asarray(corner + map_px * [self.grid.gsd_m, -self.grid.gsd_m])
+
+    def ground_m(self, map_px: Array) -> Array:
+        """Ground points (..., 3) east, north, above sea at map coordinates; NaN where unknown."""
+        points = self.en_m(map_px)
+        return np.concatenate([points, self.terrain.at_en_m(points)[..., None]], axis=-1)
+
+    def slopes(self, ground_m: Array) -> Array:
+        """Rise (N, 2) per metre east and north at ground points (N, 3)."""
+        out = np.empty((len(ground_m), 2))
+        for axis in range(2):
+            step = np.zeros(2)
+            step[axis] = SLOPE_M
+            ahead, behind = (
+                self.terrain.at_en_m(ground_m[:, :2] + sign * step) for sign in (1, -1)
+            )
+            out[:, axis] = (ahead - behind) / (2 * SLOPE_M)
+        return out
+
+    def expected(self, view: PreparedView) -> PosePrior:
+        """The prior of a view with the scale expected at each place, by its height above sea."""
+        telemetry, prior = view.telemetry, view.prior
+        below, agl_m = telemetry.below, telemetry.agl_m
+        if below is None:
+            return prior
+        own_m = DEFAULT_AGL_STD * agl_m
+        if telemetry.agl_std_m is not None:
+            own_m = math.sqrt(max(telemetry.agl_std_m**2 - below.std_m**2, 0.0))
+        means, step_px = self._mean_heights(view.side_px)
+        over = np.maximum(1 + (below.height_m - means) / agl_m, 0.05)
+        values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
+        focal_std = view.view.camera.focal_std
+        std = max(math.hypot(own_m / agl_m, focal_std), MIN_AGL_STD)
+        reach = min(float(np.abs(values).max()) + SIGMAS * std, SIGMAS * prior.log_scale_std)
+        if below.std_m / agl_m > std:
+            reach = float(np.abs(values).max()) + SIGMAS * std
+        widest = min(reach / SIGMAS, LARGEST_STD)
+        return replace(
+            prior,
+            log_scale_std=max(widest, MIN_AGL_STD),
+            scale_map=ScaleMap(values, step_px, min(std, prior.log_scale_std)),
+        )
+
+    def _mean_heights(self, side_px: float) -> tuple[NDArray[np.float32], float]:
+        """Mean heights of the ground under windows of about a side at nodes over the sheet, and
+        the distance of these in pixels of level 0."""
+        key = round(math.log2(max(side_px, 1.0)))
+        if key not in self._means:
+            size = self.grid.width_px, self.grid.height_px
+            step = max(max(size) / MAP_NODES, 2.0**key / 4)
+            x, y = (np.arange(0.0, side + step, step) for side in size)
+            heights = self.ground_m(np.stack(np.meshgrid(x, y), -1))[..., 2]
+            known = np.isfinite(heights).astype(np.float32)
+            box = (max(round(2.0**key / step), 1),) * 2
+            border = cv2.BORDER_REPLICATE
+            share = cv2.blur(known, box, borderType=border)
+            total = cv2.blur(
+                np.nan_to_num(heights).astype(np.float32) * known, box, borderType=border
+            )
+            with np.errstate(invalid="ignore", divide="ignore"):
+                self._means[key] = np.asarray(total / share, np.float32), step
+        return self._means[key]
+
+
+REFERENCE_NODES = 9
+"""Nodes across and down a window whose mean height is its reference."""
+MIN_KNOWN = 0.5
+"""Windows of which less is known are registered on level ground."""
+LEVEL_PX = 0.2
+"""Relief that displaces no ground of a window by more (pixels of the final level) is left out."""
+
+
+class SearchedSheet:
+    """A sheet and its imagery, made ready for all views. Safe to share between threads."""
+
+    def __init__(
+        self,
+        sheet: SheetInfo,
+        layer: GreyPyramid,
+        *,
+        confidence: RegisteredConfidence | None,
+        radius_m: float,
+        floor_px: float,
+        propose: TileProposer | None = None,
+        plan: SearchPlan = DEFAULT_PLAN,
+        terrain: TerrainLayer | None = None,
+    ) -> None:
+        """`confidence`: None before it is learnt; no place is proven then. `radius_m`: the error
+        that it is about. `floor_px`: standard deviation with which maps of two dates agree, in
+        pixels of level 0. Without `propose`, candidates come from searches by FFT only; without
+        `terrain` the ground is level.
+        """
+        self.sheet, self.grid = sheet, sheet.grid
+        self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
+        self.reference = Reference(layer)
+        self.windows = SearchWindows(self.reference)
+        self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
+        self.propose, self.plan = propose, plan
+        self.relief = Relief(terrain or LevelTerrain(), self.grid)
+
+    @property
+    def pyramid(self) -> GreyPyramid:
+        """The grey levels of the sheet at all its resolutions."""
+        return self.reference.pyramid
+
+    def px_of(self, place_en_m: Array) -> tuple[float, float]:
+        """Pixels of level 0, x and y, of a place (2,): the inverse of `Relief.en_m`."""
+        (east, north), grid = place_en_m, self.grid
+        return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
+
+
+class ViewOverGround:
+    """One view over the ground of a sheet."""
+
+    def __init__(self, relief: Relief, view: PreparedView) -> None:
+        self.relief, self.view = relief, view
+        valid = view.templates.valid
+        rows, cols = (
+            (np.arange(REFERENCE_NODES) + 0.5) * side / REFERENCE_NODES for side in valid.shape
+        )
+        used = valid[np.ix_(rows.astype(int), cols.astype(int))]
+        x, y = np.meshgrid(cols - valid.shape[1] / 2, rows - valid.shape[0] / 2)
+        nodes = np.stack([x, y], axis=-1) * 2.0**view.levels.final
+        self._reference_px = nodes[used] if used.any() else nodes.reshape(-1, 2)
+
+    def templates_at(
+        self, pose: Pose, level: int, orientation: Orientation | None = None
+    ) -> ViewTemplates | None:
+        """The view orthorectified on the terrain under a pose, at a level; None where less than
+        half of the window is known. `orientation`: of the camera; None: that of the pose."""
+        orientation = orientation or self.orientation(pose)
+        if orientation is None:
+            return None
+        final = self.view.levels.final
+        rows, cols = self.view.templates.valid.shape
+        scale = 2.0 ** (final - level)
+        shape = round(rows * scale), round(cols * scale)
+        nodes = (node_px(shape) - [shape[1] / 2, shape[0] / 2]) * 2.0**level
+        ground = self.relief.ground_m(pose.map_px(nodes))
+        picture = self.view.picture_at(level)
+        return ViewTemplates(*orthorectified(picture, orientation, ground, shape), level)
+
+    def orientation(self, pose: Pose) -> Orientation | None:
+        """Where the camera is under a pose; None where less than half of its ground is known."""
+        reference_m = self.reference_m(pose)
+        if math.isnan(reference_m):
+            return None
+        telemetry = self.view.telemetry
+        above_m = telemetry.agl_m * math.exp(pose.log_scale)
+        east, north = self.relief.en_m(pose.map_px(self.view.camera_px))
+        position = np.array([east, north, reference_m + above_m])
+        attitude = np.array([math.degrees(pose.turn_rad), telemetry.pitch_deg, telemetry.roll_deg])
+        return Orientation(position, attitude)
+
+    def reference_m(self, pose: Pose) -> float:
+        """Mean height of the ground of the window; NaN where less than half of it is known."""
+        heights = self.relief.ground_m(pose.map_px(self._reference_px))[:, 2]
+        known = np.isfinite(heights)
+        return float(heights[known].mean()) if known.mean() >= MIN_KNOWN else math.nan
+
+    def is_level(self, pose: Pose) -> bool:
+        """Whether relief displaces no ground of the window by a visible amount."""
+        if self.relief.is_level:
+            return True
+        ground = self.relief.ground_m(pose.map_px(self._reference_px))
+        orientation = self.orientation(pose)
+        if orientation is None or not np.isfinite(ground).all():
+            return False
+        offset = ground - orientation.position_m
+        rise = np.abs(ground[:, 2] - ground[:, 2].mean())
+        shift_m = rise * np.hypot(offset[:, 0], offset[:, 1]) / np.maximum(-offset[:, 2], 1.0)
+        pixel_m = self.relief.grid.gsd_m * 2.0**self.view.levels.final
+        return bool(shift_m.max() < LEVEL_PX * pixel_m)
+
+    def moved_px(self, one: Pose, other: Pose) -> float:
+        """How far a window moved at its rim, pixels of level 0."""
+        half = self.view.side_px / 2
+        corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+        moved = one.map_px(corners) - other.map_px(corners)
+        return float(np.hypot(*moved.T).max())
+
+    def below_camera(self, pose: Pose) -> Pose:
+        """The pose of a window, with its height counted from the ground below the camera."""
+        camera_px, orientation = self.view.camera_px, self.orientation(pose)
+        if orientation is None:
+            return pose
+        east, north, above_sea_m = orientation.position_m.tolist()
+        below_m = float(self.relief.terrain.at_en_m([east, north]))
+        agl_m = self.view.telemetry.agl_m
+        if not above_sea_m - below_m > 0:  # also where it is unknown
+            return pose
+        turned = replace(pose, log_scale=math.log((above_sea_m - below_m) / agl_m))
+        x, y = pose.map_px(camera_px) - turned.linear @ camera_px
+        return replace(turned, x_px=float(x), y_px=float(y))
+
+    def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
+        """Where the middle of the picture looks on the terrain; the middle of the window of `pose`
+        where that is unknown."""
+        found = self.sight_en_m(orientation)
+        if not np.isfinite(found).all():
+            found = self.relief.en_m(np.array([pose.x_px, pose.y_px]))
+        return float(found[0]), float(found[1])
+
+    def sight_en_m(self, orientation: Orientation) -> Array:
+        """Metres east and north (2,) of the terrain that the middle of the picture shows; NaN where
+        that is unknown."""
+        camera = self.view.picture_at(self.view.levels.final).camera
+        px = np.array([camera.width_px / 2 - camera.cx_px, camera.height_px / 2 - camera.cy_px])
+        plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
+        ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
+        if not ray[2] < -1e-6:
+            return np.full(2, np.nan)
+
+        def above_sea_m(offset_en_m: Array) -> Array:
+            return self.relief.terrain.at_en_m(orientation.position_m[:2] + offset_en_m)
+
+        met = sight_on_ground(ray[:2] / -ray[2], float(orientation.position_m[2]), above_sea_m)
+        return np.asarray(orientation.position_m[:2] + met)

@@ -1,0 +1,252 @@
+"""A view made ready for registration: checked, and rectified with its own heading up.
+
+Views that cannot be placed are refused before any search, each by a `NoFix` with its reason.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.rectify import (
+    RectifiedView,
+    downsampled,
+    is_oblique,
+    near_part,
+    off_nadir_deg,
+    rectify_footprint,
+)
+from orthonav.core.records import (
+    DEFAULT_AGL_STD,
+    DEFAULT_YAW_STD_DEG,
+    MIN_YAW_STD_DEG,
+    NoFix,
+    Telemetry,
+    View,
+)
+from orthonav.core.register.pose import PosePrior
+from orthonav.core.register.template import Levels, ViewTemplates
+
+MAX_TILT_DEG = 65.0
+MIN_SIDE_PX = 32
+MIN_VIEW_PX = 24.0
+"""Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
+that views are finished at (docs/decisions/registration.md)."""
+MIN_TILT_COS = 0.5
+"""Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
+MAX_COARSER = 4.0
+DARK_LEVEL = 16.0
+BRIGHT_LEVEL = 250.0
+MIN_STD = 3.0
+_SAMPLE_STEP_PX = 8
+
+
+def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
+    """Why a view cannot be placed on a map of resolution `gsd_m`; None if it can be tried."""
+    refused = check_telemetry(view.telemetry, view.camera, gsd_m, heading_known)
+    return refused or check_picture(view.grey)
+
+
+def check_telemetry(
+    telemetry: Telemetry, camera: Camera, gsd_m: float | None, heading_known: bool
+) -> NoFix | None:
+    """Why a view with this telemetry cannot be rectified to `gsd_m`; None if it can.
+
+    Without `gsd_m` its size beside a map is not checked.
+    """
+    missing = [name for name in telemetry.missing() if heading_known or name != "yaw_deg"]
+    if missing:
+        return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
+    if telemetry.agl_m <= 0:
+        return NoFix("bad_height", f"height above ground is {telemetry.agl_m:.1f} m")
+    tilt_deg = off_nadir_deg(telemetry)
+    if tilt_deg > MAX_TILT_DEG:
+        return NoFix(
+            "extreme_tilt",
+            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used; pitch and "
+            "roll are 0 for a camera that looks down",
+        )
+    if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
+        return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
+    if gsd_m is None:
+        return None
+    side_px = footprint_side_m(telemetry, camera) / gsd_m
+    if side_px < MIN_VIEW_PX:
+        return _too_small(side_px, MIN_VIEW_PX, f"{telemetry.agl_m:.0f} m above ground, ")
+    coarser = camera.gsd_m(telemetry.agl_m) / gsd_m
+    if coarser > MAX_COARSER:
+        return NoFix("too_coarse", f"a pixel of the view covers {coarser:.3g} pixels of the map")
+    return None
+
+
+def footprint_side_m(telemetry: Telemetry, camera: Camera) -> float:
+    """Root of the area of flat ground that a view shows, as it is expected from the telemetry."""
+    tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(math.radians(telemetry.roll_deg))
+    # The area seen grows with the inverse cube of the cosine of the tilt.
+    across, along = camera.extent
+    return telemetry.agl_m * math.sqrt(across * along / max(tilt, MIN_TILT_COS) ** 3)
+
+
+def check_picture(grey: NDArray[np.uint8]) -> NoFix | None:
+    """Why a view (H, W) shows nothing: too dark, too bright, blank; None if it shows something."""
+    sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
+    counts = np.bincount(sample.reshape(-1), minlength=256)
+    low, high = (_percentile(counts, percent) for percent in (1, 99))
+    levels, size = np.arange(256), int(counts.sum())
+    mean = float(counts @ levels) / size
+    std = math.sqrt(max(float(counts @ levels**2) / size - mean**2, 0.0))
+    if high < DARK_LEVEL:
+        return NoFix("too_dark", f"99 % of the view is darker than {high:.0f} of 255")
+    if low > BRIGHT_LEVEL:
+        return NoFix("too_bright", f"99 % of the view is brighter than {low:.0f} of 255")
+    if std < MIN_STD:
+        return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
+    return None
+
+
+def _percentile(counts: NDArray[np.intp], percent: float) -> float:
+    """As `np.percentile` of the levels that were counted, in a tenth of the time."""
+    upto = np.cumsum(counts)
+    at = percent / 100 * (int(upto[-1]) - 1)
+    below, above = np.searchsorted(upto, [math.floor(at), math.ceil(at)], side="right").tolist()
+    return float(below + (at - math.floor(at)) * (above - below))
+
+
+def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None:
+    """Why too little of a tile is seen; None if enough is."""
+    share = float(view.valid.mean())
+    if share < min_valid_share or share == 0:
+        return NoFix(
+            "too_small", f"view covers {share:.0%} of a tile, {min_valid_share:.0%} are needed"
+        )
+    if _is_uniform(view):
+        return NoFix("blank", "the part of the view that would be compared is uniform")
+    return None
+
+
+def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> NoFix | None:
+    """Why a rectified footprint shows too little; None if enough.
+
+    `pixel` is the size of its pixels in pixels of the map, `min_side_px` the least side, in those.
+    """
+    side = math.sqrt(cv2.countNonZero(view.valid.view(np.uint8))) * pixel
+    if side < min_side_px:
+        return _too_small(side, min_side_px)
+    if _is_uniform(view):
+        return NoFix("blank", "the part of the view that would be compared is uniform")
+    return None
+
+
+def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
+    detail = f"{where}view covers {side_px:.0f} pixels of the map across, {least_px:.0f} needed"
+    return NoFix("too_small", detail)
+
+
+def _is_uniform(view: RectifiedView) -> bool:
+    _, std = cv2.meanStdDev(view.grey, mask=view.valid.view(np.uint8))
+    return float(std[0, 0]) < MIN_STD / 2
+
+
+MIN_AGL_STD = 0.03
+"""Least standard deviation of the log scale that is searched, whatever the telemetry reports."""
+MAX_AGL_STD = 0.15
+"""Largest one: three of them are scales of 0.64 to 1.57, about as far as scores of chance were
+measured to be alike (docs/decisions/registration.md)."""
+NEAR_SHARE = 0.6
+"""The part of a view far off nadir is judged as one so many times smaller, thus mostly one level
+finer: it is no square, and on its coarse levels too little is left of it
+(docs/decisions/terrain.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedView:
+    """A view made ready for registration.
+
+    `view`: as the camera saw it. `gsd_m`: ground resolution of level 0 of the map. `levels`: levels
+    of the map at which it is searched, judged and finished. `templates`: it rectified at the final
+    level. `side_px`: root of the area seen, in pixels of level 0. `camera_px` (2,): the camera as
+    seen from the middle of the view, heading up, x to the right and y down, in pixels of level 0.
+    `prior`: expected heading and scale.
+    """
+
+    view: View
+    gsd_m: float
+    levels: Levels
+    templates: ViewTemplates
+    side_px: float
+    camera_px: NDArray[np.float64]
+    prior: PosePrior
+    _pictures: dict[int, View]
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What was reported with the view."""
+        return self.view.telemetry
+
+    def picture_at(self, level: int) -> View:
+        """The view averaged towards the ground resolution of a level, made once."""
+        if level not in self._pictures:
+            self._pictures[level] = downsampled(self.view, self.gsd_m * 2**level)
+        return self._pictures[level]
+
+    def rectified_at(self, level: int) -> RectifiedView:
+        """The view rectified at the ground resolution of a level."""
+        return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)
+
+
+def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> PreparedView | NoFix:
+    """The view rectified at the level where it is finished; `NoFix` where it shows too little.
+
+    `gsd_m` is the ground resolution of level 0 of the map, `map_levels` the number of its levels.
+    """
+    camera, telemetry = view.camera, view.telemetry
+    nominal_m = footprint_side_m(telemetry, camera)
+    if is_oblique(view):
+        near = near_part(view, gsd_m)
+        if near is None:
+            return NoFix("too_small", "the view shows no ground that is near enough")
+        nominal_m = NEAR_SHARE * math.sqrt(near.area_m2)
+    levels = Levels.of(nominal_m / gsd_m, map_levels)
+    unit_px = 2**levels.final
+    picture = downsampled(view, gsd_m * unit_px)
+    rectified = _rectified(picture, gsd_m, levels, levels.final)
+    refused = check_footprint(rectified, unit_px, MIN_VIEW_PX)
+    if refused is not None:
+        return refused
+    offset = rectified.offset_en_m / gsd_m
+    return PreparedView(
+        view,
+        gsd_m,
+        levels,
+        ViewTemplates(rectified.grey, rectified.valid, levels.final),
+        math.sqrt(float(rectified.valid.sum())) * unit_px,
+        np.array([-offset[0], offset[1]]),
+        pose_prior(telemetry, heading_known, camera.focal_std),
+        {levels.final: picture},
+    )
+
+
+def _rectified(picture: View, gsd_m: float, levels: Levels, level: int) -> RectifiedView:
+    """A picture rectified at a level, its sides whole pixels of the coarse one."""
+    multiple = 2 ** max(0, levels.coarse - level)
+    return rectify_footprint(picture, gsd_m=gsd_m * 2**level, multiple_px=multiple)
+
+
+def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> PosePrior:
+    """Expected heading and scale of a view, by its telemetry and its camera's `focal_std`."""
+    yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
+    agl_std_m = telemetry.agl_std_m
+    agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
+    scale_std = math.hypot(_or_default(agl_std, DEFAULT_AGL_STD), focal_std)
+    return PosePrior(
+        math.radians(telemetry.yaw_deg) if heading_known else None,
+        math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
+        min(max(scale_std, MIN_AGL_STD), MAX_AGL_STD),
+    )
+
+
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None or not math.isfinite(value) else value

@@ -1,0 +1,136 @@
+"""What registration compares: two kinds of channels of the same ground, made of grey levels.
+
+*Oriented gradients*: the edge direction doubled, so that an edge keeps its place when its contrast
+flips between seasons, weighted by a magnitude that saturates against its surroundings, so that a
+bright roof says no more than a hedge. As in matching of images of different sensors (CFOG, Ye et
+al., IEEE TGRS 2019), but as two numbers per pixel instead of a histogram.
+
+*Grey*: what is left of the grey levels after local mean and local contrast are taken out.
+
+They err in different places: their sum is far better than either.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+CHANNELS = 4
+"""cosine and sine of the doubled edge direction, grey, valid."""
+GROUPS = (slice(0, 2), slice(2, 3))
+"""Those of the two kinds."""
+
+
+@dataclass(frozen=True)
+class ChannelRecipe:
+    """Parameters of the channels, in pixels of the level it is made at.
+
+    `gradient_sigma_px`: Gaussian before the gradient; `contrast_px`: side of the window in which a
+    gradient is weighed against its surroundings; `mean_px` and `deviation_px`: windows of local
+    mean and local contrast of grey; `grey_share`: weight of grey beside gradients.
+    """
+
+    gradient_sigma_px: float = 1.0
+    contrast_px: int = 27
+    mean_px: int = 11
+    deviation_px: int = 21
+    grey_share: float = 0.6
+
+    @property
+    def margin_px(self) -> int:
+        """How far a pixel's grey level can reach into the channels."""
+        return max(self.contrast_px // 2 + 4, self.mean_px // 2 + self.deviation_px // 2 + 1)
+
+
+FINE = ChannelRecipe()
+COARSE = ChannelRecipe(gradient_sigma_px=0.7, contrast_px=17, mean_px=7, deviation_px=17)
+"""For views of some 30 pixels across: the same channels from smaller windows."""
+_GRADIENT_FLOOR = np.float32(0.5)
+_DEVIATION_FLOOR = np.float32(2.0)
+"""Grey levels (per pixel) below which gradient and contrast count as noise of an 8-bit picture."""
+_CLIP = 3.0
+"""Limit of the normalized grey, in local standard deviations."""
+
+
+def channels_of(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe = FINE
+) -> Array:
+    """Channels (H, W, 4) float32 of grey (H, W) uint8, zero where not valid.
+
+    The last channel is 1 where the channels count: valid, and not on the border of `valid`.
+    """
+    return np.asarray(cv2.merge(channel_planes(grey, valid, recipe)), np.float32)
+
+
+def channel_planes(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe
+) -> list[Array]:
+    """Those of `channels_of`, each (H, W)."""
+    whole = bool(valid.all())
+    picture = np.asarray(grey, dtype=np.float32)
+    share = np.ones(grey.shape, np.float32) if whole else valid.astype(np.float32)
+    local = _LocalMean(share, whole)
+    if not whole:
+        picture = np.where(valid, picture, local(picture * share, recipe.deviation_px))
+    counts = share
+    if not whole:
+        reach = 2 * int(np.ceil(2 * recipe.gradient_sigma_px)) + 1
+        counts = np.asarray(
+            cv2.erode(share, np.ones((reach, reach), np.uint8), borderValue=1.0), np.float32
+        )
+    east, north = _gradients(picture, counts, local, recipe)
+    return [east, north, _grey(picture, share, local, recipe) * counts, counts]
+
+
+class _LocalMean:
+    """Mean over the valid pixels of a square around each pixel."""
+
+    def __init__(self, share: Array, whole: bool) -> None:
+        self._share, self._whole = share, whole
+        self._counts: dict[int, Array] = {}
+
+    def __call__(self, values: Array, side_px: int) -> Array:
+        """Means (H, W) of `values`, which are zero where not valid."""
+        mean = _box(values, side_px)
+        if self._whole:
+            return mean
+        if side_px not in self._counts:
+            self._counts[side_px] = np.maximum(_box(self._share, side_px), np.float32(1e-3))
+        return np.asarray(mean / self._counts[side_px])
+
+
+def _box(values: Array, side_px: int) -> Array:
+    side_px = min(side_px, 2 * min(values.shape) - 1)  # reflection reaches no farther
+    return np.asarray(cv2.blur(values, (side_px, side_px)), dtype=np.float32)
+
+
+def _gradients(
+    picture: Array, counts: Array, local: _LocalMean, recipe: ChannelRecipe
+) -> tuple[Array, Array]:
+    """Doubled direction times saturated magnitude: cosine and sine (H, W)."""
+    smooth = cv2.GaussianBlur(picture, (0, 0), recipe.gradient_sigma_px)
+    east: Array = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32), np.float32)
+    south: Array = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32), np.float32)
+    square, product = east * east, east * south
+    south *= south
+    power = square + south
+    square -= south
+    magnitude = np.sqrt(power) * counts
+    # |g|^2 / (|g| + surroundings) / |g|^2: direction times |g| / (|g| + surroundings).
+    weight = magnitude / (
+        (magnitude + local(magnitude, recipe.contrast_px) + _GRADIENT_FLOOR)
+        * (power + np.float32(1e-6))
+    )
+    product *= 2
+    return np.asarray(square * weight), np.asarray(product * weight)
+
+
+def _grey(picture: Array, share: Array, local: _LocalMean, recipe: ChannelRecipe) -> Array:
+    """Grey levels (H, W) without local mean, divided by the local deviation."""
+    rest = (picture - local(picture * share, recipe.mean_px)) * share
+    # Running sums of a box filter may fall a little below zero.
+    power = np.maximum(local(rest * rest, recipe.deviation_px), 0)
+    deviation = np.sqrt(power) + _DEVIATION_FLOOR
+    return np.asarray(np.clip(rest / deviation, -_CLIP, _CLIP), dtype=np.float32)

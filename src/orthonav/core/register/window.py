@@ -1,0 +1,255 @@
+"""The map as registration sees it: channels of windows, sampled under the pose of a view, and
+the sums over the pixels of both.
+
+The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not.
+"""
+
+import math
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.register.channels import CHANNELS, FINE, GROUPS, ChannelRecipe, channels_of
+from orthonav.core.register.pose import Pose
+from orthonav.core.register.template import BLOCKS, Template, by_kind, turn_planes
+
+_kept = threading.local()
+
+
+def thread_memory(name: str, size: int) -> NDArray[np.float32]:
+    """`size` numbers of this thread, the same ones at every call with that `name`.
+
+    Who asks again under the same name overwrites what it held before.
+    """
+    found: NDArray[np.float32] | None = getattr(_kept, name, None)
+    if found is None or found.size < size:
+        found = np.empty(size, np.float32)
+        setattr(_kept, name, found)
+    return found[:size]
+
+
+Array = NDArray[np.float32]
+LONGEST_PX = 32768
+"""Longest side of an array that the kernel and OpenCV sample."""
+WHOLE_LEVEL_PX = 2_000_000
+"""Levels of up to so many pixels are made ready whole, once (16 bytes each)."""
+
+
+class GreyPyramid(Protocol):
+    """Grey levels of one sheet at several resolutions, each half as fine as the one before."""
+
+    levels: int
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        ...
+
+    def read(
+        self, level: int, row: int, col: int, height: int, width: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Grey and valid (height, width) of a window, which may reach beyond the sheet."""
+        ...
+
+
+class Reference:
+    """Channels of one sheet. Safe to share between threads."""
+
+    def __init__(self, pyramid: GreyPyramid) -> None:
+        self.pyramid = pyramid
+        self._whole: OrderedDict[tuple[int, ChannelRecipe], Array] = OrderedDict()
+        self._lock = threading.Lock()
+
+    @property
+    def levels(self) -> int:
+        """Number of levels; level 0 is the finest."""
+        return self.pyramid.levels
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        return self.pyramid.shape(level)
+
+    def caches(self, level: int) -> bool:
+        """Whether the channels of a level are made once and cached: where it is small enough."""
+        return (
+            math.prod(self.shape(level)) <= WHOLE_LEVEL_PX and max(self.shape(level)) <= LONGEST_PX
+        )
+
+    def whole(self, level: int, recipe: ChannelRecipe = FINE) -> Array:
+        """Channels (H, W, 4) of a whole level, computed once."""
+        with self._lock:
+            key = (level, recipe)
+            if key not in self._whole:
+                made = channels_of(*self.pyramid.read(level, 0, 0, *self.shape(level)), recipe)
+                made.flags.writeable = False
+                self._whole[key] = made
+            return self._whole[key]
+
+    def window(
+        self, level: int, row: int, col: int, height: int, width: int, recipe: ChannelRecipe = FINE
+    ) -> Array:
+        """Channels (height, width, 4) of a window; zero beyond the sheet."""
+        rows, cols = self.shape(level)
+        if self.caches(level):
+            return cut(self.whole(level, recipe), row, col, height, width)
+        # No more than the sheet: a window beyond it costs nothing.
+        margin = recipe.margin_px
+        top, left = max(row - margin, 0), max(col - margin, 0)
+        bottom, right = min(row + height + margin, rows), min(col + width + margin, cols)
+        if top >= bottom or left >= right:
+            return np.zeros((height, width, CHANNELS), np.float32)
+        grey, valid = self.pyramid.read(level, top, left, bottom - top, right - left)
+        return cut(channels_of(grey, valid, recipe), row - top, col - left, height, width)
+
+
+def cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
+    """A window (height, width, C) of an array (H, W, C); zero beyond it. A view where possible."""
+    rows, cols = whole.shape[:2]
+    y0, x0, y1, x1 = max(row, 0), max(col, 0), min(row + height, rows), min(col + width, cols)
+    if (y0, x0, y1, x1) == (row, col, row + height, col + width):
+        return whole[y0:y1, x0:x1]
+    out = np.zeros((height, width, whole.shape[2]), np.float32)
+    if y0 < y1 and x0 < x1:
+        out[y0 - row : y1 - row, x0 - col : x1 - col] = whole[y0:y1, x0:x1]
+    return out
+
+
+LARGEST_LOG_SCALE = 1.0
+"""A window reaches no farther than under this log scale: more than twice what is searched. Beyond
+it the map counts as missing, whatever a computed pose asks for."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapWindow:
+    """Channels (R, C, 4) of the map at a level, for windows of `shape` (H, W) near a pose.
+
+    (`row`, `col`) is its first pixel on that level of the sheet; `unit` pixels of level 0 are one
+    of the level.
+    """
+
+    made: Array
+    row: int
+    col: int
+    unit: float
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls,
+        template: Template,
+        reference: Reference,
+        pose: Pose,
+        slack_px: int,
+        margins: tuple[int, int] = (0, 0),
+    ) -> "MapWindow":
+        """Around the window of a view at a pose, larger by `margins` (rows, columns) on each side.
+
+        `slack_px`: how far the pose may still move, pixels of the level. The whole level where that
+        is cached.
+        """
+        rows, cols = template.mask.shape
+        height, width = rows + 2 * margins[0], cols + 2 * margins[1]
+        unit = 2.0**template.level
+        if reference.caches(template.level):
+            whole = reference.whole(template.level, template.recipe)
+            return cls(whole, 0, 0, unit, (height, width))
+        scale = math.exp(min(pose.log_scale, LARGEST_LOG_SCALE)) / 2
+        cos, sin = abs(scale * math.cos(pose.turn_rad)), abs(scale * math.sin(pose.turn_rad))
+        x, half_x = pose.x_px / unit, cos * width + sin * height
+        y, half_y = pose.y_px / unit, sin * width + cos * height
+        row, col = math.floor(y - half_y) - slack_px, math.floor(x - half_x) - slack_px
+        bottom, right = math.ceil(y + half_y) + slack_px, math.ceil(x + half_x) + slack_px
+        made = reference.window(
+            template.level, row, col, bottom - row, right - col, template.recipe
+        )
+        return cls(made, row, col, unit, (height, width))
+
+    def sample(self, pose: Pose, into: Array) -> None:
+        """Channels (H, W, 4) of the map as the window shows it under a pose."""
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        matrix = np.reshape(self.matrix(pose), (2, 3))
+        cv2.warpAffine(self.made, matrix, self.shape[::-1], dst=into, flags=flags)
+
+    def matrix(self, pose: Pose) -> tuple[float, ...]:
+        """Numbers (6,) of the matrix (2, 3) from the window's pixels to those of `made` under a
+        pose, both counted from pixel centres, row by row."""
+        height, width = self.shape
+        scale = math.exp(pose.log_scale)
+        cos, sin = scale * math.cos(pose.turn_rad), scale * math.sin(pose.turn_rad)
+        # Pixel-is-area to pixel centres: source and target are both half a pixel off.
+        x, y = (width - 1) / 2, (height - 1) / 2
+        column = pose.x_px / self.unit - self.col - 0.5 - cos * x + sin * y
+        row = pose.y_px / self.unit - self.row - 0.5 - sin * x - cos * y
+        return cos, -sin, column, sin, cos, row
+
+
+FULLY_VALID = 0.99
+"""A pixel counts where the sampled map is valid by more than this."""
+
+
+class Sums(NamedTuple):
+    """Sums over the pixels of a view that count, and that see valid map.
+
+    - `products`, `energies` (2,): view times map, and map squared, by kind of channel.
+    - `left_energies` (2,): view squared over its pixels that see no valid map.
+    - `slopes` (2, 4): derivatives by the steps times map.
+    - `left_slopes` (2, 4): derivatives times view over its pixels that see no valid map.
+    - `left_pixels` (B * B,): number of these by block.
+    """
+
+    products: NDArray[np.float64]
+    energies: NDArray[np.float64]
+    left_energies: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    left_slopes: NDArray[np.float64]
+    left_pixels: NDArray[np.float64]
+
+    @classmethod
+    def of_row(cls, row: NDArray[np.float64]) -> "Sums":
+        """Views of one row of `SUMS` numbers."""
+        slopes, left_slopes = row[6:14].reshape(2, 4), row[14:22].reshape(2, 4)
+        return cls(row[:2], row[2:4], row[4:6], slopes, left_slopes, row[22:])
+
+
+SUMS = 22 + BLOCKS**2
+
+
+def compared(template: Template, seen: Array, valid: Array, slopes: bool = True) -> Sums:
+    """The sums of a view beside `sampled_planes`; those of derivatives are 0 unless `slopes`.
+
+    `seen` becomes 0 where the view or the map does not count.
+    """
+    made = Sums.of_row(np.zeros(SUMS))
+    if not (template.whole and valid.min() > FULLY_VALID):
+        counts = template.mask * (valid > FULLY_VALID)
+        seen *= counts
+        left = template.mask - counts
+        if left.any():
+            made.left_pixels[:] = template.block_sums(left)
+            view = template.channels * left
+            made.left_energies[:] = [float(np.sum(np.square(view[group]))) for group in GROUPS]
+            if slopes:
+                made.left_slopes[:] = by_kind(template, view)
+    for kind, group in enumerate(GROUPS):
+        mine, theirs = template.channels[group].reshape(-1), seen[group].reshape(-1)
+        made.products[kind], made.energies[kind] = mine @ theirs, theirs @ theirs
+    if slopes:
+        made.slopes[:] = by_kind(template, seen)
+    return made
+
+
+def sampled_planes(template: Template, window: MapWindow, pose: Pose) -> tuple[Array, Array]:
+    """The map as the view's window shows it: channels (3, H, W), and how far it is valid (H, W).
+
+    Memory of the thread, overwritten by the next call.
+    """
+    shape = template.mask.shape
+    planes = thread_memory("sampled", 10 * template.mask.size).reshape(10, *shape)
+    interleaved = planes[:4].reshape(*shape, 4)
+    window.sample(pose, interleaved)
+    turn_planes(interleaved, -pose.turn_rad, planes[4:8], planes[8:10])
+    return planes[4:7], planes[7]

@@ -1,0 +1,217 @@
+"""What one view says: how likely each of its places is, and whether it shows the map there."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthonav.core.localize.confidence import RegisteredConfidence, logit
+from orthonav.core.localize.place import Place
+from orthonav.core.track.model import (
+    HEADING_FLOOR_RAD,
+    SCALE_FLOOR,
+    SEEN,
+    WHITE_SHARE,
+    Array,
+    Model,
+    ReportedAttitude,
+    Sighting,
+)
+
+TRUSTED = (0.1, 0.5)
+"""Views with a probability of their own below the first do not count, above the second fully."""
+MOST_OF_ONE = 0.75
+"""A single view counts at most so much: less than `CONFIRMED`."""
+POSE = slice(2, 4)
+"""Heading and scale in a measurement."""
+SEARCHED_SIGMAS = 6.0
+"""Width of the search over heading and scale, in standard deviations, from end to end."""
+MAX_LOG_ODDS = 7.0
+"""Limit of the log odds of a single view."""
+WORTH_LOG_ODDS = -12.0
+"""Less likely places are left out."""
+LEAST_PLACE = 1e-12
+"""Least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds."""
+
+
+def places_of(
+    best: Place, confidence: RegisteredConfidence, near_px: float, searched_share: float
+) -> list[tuple[float, float, Place]]:
+    """Log odds, probability by the view alone, and place: of the best place and of its rivals that
+    are farther than `near_px` from it and from each other.
+
+    A search of only a share of the map finds fewer rivals, and chance is lower: the log odds are
+    those within the area searched times `searched_share`, or, if less, those of a search of the
+    whole map whose rivals are what chance makes (docs/decisions/tracking.md).
+    """
+    share, chances = math.log(searched_share), confidence.chances
+    chance = {
+        "rival": chances.of_strength(best.scores),
+        "look_rival": chances.look,
+        "fine_rival": chances.fine,
+    }
+    out: list[tuple[float, float, Place]] = []
+    for place in (best, *best.rivals):
+        if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
+            continue
+        scores = _as_rival(best, place) if out else best.scores
+        alone = confidence(
+            scores
+            | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
+        )
+        log_odds = min(logit(confidence(scores), LEAST_PLACE) + share, logit(alone, LEAST_PLACE))
+        if out:  # the best place may have won in detail, against stronger scores elsewhere
+            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
+        if not out or log_odds > WORTH_LOG_ODDS:
+            out.append((log_odds, alone, place))
+    return out
+
+
+def _as_rival(best: Place, place: Place) -> dict[str, float]:
+    """The scores of a rival as if it were the best place, and the best one its rival."""
+    share = place.score / max(best.score, 1e-6)
+    look = best.scores["look"]
+    return best.scores | {
+        "strength": place.score,
+        "rival": best.score,
+        "look": look * share,
+        "look_rival": look,
+        "fine": math.nan,
+        "fine_rival": math.nan,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A sighting as a measurement of the state.
+
+    `mean` (6,), `noise` (6, 6): of `model.SEEN`. `log_odds`: log odds over the density of
+    places, headings and scales that only look alike. `own_noise` (6, 6): covariance without regard
+    to earlier views of the same ground. `alone`: probability by the view alone. `log_chance`: log
+    density of places, headings and scales that chance finds in the area searched.
+    """
+
+    mean: Array
+    noise: Array
+    log_odds: float
+    own_noise: Array
+    alone: float
+    log_chance: float
+
+
+def measurement(
+    model: Model, reported: ReportedAttitude, sighting: Sighting
+) -> tuple[Array, Array, Array]:
+    """A sighting as a measurement of `SEEN` (6,), and two covariances
+    (6, 6): of the errors of map and view, and of the telemetry noise, which is independent at every
+    view."""
+    noise = sighting.covariance.copy()
+    floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
+    noise[range(4), range(4)] += np.square(floor)
+    white = WHITE_SHARE * model.horizon_rad
+    independent = np.diag(np.square([0.0, 0.0, 0.0, 0.0, white, white]))
+    seen = sighting.mean.copy()
+    if reported.heading_rad is None:
+        seen[2] = 0.0
+        noise[2, :] = noise[:, 2] = 0.0
+        noise[2, 2] = math.pi**2
+    else:
+        seen[2] = math.remainder(seen[2] - reported.heading_rad, 2 * math.pi)
+    seen[4:] -= [reported.pitch_rad, reported.roll_rad]
+    return seen, noise, independent
+
+
+def updated(
+    mean: Array, covariance: Array, innovation: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Kalman update: posterior mean (.., 10) and covariance (.., 10, 10), by an innovation (.., 6)
+    and its covariance (.., 6, 6)."""
+    gain = np.linalg.solve(spread, SEEN @ covariance).swapaxes(-1, -2)
+    after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
+    moved = mean + (gain @ innovation[..., None])[..., 0]
+    return moved, (after + after.swapaxes(-1, -2)) / 2
+
+
+def log_densities(off: Array, spread: Array) -> Array:
+    """Natural logarithms (..) of the densities of Gaussians (.., N, N) at `off` (.., N)."""
+    _, log_det = np.linalg.slogdet(2 * math.pi * spread)
+    weighted = np.linalg.solve(spread, off[..., None])[..., 0]
+    return np.asarray(-0.5 * ((off * weighted).sum(axis=-1) + log_det))
+
+
+def log_density(off: Array, spread: Array) -> float:
+    """The same of one Gaussian."""
+    return float(log_densities(off, spread))
+
+
+def tempered(
+    model: Model,
+    mounts: Sequence[tuple[float, Array]],
+    areas_m2: tuple[float, float],
+    reported: ReportedAttitude,
+    sighting: Sighting,
+    newness: float,
+) -> Measurement:
+    """A sighting as a measurement, tempered by the share of it that is new.
+
+    `mounts`: probability and covariance (10, 10) of the initial state of each kind of mount.
+    `areas_m2`: of the map, and of the part of it that was searched.
+
+    A likelihood raised to the power `newness` has a broader peak, which stands out less from
+    all places, headings and scales. The telemetry noise, independent at every view, is
+    excluded.
+    """
+    mean, noise, independent = measurement(model, reported, sighting)
+    map_m2, searched_m2 = areas_m2
+    own = np.diag(noise)[POSE] + model.initial_bias()[:2]
+    poses = float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
+    wide = math.log(map_m2) + poses
+    # Tilts are distributed as those of mounts at every place: no evidence for one.
+    tilts = noise[4:, 4:] + independent[4:, 4:]
+    wide -= float(
+        np.logaddexp.reduce(
+            [
+                math.log(share) + log_density(mean[4:], tilts + (SEEN @ each @ SEEN.T)[4:, 4:])
+                for share, each in mounts
+            ]
+        )
+    )
+    _, log_det = np.linalg.slogdet(2 * math.pi * (noise + independent))
+    odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
+    odds += (1 - newness) * float(log_det) / 2 - len(mean) / 2 * math.log(newness)
+    return Measurement(
+        mean,
+        noise / newness + independent,
+        odds,
+        noise + independent,
+        sighting.alone,
+        -math.log(searched_m2) - poses,
+    )
+
+
+def recognition(
+    seen: Measurement, covariances: Array, innovations: Array, most_agreement: float
+) -> Array:
+    """Probabilities (K,) that a view showed the map, given its place and predictions of that.
+
+    `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The
+    odds by the view alone, times the likelihood ratio of the innovations (K, 6) in position,
+    heading and scale between a right place and one that chance finds in the area searched. A place
+    within the gate is never less likely for its distance.
+    """
+    spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
+    ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
+    agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
+    odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
+    return np.asarray(odds / (1 + odds))
+
+
+def confirmed_ground(alone: float, ground: float) -> float:
+    """New ground, in views, that a view confirms by its probability `alone`.
+
+    `ground`: share of the view that the last one did not show.
+    """
+    low, high = TRUSTED
+    trust = min(max((alone - low) / (high - low), 0.0), 1.0)
+    return min(ground * trust, MOST_OF_ONE)

@@ -1,0 +1,556 @@
+"""The vector index: unit vectors assigned to lists and coded, in shards that are mapped.
+
+Lists are an inverted multi-index (Babenko and Lempitsky, CVPR 2012). Codes have 4 bits per
+quantizer (product quantization: Jegou, Douze and Schmid, PAMI 2011; fast scan: Andre, Kermarrec and
+Le Scouarnec, VLDB 2015). Both are computed by FAISS. All shards of an index share one set of
+quantizers (`train`) and depend on nothing else, so they can be added and removed one by one.
+
+A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
+codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
+list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. FAISS maps
+neither lists of 4-bit codes nor checks the files that it reads, so this format is our own: every
+length is checked before FAISS is given the map.
+"""
+
+import json
+import os
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from orthonav.core.errors import AtlasError
+from orthonav.core.extras import needed
+
+Array = NDArray[np.float32]
+
+QUANTIZERS_NAME = "quantizers.safetensors"
+MAX_TRAINING_VECTORS = 200_000
+"""Vectors that quantizers are trained on, as in `python -m benchmarks.atlas_search`."""
+POINTS_PER_CENTRE = 4096
+"""Training vectors per centre, if there are as many. FAISS's default, 256, loses 2 to 4 points of
+recall where lists or codes have few centres (2e5 vectors of `benchmarks.atlas_fields`)."""
+ROUNDS = 12
+"""Iterations of k-means, as in `python -m benchmarks.atlas_search`."""
+CODE_BITS = 4
+"""Bits per quantizer: what the fast scan of FAISS supports."""
+BLOCK = 32
+"""Codes that FAISS scans together; the room of a list is a multiple of it."""
+FORMAT = "orthonav-vectors"
+
+
+def faiss() -> Any:
+    """The module FAISS; raises `MissingExtraError` where it is not installed."""
+    return needed("faiss", "atlas", "searching an atlas")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """FAISS on one thread: with more threads sums are added in a varying order."""
+    module = faiss()
+    threads = module.omp_get_max_threads()
+    module.omp_set_num_threads(1)
+    try:
+        yield
+    finally:
+        module.omp_set_num_threads(threads)
+
+
+@dataclass(frozen=True)
+class VectorRecipe:
+    """How vectors are assigned to lists and coded.
+
+    `dims`: components per vector, even.
+    `list_bits`: there are 2 ** `list_bits` lists, half of the bits from either half of a vector;
+    even, 2 to 20.
+    `quantizers`: codes of 4 bits per vector; even, divides `dims`.
+    `seed`: seed of k-means.
+    """
+
+    dims: int
+    list_bits: int = 14
+    quantizers: int = 32
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.dims < 2 or self.dims % 2:
+            raise AtlasError(f"vectors must have an even number of dims, got {self.dims}")
+        if not 2 <= self.list_bits <= 20 or self.list_bits % 2:
+            raise AtlasError(f"list_bits must be even and 2 to 20, got {self.list_bits}")
+        if self.quantizers < 2 or self.quantizers % 2 or self.dims % self.quantizers:
+            raise AtlasError(
+                f"quantizers must be even and divide dims ({self.dims}), got {self.quantizers}"
+            )
+
+    @classmethod
+    def for_count(cls, count: int, dims: int, seed: int = 0) -> "VectorRecipe":
+        """The recipe for `count` vectors: lists of up to 1600, 4 bits for every two components."""
+        list_bits = 4
+        while list_bits < 16 and count > 800 * 2 ** (list_bits + 1):
+            list_bits += 2
+        quantizers = dims // 2 if dims % 4 == 0 else 2
+        return cls(dims, list_bits, quantizers, seed)
+
+    @property
+    def lists(self) -> int:
+        """Number of lists."""
+        return int(2**self.list_bits)
+
+    @property
+    def code_bytes(self) -> int:
+        """Bytes of a code."""
+        return self.quantizers // 2
+
+
+@dataclass(frozen=True, eq=False)
+class Quantizers:
+    """The trained quantizers that all shards of an index share.
+
+    `recipe`: how they were made.
+    `rotation` (D, D): rotates vectors so that variance is spread evenly over the quantizers.
+    `halves` (2, sqrt(lists), D / 2): list centres of each half of a rotated vector.
+    `codebook` (quantizers, 16, D / quantizers): codes of the residual.
+    """
+
+    recipe: VectorRecipe
+    rotation: Array
+    halves: Array
+    codebook: Array
+
+    @cached_property
+    def digest(self) -> str:
+        """Short digest of all arrays."""
+        return sha256(self._bytes()).hexdigest()[:16]
+
+    def save(self, path: Path) -> None:
+        """Write to `path` (safetensors)."""
+        path.write_bytes(self._bytes())
+
+    @classmethod
+    def load(cls, path: Path) -> "Quantizers":
+        """Read what `save` wrote; raises `AtlasError`."""
+        try:
+            with safe_open(path, framework="numpy") as stored:
+                recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
+                made = cls(recipe, *(stored.get_tensor(name) for name in _shapes(recipe)))
+        except (OSError, SafetensorError, ValueError, TypeError) as error:
+            raise AtlasError(f"quantizers of an index cannot be read ({error}): {path}") from error
+        for name, shape in _shapes(recipe).items():
+            array = getattr(made, name)
+            if array.shape != shape or array.dtype != np.float32:
+                raise AtlasError(f"{name} of an index must be {shape}, got {array.shape}: {path}")
+        return made
+
+    def _bytes(self) -> bytes:
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
+        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
+        return bytes(save(arrays, metadata={FORMAT: recipe}))
+
+    def rotated(self, vectors: Array) -> Array:
+        """Vectors (N, D) in the axes of lists and codes."""
+        return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.rotation)
+
+    def nearest_lists(self, rotated: Array, probes: int) -> tuple[NDArray[np.int64], Array]:
+        """The `probes` lists (Q, probes) whose centres have the highest scalar products with
+        rotated queries (Q, D), in the order of list numbers, and those products (Q, probes)."""
+        half = self.recipe.dims // 2
+        low, high = rotated[:, :half] @ self.halves[0].T, rotated[:, half:] @ self.halves[1].T
+        probes = min(probes, low.shape[1] * high.shape[1])
+        lists = np.empty((len(rotated), probes), np.int64)
+        products = np.empty(lists.shape, np.float32)
+        for number in range(len(rotated)):  # one at a time: 2^16 sums each
+            sums = (high[number, :, None] + low[number]).ravel()
+            lists[number] = np.sort(np.argpartition(sums, -probes)[-probes:])
+            products[number] = sums[lists[number]]
+        return lists, products
+
+    def empty_index(self) -> Any:
+        """An empty FAISS index (IndexIVFPQFastScan) with these quantizers."""
+        module = faiss()
+        index, coarse = _untrained(self.recipe)
+        module.copy_array_to_vector(self.halves.reshape(-1), coarse.pq.centroids)
+        module.copy_array_to_vector(self.codebook.reshape(-1), index.pq.centroids)
+        coarse.is_trained, coarse.ntotal, index.is_trained = True, self.recipe.lists, True
+        return index
+
+
+def _untrained(recipe: VectorRecipe) -> tuple[Any, Any]:
+    """An index of FAISS to be trained, and its quantizer of lists."""
+    module = faiss()
+    coarse = module.MultiIndexQuantizer(recipe.dims, 2, recipe.list_bits // 2)
+    index = module.IndexIVFPQFastScan(
+        coarse,
+        recipe.dims,
+        recipe.lists,
+        recipe.quantizers,
+        CODE_BITS,
+        module.METRIC_INNER_PRODUCT,
+        BLOCK,
+    )
+    index.by_residual, index.quantizer_trains_alone = True, 1
+    index.referenced_objects = [coarse]
+    return index, coarse
+
+
+def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of `Quantizers` by name."""
+    dims, quantizers = recipe.dims, recipe.quantizers
+    return {
+        "rotation": (dims, dims),
+        "halves": (2, 2 ** (recipe.list_bits // 2), dims // 2),
+        "codebook": (quantizers, 2**CODE_BITS, dims // quantizers),
+    }
+
+
+def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers:
+    """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes.
+
+    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used.
+    """
+    step = max(1, -(-len(sample) // MAX_TRAINING_VECTORS))
+    taken = np.asarray(sample[::step], dtype=np.float32)
+    rotation = _rotation(taken, recipe.quantizers)
+    index, coarse = _untrained(recipe)
+    for each in (coarse, index):
+        means = each.pq.cp
+        means.niter, means.seed = ROUNDS, recipe.seed + 1
+        means.min_points_per_centroid, means.max_points_per_centroid = 1, POINTS_PER_CENTRE
+    with one_thread():
+        index.train(np.ascontiguousarray(taken @ rotation))
+    halves, codebook = (faiss().vector_to_array(each.pq.centroids) for each in (coarse, index))
+    shapes = _shapes(recipe)
+    return Quantizers(
+        recipe,
+        rotation,
+        halves.reshape(shapes["halves"]),
+        codebook.reshape(shapes["codebook"]),
+    )
+
+
+def _rotation(vectors: Array, groups: int) -> Array:
+    """Rotation (D, D) to principal axes, assigned so that the products of the groups' variances
+    are similar (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3).
+
+    The PCAMatrix of FAISS, which balances sums of variances, finds 1 to 4 % fewer vectors.
+    """
+    wide = vectors.astype(np.float64)
+    variances, axes = np.linalg.eigh(wide.T @ wide / len(wide))
+    variances, axes = variances[::-1], axes[:, ::-1]
+    largest = np.abs(axes).argmax(axis=0)
+    axes = axes * np.sign(axes[largest, np.arange(len(axes))])
+    room = len(axes) // groups
+    assigned: list[list[int]] = [[] for _ in range(groups)]
+    weight = np.zeros(groups)
+    logs = np.log(np.maximum(variances, 1e-9 * variances[0]))
+    logs -= logs.min() - 1e-3
+    # The two halves are balanced as well: groups are filled from either half in turn.
+    in_turn = np.arange(groups).reshape(2, -1).T.ravel().tolist()
+    for axis, log in enumerate(logs):
+        open_groups = [group for group in in_turn if len(assigned[group]) < room]
+        least = min(open_groups, key=weight.__getitem__)
+        assigned[least].append(axis)
+        weight[least] += log
+    order = [axis for group in assigned for axis in group]
+    return np.ascontiguousarray(axes[:, order], dtype=np.float32)
+
+
+SCAN_ONE = 10
+"""FAISS's implementation of the scan that is fastest for one query at a time."""
+ADD_ROWS = 32_768
+NONE = -1
+"""Id where fewer than k vectors were found."""
+
+Ids = NDArray[np.int64]
+Places = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Part:
+    """The rows of one sheet in a shard, in the order of its coarse tiles.
+
+    `sheet`: name of the sheet.
+    `sha256`: digest of its coarse tiles (hex).
+    `rows`: how many.
+    `retired`: the sheet has changed or gone, and its rows are not found any more.
+    """
+
+    sheet: str
+    sha256: str
+    rows: int
+    retired: bool = False
+
+
+@dataclass(frozen=True)
+class ShardInfo:
+    """A shard: its name, the id of its first row, and the sheets in it, row after row."""
+
+    name: str
+    base: int
+    parts: tuple[Part, ...]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows, retired ones included."""
+        return sum(part.rows for part in self.parts)
+
+    @property
+    def retired_rows(self) -> NDArray[np.int64]:
+        """Rows (N,) of retired parts, in order."""
+        ends = np.cumsum([part.rows for part in self.parts]).tolist()
+        retired = [
+            np.arange(end - part.rows, end, dtype=np.int64)
+            for part, end in zip(self.parts, ends, strict=True)
+            if part.retired
+        ]
+        return np.concatenate(retired) if retired else np.empty(0, np.int64)
+
+
+def write_shard(
+    folder: Path, name: str, quantizers: Quantizers, batches: Iterable[tuple[Places, Array]]
+) -> int:
+    """Write a shard of unit vectors and return its number of rows.
+
+    `batches`: latitudes and longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory
+    grows by codes and places, some 40 bytes a vector. Raises `AtlasError` where the vectors are not
+    finite.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    dims, index = quantizers.recipe.dims, quantizers.empty_index()
+    places_deg = [np.empty((0, 2))]
+    with (folder / f"{name}.vectors.npy").open("wb") as out:
+        _write_header(out, 0, dims)
+        for places, batch in batches:
+            places_deg.append(places)
+            for start in range(0, len(batch), ADD_ROWS):
+                stored = np.ascontiguousarray(batch[start : start + ADD_ROWS], dtype=np.float16)
+                if not np.isfinite(stored).all():
+                    raise AtlasError("vectors of an index must be finite")
+                out.write(stored.data)
+                with one_thread():
+                    index.add(quantizers.rotated(stored.astype(np.float32)))
+        out.seek(0)
+        _write_header(out, index.ntotal, dims)
+    np.save(folder / f"{name}.places.npy", np.concatenate(places_deg))
+    _write_lists(folder, name, index, quantizers)
+    return int(index.ntotal)
+
+
+def _write_header(out: IO[bytes], rows: int, dims: int) -> None:
+    """Header of an array of NumPy, which reserves room for any number of rows."""
+    header = {"descr": "<f2", "fortran_order": False, "shape": (rows, dims)}
+    np.lib.format.write_array_header_1_0(out, header)
+
+
+def _write_lists(folder: Path, name: str, index: Any, quantizers: Quantizers) -> None:
+    table = np.zeros((quantizers.recipe.lists, 3), dtype=np.uint64)
+    code_bytes = quantizers.recipe.code_bytes
+    with (folder / f"{name}.codes").open("wb") as out:
+        for number, codes, rows in _lists(index, quantizers):
+            table[number] = len(rows), len(codes) // code_bytes, out.tell()
+            out.write(codes.data)
+            out.write(np.pad(rows, (0, int(table[number, 1]) - len(rows))).data)
+        if out.tell() == 0:
+            out.write(bytes(BLOCK))  # an empty file cannot be mapped
+    np.save(folder / f"{name}.lists.npy", table)
+
+
+def _lists(index: Any, quantizers: Quantizers) -> Iterator[tuple[int, NDArray[np.uint8], Ids]]:
+    """Number, codes in blocks, and rows of each list that is not empty."""
+    module, lists = faiss(), index.invlists
+    for number in range(quantizers.recipe.lists):
+        size = lists.list_size(number)
+        if size == 0:
+            continue
+        room = -(-size // BLOCK) * BLOCK * quantizers.recipe.code_bytes
+        codes = module.rev_swig_ptr(lists.get_codes(number), room)
+        rows = module.rev_swig_ptr(lists.get_ids(number), size)
+        yield number, np.asarray(codes), np.asarray(rows, dtype=np.int64)
+
+
+class OpenShard:
+    """The files of a shard, opened. Lists are mapped. Vectors are read row by row: the system
+    would map a megabyte around each."""
+
+    def __init__(
+        self, file: Callable[[str], Path], info: ShardInfo, quantizers: Quantizers
+    ) -> None:
+        """Raises `AtlasError` where a file cannot be read or does not fit `info`."""
+        self.info = info
+        ends = ("vectors.npy", "codes", "lists.npy", "places.npy")
+        path, codes, lists, places = (file(f"{info.name}.{end}") for end in ends)
+        try:
+            vectors = np.load(path, mmap_mode="r")
+            table = np.load(lists)
+            self.places_deg = np.load(places, mmap_mode="r")
+            codes_bytes = codes.stat().st_size
+        except (OSError, ValueError) as error:
+            raise AtlasError(f"shard {info.name} cannot be read ({error})") from error
+        dims = quantizers.recipe.dims
+        if vectors.shape != (info.rows, dims) or vectors.dtype != np.float16:
+            raise AtlasError(
+                f"shard holds {vectors.shape} {vectors.dtype}, expected {info.rows} vectors of "
+                f"{dims} float16; rebuild the index: {path}"
+            )
+        if self.places_deg.shape != (info.rows, 2) or self.places_deg.dtype != np.float64:
+            raise AtlasError(f"places of shard {info.name} are damaged; rebuild the index")
+        self._dims, self._offset = dims, path.stat().st_size - vectors.nbytes
+        self._file = os.open(path, os.O_RDONLY)
+        weakref.finalize(self, os.close, self._file)
+        os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
+        self._retired = info.retired_rows
+        self._index = quantizers.empty_index()
+        self._map_lists(codes, codes_bytes, table, quantizers)
+
+    def _map_lists(
+        self, path: Path, size: int, table: NDArray[np.uint64], quantizers: Quantizers
+    ) -> None:
+        """Let FAISS scan the lists in the mapped file."""
+        module, recipe = faiss(), quantizers.recipe
+        _check_table(table, recipe.lists, recipe.code_bytes, size, path)
+        if int(table[:, 0].sum()) != self.info.rows:
+            raise AtlasError(f"lists hold {table[:, 0].sum()} of {self.info.rows} rows: {path}")
+        mapped = module.OnDiskInvertedLists(recipe.lists, recipe.code_bytes, str(path))
+        mapped.lists.resize(recipe.lists)
+        contents = np.ascontiguousarray(table)
+        module.memcpy(mapped.lists.data(), module.swig_ptr(contents), contents.nbytes)
+        mapped.totsize, mapped.read_only, mapped.prefetch_nthread = size, True, 0
+        mapped.do_mmap()
+        self._index.replace_invlists(mapped, False)
+        self._index.ntotal = self.info.rows
+        self._index.referenced_objects.append(mapped)
+
+    def scan(self, rotated: Array, lists: Ids, scores: Array, count: int) -> tuple[Array, Ids]:
+        """Approximate products (Q, count) and rows (Q, count), best first, of lists (Q, probes)."""
+        module, index = faiss(), self._index
+        found = np.empty((len(rotated), count), dtype=np.float32)
+        rows = np.empty((len(rotated), count), dtype=np.int64)
+        index.nprobe = lists.shape[1]
+        index.implem = SCAN_ONE if len(rotated) == 1 else 0
+        point = module.swig_ptr
+        index.search_preassigned_c(
+            len(rotated),
+            point(rotated),
+            count,
+            point(lists),
+            point(scores),
+            point(found),
+            point(rows),
+            False,
+        )
+        if rows.max(initial=NONE) >= self.info.rows or rows.min(initial=NONE) < NONE:
+            raise AtlasError(f"codes of shard {self.info.name} are damaged; rebuild the index")
+        if len(self._retired):
+            gone = np.isin(rows, self._retired)
+            rows[gone], found[gone] = NONE, -np.inf
+        return found, rows
+
+    def vectors(self, rows: Ids) -> Array:
+        """Stored vectors (N, D) of rows (N,)."""
+        size, offset, file = 2 * self._dims, self._offset, self._file
+        read = b"".join([os.pread(file, size, offset + size * row) for row in rows.tolist()])
+        return np.frombuffer(read, dtype=np.float16).astype(np.float32).reshape(-1, self._dims)
+
+
+def _check_table(
+    table: NDArray[np.uint64], lists: int, code_bytes: int, size: int, path: Path
+) -> None:
+    """Raise `AtlasError` unless every list lies within the file."""
+    fits = table.shape == (lists, 3) and table.dtype == np.uint64
+    if fits:
+        count, room, offset = table.astype(np.float64).T
+        ends = offset + room * (code_bytes + 8)
+        fits = bool(((count <= room) & (ends <= size) & (room % BLOCK == 0)).all())
+    if not fits:
+        raise AtlasError(f"lists do not fit their file; rebuild the index: {path}")
+
+
+class ShardedIndex:
+    """The shards of an index, mapped and searched on one core.
+
+    The id of a vector is the base of its shard plus its row. Not for several threads at once.
+    """
+
+    def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
+        """Open shards and quantizers; `file` gives the path of each of their files.
+
+        Raises `AtlasError` where a file is damaged.
+        """
+        self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
+        self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
+
+    def __len__(self) -> int:
+        return sum(each.info.rows for each in self._shards)
+
+    def search(
+        self, queries: NDArray[np.float32], k: int, probes: int, rerank: int
+    ) -> tuple[Array, Ids]:
+        """Highest scalar products (Q, k) and ids (Q, k) of queries (Q, D), best first.
+
+        `probes` lists of every shard are scanned. The `rerank` best by code, over all shards, are
+        compared by their stored vectors. Where fewer are found: id -1 and product -inf.
+        """
+        queries = np.ascontiguousarray(queries, dtype=np.float32)
+        rotated = self.quantizers.rotated(queries)
+        lists, centre_scores = self.quantizers.nearest_lists(rotated, probes)
+        rerank = max(k, rerank)
+        scores = np.full((len(queries), 0), -np.inf, dtype=np.float32)
+        ids: Ids = np.empty((len(queries), 0), dtype=np.int64)
+        with one_thread():
+            for shard in self._shards:
+                found, rows = shard.scan(rotated, lists, centre_scores, rerank)
+                some = np.where(rows == NONE, NONE, rows + shard.info.base)
+                scores, ids = _highest(
+                    np.concatenate([scores, found], axis=1),
+                    np.concatenate([ids, some], axis=1),
+                    rerank,
+                )
+        return self._compared(queries, ids, k)
+
+    def vectors(self, ids: Ids) -> Array:
+        """Stored vectors (N, D) of ids (N,); zeros for ids that are in no shard."""
+        out = np.zeros((len(ids), self.quantizers.recipe.dims), dtype=np.float32)
+        for shard in self._shards:
+            rows = ids - shard.info.base
+            ours = np.flatnonzero((rows >= 0) & (rows < shard.info.rows))
+            if len(ours):
+                ours = ours[np.argsort(rows[ours], kind="stable")]
+                out[ours] = shard.vectors(rows[ours])
+        return out
+
+    def place_deg(self, number: int) -> tuple[float, float] | None:
+        """Latitude and longitude of an id; None where it is in no shard."""
+        for shard in self._shards:
+            if shard.info.base <= number < shard.info.base + shard.info.rows:
+                lat, lon = shard.places_deg[number - shard.info.base].tolist()
+                return lat, lon
+        return None
+
+    def _compared(self, queries: Array, ids: Ids, k: int) -> tuple[Array, Ids]:
+        """The k best of the candidates (Q, R) by their stored vectors; of equal ones the lower id
+        first."""
+        out_scores = np.full((len(queries), k), -np.inf, dtype=np.float32)
+        out_ids = np.full((len(queries), k), NONE, dtype=np.int64)
+        for query, candidates in enumerate(ids):
+            real = candidates[candidates != NONE]
+            scores = self.vectors(real) @ queries[query]
+            order = np.lexsort((real, -scores))[:k]
+            out_scores[query, : len(order)] = scores[order]
+            out_ids[query, : len(order)] = real[order]
+        return out_scores, out_ids
+
+
+def _highest(scores: Array, ids: Ids, count: int) -> tuple[Array, Ids]:
+    """The `count` highest of each row, in no order."""
+    if scores.shape[1] <= count:
+        return scores, ids
+    chosen = np.argpartition(scores, -count, axis=1)[:, -count:]
+    return np.take_along_axis(scores, chosen, axis=1), np.take_along_axis(ids, chosen, axis=1)

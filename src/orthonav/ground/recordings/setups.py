@@ -1,0 +1,213 @@
+"""Other configurations, tried on views that are not confident, to find the wrong value.
+
+A wrong heading, height, focal length or a mirrored image lowers the confidence of every view, and
+so does a map of another area. A few of the views of low confidence are localized again with one
+value changed at a time. The change that makes them confident names the value to check.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.recording import RecordedView
+from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.headings import seem_radians
+from orthonav.core.localize.localizer import Localizer
+from orthonav.core.localize.view import MAX_AGL_STD
+from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
+
+V = TypeVar("V", bound=RecordedView)
+FEW = 0.5
+"""Below this fraction of confident views the configuration may be wrong; a change that reaches it
+explains it."""
+SAMPLE = 8
+"""At most so many views are localized again."""
+_GIVE_UP = 4
+"""A change that makes none of so many views confident is left."""
+_RETRIED = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidence")
+"""Reasons of views without a position that another configuration may give one."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One change of the configuration. `changed` makes the view as it then is; `factor` is that of
+    the height, 1 where it stays."""
+
+    name: str
+    any_heading: bool = False
+    factor: float = 1.0
+    mirrored: bool = False
+    radians: bool = False
+    without_prior: bool = False
+
+    def changed(self, view: View) -> View:
+        """The view with this change."""
+        telemetry, camera, grey = view.telemetry, view.camera, view.grey
+        if self.radians:
+            telemetry = replace(telemetry, yaw_deg=math.degrees(telemetry.yaw_deg) % 360)
+        if self.factor != 1.0:
+            agl_m = self.factor * telemetry.agl_m
+            telemetry = replace(telemetry, agl_m=agl_m, agl_std_m=MAX_AGL_STD * agl_m)
+        if self.mirrored:
+            camera, grey = mirrored_camera(camera), np.ascontiguousarray(grey[:, ::-1])
+            telemetry = replace(telemetry, roll_deg=-telemetry.roll_deg)
+        return View(grey, camera, telemetry)
+
+
+AS_REPORTED = Setup("as reported")
+_ANY_HEADING = Setup("any heading", any_heading=True)
+_TWICE = Setup("twice the height", factor=2.0)
+_HALF = Setup("half the height", factor=0.5)
+_ORDER = (
+    Setup("headings in radians", radians=True),
+    _ANY_HEADING,
+    _TWICE,
+    _HALF,
+    Setup("mirrored", mirrored=True, any_heading=True),
+    Setup("four times the height", factor=4.0),
+    Setup("a quarter of the height", factor=0.25),
+    replace(_TWICE, name="any heading and twice the height", any_heading=True),
+    replace(_HALF, name="any heading and half the height", any_heading=True),
+    Setup("without the prior", without_prior=True),
+)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What a change did: `views` were localized again, `confident` of them are.
+
+    `heading_off_deg`, `heading_std_deg`: mean and standard deviation of the heading found, less the
+    reported one. `height_ratio`: median of the height found over the reported one. All three are
+    of the confident views, NaN without any.
+    """
+
+    setup: Setup
+    views: int
+    confident: int
+    heading_off_deg: float
+    heading_std_deg: float
+    height_ratio: float
+
+    @property
+    def explains(self) -> bool:
+        """Whether this change makes the views confident."""
+        return self.confident >= FEW * self.views and self.confident > 0
+
+
+class LowConfidenceViews:
+    """Some of the views of a flight that are not confident, spread evenly over them."""
+
+    def __init__(self, camera: Camera, corrected: Callable[[Telemetry], Telemetry]) -> None:
+        """`corrected`: what is known to be wrong with the telemetry is corrected by it."""
+        self._camera, self._corrected = camera, corrected
+        self._current: RecordedView | None = None
+        self._count, self._every = 0, 1
+        self.views: list[View] = []
+
+    def watching(self, views: Iterable[V]) -> Iterator[V]:
+        """The same views; the newest one is the one whose result `take` receives next."""
+        for view in views:
+            self._current = view
+            yield view
+
+    def take(self, result: ViewResult) -> None:
+        """Keep the view of this result if its confidence is low, and its turn."""
+        outcome = result.outcome
+        retried = isinstance(outcome, Fix) or outcome.reason in _RETRIED
+        if self._current is None or result.is_confident or not retried:
+            return
+        self._count += 1
+        if (self._count - 1) % self._every:
+            return
+        telemetry = self._corrected(self._current.telemetry)
+        if math.isfinite(telemetry.agl_m):
+            with suppress(FlightError):  # a track has a position without the image
+                self.views.append(View(self._current.grey(), self._camera, telemetry))
+        if len(self.views) > SAMPLE:
+            self.views = self.views[::2]
+            self._every *= 2
+
+
+def try_setups(
+    localizer: Localizer,
+    views: Sequence[View],
+    accepts: Callable[[Fix | NoFix], bool],
+    *,
+    use_prior: bool,
+    heading_known: bool,
+    tracked: bool = False,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[Tried]:
+    """What each change of the configuration does to the views, in the order of the trials.
+
+    `stop` is asked before each view and ends the search: the last change may then have been tried
+    on fewer views, and may be missing. `accepts` says whether an outcome is confident. The first
+    change that explains it ends the search; at most ten are tried, each on at most `SAMPLE` views.
+    `tracked`: the views were judged as a track, so they are first placed one by one as reported.
+    """
+    setups = [
+        setup
+        for setup in ((AS_REPORTED, *_ORDER) if tracked else _ORDER)
+        if _makes_sense(setup, views, use_prior=use_prior, heading_known=heading_known)
+    ]
+    found: list[Tried] = []
+    for number, setup in enumerate(setups):
+        fixes: list[tuple[View, Fix]] = []
+        placed = 0
+        for i, view in enumerate(views):
+            progress((number + i / len(views)) / len(setups))
+            if stop() or (i == _GIVE_UP and not fixes):
+                break
+            placed += 1
+            outcome = localizer.locate(
+                setup.changed(view),
+                prior=view.telemetry.prior if use_prior and not setup.without_prior else None,
+                heading_known=heading_known and not setup.any_heading,
+            )
+            if isinstance(outcome, Fix) and accepts(outcome):
+                fixes.append((view, outcome))
+        if placed:
+            found.append(_tried(setup, placed if stop() else len(views), fixes))
+        if stop() or found[-1].explains:
+            break
+    progress(1.0)
+    return found
+
+
+def mirrored_camera(camera: Camera) -> Camera:
+    """The camera of the images mirrored left to right."""
+    lens = camera.distortion
+    if camera.model == "brown" and lens:
+        lens = (*lens[:3], -lens[3], *lens[4:])  # p2 is the tangential part along x
+    return replace(camera, cx_px=camera.width_px - camera.cx_px, distortion=lens)
+
+
+def _makes_sense(
+    setup: Setup, views: Sequence[View], *, use_prior: bool, heading_known: bool
+) -> bool:
+    if setup.radians:
+        return heading_known and seem_radians([view.telemetry.yaw_deg for view in views])
+    if setup.without_prior:
+        return use_prior and any(view.telemetry.prior is not None for view in views)
+    # With an unknown heading each of these is the same as another one.
+    only_heading = setup.any_heading and not setup.mirrored
+    return heading_known or not only_heading
+
+
+def _tried(setup: Setup, views: int, fixes: list[tuple[View, Fix]]) -> Tried:
+    off = np.array([fix.heading_deg - view.telemetry.yaw_deg for view, fix in fixes])
+    ratios = [fix.agl_m / view.telemetry.agl_m for view, fix in fixes]
+    mean, std = math.nan, math.nan
+    if len(off) and np.isfinite(off).all():
+        # Circular mean and standard deviation; Mardia and Jupp, Directional statistics, 2.3.
+        vector = complex(np.exp(1j * np.radians(off)).mean())
+        mean = math.degrees(math.atan2(vector.imag, vector.real))
+        std = math.degrees(math.sqrt(-2 * math.log(min(max(abs(vector), 1e-12), 1.0))))
+    ratio = float(np.median(ratios)) if ratios else math.nan
+    return Tried(setup, views, len(fixes), mean, std, ratio)

@@ -1,0 +1,262 @@
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
+from lab.landscape.__main__ import main
+from lab.landscape.network import Network
+from lab.landscape.noise import fractal_grid, key_of, noise_at, noise_grid, white_grid
+from lab.landscape.relief import lighting
+from lab.landscape.window import PixelWindow
+from numpy.typing import NDArray
+
+from orthonav.core.errors import AreaError
+
+SUMMER, AUTUMN, SPRING = DEFAULT_DATES
+WEST_M, NORTH_M = ORIGIN_M[0] + 600.0, ORIGIN_M[1] + 1500.0
+
+
+def worst_difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[int, float]:
+    """Largest difference in grey levels, and the share of values that differ at all."""
+    difference = np.abs(a.astype(int) - b.astype(int))
+    return int(difference.max()), float((difference > 0).mean())
+
+
+def oriented_gradients(image: NDArray[np.uint8]) -> NDArray[np.complex64]:
+    grey = cv2.GaussianBlur(image.astype(np.float32).mean(axis=2), (0, 0), 1.5)
+    gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    size = np.abs(gradient)
+    turned = gradient**2 / np.maximum(size**2, 1e-9)
+    return (turned * size / (size + np.median(size))).astype(np.complex64)
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    land = Landscape(1)
+    return (
+        land.render(SUMMER, WEST_M, NORTH_M, 400, 360, 1.0),
+        land.render(AUTUMN, WEST_M, NORTH_M, 400, 360, 1.0),
+    )
+
+
+def test_same_seed_same_pixels_in_any_order_of_rendering(pair):
+    land = Landscape(1)
+    land.render(AUTUMN, WEST_M + 9000.0, NORTH_M, 16, 16, 1.0)
+    again = land.render(SUMMER, WEST_M, NORTH_M, 400, 360, 1.0)
+    assert again.dtype == np.uint8
+    assert again.shape == (360, 400, 3)
+    assert np.array_equal(again, pair[0])
+
+
+def test_other_seed_other_land(pair):
+    other = Landscape(2).render(SUMMER, WEST_M, NORTH_M, 400, 360, 1.0)
+    assert np.abs(other.astype(int) - pair[0]).mean() > 15
+
+
+@pytest.mark.parametrize(
+    ("gsd_m", "date", "corner_m"),
+    [
+        (1.0, AUTUMN, (WEST_M, NORTH_M)),
+        pytest.param(0.3, SUMMER, (WEST_M + 700.1, NORTH_M + 0.25), marks=pytest.mark.slow),
+        pytest.param(0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7), marks=pytest.mark.slow),
+        (3.0, SPRING, (WEST_M - 500.0, NORTH_M + 300.0)),
+    ],
+)
+def test_quarters_meet_without_seam(gsd_m, date, corner_m):
+    land = Landscape(1)
+    west_m, north_m = corner_m
+    shape = (201, 170) if gsd_m < 2.0 else (101, 90)
+    split = (90, 71) if gsd_m < 2.0 else (40, 31)
+    whole = land.render(date, west_m, north_m, *shape, gsd_m)
+    joined, other = np.empty_like(whole), Landscape(1)
+    for col, width in ((0, split[0]), (split[0], shape[0] - split[0])):
+        for row, height in ((0, split[1]), (split[1], shape[1] - split[1])):
+            joined[row : row + height, col : col + width] = other.render(
+                date, west_m + col * gsd_m, north_m - row * gsd_m, width, height, gsd_m
+            )
+    largest, share = worst_difference(whole, joined)
+    assert largest <= 2
+    assert share < 1e-3
+
+
+def test_large_window_is_the_same_as_a_small_one(pair):
+    large = Landscape(1).render(SUMMER, WEST_M - 200.0, NORTH_M + 10.0, 600, 380, 1.0)
+    largest, share = worst_difference(large[10:370, 200:600], pair[0])
+    assert largest <= 2
+    assert share < 1e-3
+
+
+@pytest.mark.slow  # how the generated ground looks
+def test_coarse_picture_shows_the_same_ground(pair):
+    coarse = Landscape(1).render(SUMMER, WEST_M, NORTH_M, 100, 90, 4.0)
+    shrunk = cv2.resize(pair[0], (100, 90), interpolation=cv2.INTER_AREA)
+    assert np.corrcoef(coarse.ravel(), shrunk.ravel())[0, 1] > 0.97
+
+
+def test_dates_differ_but_edges_stay_in_place(pair):
+    summer, autumn = pair
+    assert np.abs(summer.astype(int) - autumn).mean() > 15
+    a, b = oriented_gradients(summer), oriented_gradients(autumn)
+    correlation = np.fft.ifft2(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real
+    row, col = np.unravel_index(correlation.argmax(), correlation.shape)
+    assert min(row, 360 - row) <= 1
+    assert min(col, 400 - col) <= 1
+
+
+@pytest.mark.parametrize("gsd_m", [0.5, 1.0])
+@pytest.mark.parametrize("date", DEFAULT_DATES)
+def test_shadow_lies_away_from_the_sun_and_is_as_long_as_it_should_be(date, gsd_m):
+    size, height_m = int(120 / gsd_m), 12.0
+    window = PixelWindow.at(0.0, 0.0, size, size, gsd_m)
+    height = np.zeros((size, size), np.float32)
+    post = slice(size // 2 - 2, size // 2 + 2)
+    height[post, post] = height_m
+    dark = lighting(height, np.zeros((size, size), np.uint8), window, date) < 0.5
+    dark[post, post] = False
+    rows, cols = np.nonzero(dark)
+    east_m, north_m = (cols + 0.5 - size / 2) * gsd_m, (size / 2 - rows - 0.5) * gsd_m
+    length_m = np.hypot(east_m, north_m).max()
+    expected_m = height_m / np.tan(np.deg2rad(date.sun_elevation_deg))
+    assert abs(length_m - expected_m) < 2.0 + 3.0 * gsd_m
+    bearing_deg = np.rad2deg(np.arctan2(east_m.mean(), north_m.mean()))
+    assert abs((bearing_deg - date.sun_azimuth_deg) % 360.0 - 180.0) < 6.0
+
+
+@pytest.mark.slow  # how the generated ground looks
+def test_more_years_more_change():
+    land = Landscape(3)
+    cells = land._network.cells_near((0.0, 0.0, 700.0, 700.0))
+    plans = [land._plan(cell) for cell in cells]
+
+    def gone(time: float) -> int:
+        return sum(line.gone_year <= time for plan in plans for line in plan.lines)
+
+    assert 0 < gone(2012.0) < gone(2016.0) < gone(2021.0)
+    total = sum(len(plan.lines) for plan in plans)
+    assert gone(2021.0) - gone(2016.0) < 0.1 * total
+    born = np.concatenate([plan.buildings.born_year for plan in plans])
+    assert 0.0 < np.mean((born > 2016.5) & (born < 2021.8)) < 0.1
+
+
+@pytest.mark.slow  # how the generated ground looks
+def test_warp_never_folds():
+    network = Network(5)
+    grid = np.stack(np.meshgrid(np.arange(0, 6000.0, 15.0), np.arange(0, 6000.0, 15.0)), axis=2)
+    bent = network.warp(grid.reshape(-1, 2)).reshape(grid.shape)
+    east, north = np.diff(bent, axis=1)[:-1], np.diff(bent, axis=0)[:, :-1]
+    area = east[..., 0] * north[..., 1] - east[..., 1] * north[..., 0]
+    assert area.min() > 0.15 * 15.0**2
+
+
+def test_noise_on_a_grid_is_noise_at_its_points():
+    east, north = np.arange(-50.0, 70.0, 7.3), np.arange(900.0, 800.0, -6.1)
+    x, y = np.meshgrid(east, north)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    one_by_one = noise_at(key_of("test"), points, 23.0).reshape(x.shape)
+    np.testing.assert_allclose(noise_grid(key_of("test"), east, north, 23.0), one_by_one, atol=1e-5)
+
+
+@pytest.mark.parametrize("gsd_m", [0.2, 0.3, 0.7, 1.3])
+def test_octaves_at_the_edge_of_resolution_do_not_hang_on_the_window(gsd_m):
+    columns = np.arange(1285, 2100)
+    east_m, north_m = (columns + 0.5) * gsd_m + 0.50001, np.array([3.0, 2.0])
+    octaves = (4.0 * gsd_m, 2.0 * gsd_m)
+    whole = fractal_grid(key_of("edge"), east_m, north_m, octaves)
+    for start in range(1, 800, 57):
+        part = fractal_grid(key_of("edge"), east_m[start:], north_m, octaves)
+        np.testing.assert_allclose(part, whole[:, start:], atol=1e-5)
+
+
+def test_noise_has_the_promised_spread():
+    east = np.arange(0.0, 3000.0, 5.0)
+    assert 0.25 < fractal_grid(key_of("spread"), east, east, (40.0, 20.0), 0.8).std() < 0.8
+    pixels = np.arange(-300, 300)
+    white = white_grid(key_of("white"), pixels, pixels)
+    assert abs(white.mean()) < 0.02
+    assert abs(white.std() - 1.0) < 0.02
+    assert abs(np.mean(white[1:] * white[:-1])) < 0.02
+
+
+@pytest.mark.long
+def test_geotiff_has_position_and_date(tmp_path: Path):
+    import rasterio
+
+    seen: list[float] = []
+    paths = generate_area(
+        tmp_path / "area",
+        size_m=(250.0, 150.0),
+        gsd_m=2.0,
+        dates=DEFAULT_DATES[:2],
+        progress=seen.append,
+    )
+    assert [path.name for path in paths] == ["2016-07.tif", "2021-10.tif"]
+    assert sorted(tmp_path.glob("area/*")) == sorted(paths)  # nothing temporary left
+    assert seen == sorted(seen)
+    assert (seen[0], seen[-1]) == (0.0, 1.0)
+    with rasterio.open(paths[0]) as image:
+        assert image.crs.to_epsg() == 2154
+        assert (image.width, image.height, image.count) == (125, 75, 3)
+        assert image.dtypes == ("uint8",) * 3
+        assert image.transform.a == 2.0
+        assert image.bounds == (652000.0, 6862000.0, 652250.0, 6862150.0)
+        assert image.tags()["TIFFTAG_DATETIME"] == "2016:07:12 12:00:00"
+        assert [band.name for band in image.colorinterp] == ["red", "green", "blue"]
+        assert image.profile["compress"] == "deflate"
+        pixels = np.moveaxis(image.read(), 0, 2)
+    assert np.array_equal(pixels, Landscape(1).render(SUMMER, 652000.0, 6862150.0, 125, 75, 2.0))
+
+
+def test_the_command_writes_three_dates(tmp_path: Path, capsys):
+    out = tmp_path / "area"
+    main(["--out", str(out), "--size-m", "120", "100", "--gsd-m", "2"])
+    printed = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert sorted(printed) == sorted(out.iterdir()) and len(printed) == 3
+    with pytest.raises(SystemExit, match="error: size_m must be"):
+        main(["--out", str(tmp_path / "no"), "--size-m", "-5", "5"])
+    assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"size_m": (0.0, 100.0)},
+        {"size_m": (100.0, -1.0)},
+        {"size_m": (float("nan"), 100.0)},
+        {"size_m": (float("inf"), 100.0)},
+        {"gsd_m": 0.1},
+        {"gsd_m": 11.0},
+        {"gsd_m": float("nan")},
+        {"dates": []},
+        {"dates": [SUMMER, SUMMER]},
+        {"seed": -1},
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_written(tmp_path: Path, bad):
+    with pytest.raises(AreaError):
+        generate_area(tmp_path / "area", **bad)
+    assert not (tmp_path / "area").exists()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"name": "a/b"}, {"name": ""}, {"month": 13}, {"sun_elevation_deg": 3.0}, {"haze": 1.0}],
+)
+def test_epoch_refuses_what_no_photograph_can_have(bad):
+    with pytest.raises(ValueError, match="epoch"):
+        replace(SUMMER, **bad)
+
+
+@pytest.mark.slow  # how the generated ground looks
+def test_low_sun_leaves_no_seam():
+    low = replace(AUTUMN, sun_elevation_deg=16.0)
+    whole = Landscape(1).render(low, ORIGIN_M[0] + 1650.0, NORTH_M, 200, 200, 1.0)
+    right = Landscape(1).render(low, ORIGIN_M[0] + 1750.0, NORTH_M, 100, 200, 1.0)
+    assert worst_difference(whole[:, 100:], right)[0] <= 2
+
+
+@pytest.mark.parametrize("bad", [(0, 10, 1.0), (10, 0, 1.0), (10, 10, 0.0), (10, 10, 50.0)])
+def test_render_refuses_impossible_windows(bad):
+    with pytest.raises(AreaError):
+        Landscape(1).render(SUMMER, WEST_M, NORTH_M, *bad)

@@ -1,0 +1,126 @@
+"""Calibration of a mount from a track, and correction of telemetry with it."""
+
+import math
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.mount import Bias, Mount
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.track import Model
+from orthonav.ground.recordings.calibrate_mount import calibrate_mount
+from orthonav.onboard.run import MountCorrected, model_of
+
+CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)
+TRUE = {"heading_bias": 4.0, "log_scale_bias": -0.1, "pitch_bias": 6.0, "roll_bias": -1.0}
+SCATTER = {"heading_bias": 1.5, "log_scale_bias": 0.02, "pitch_bias": 0.4, "roll_bias": 0.4}
+
+
+def view(number, values, confidence=0.99, std=0.5):
+    evidence = {}
+    for name, value in values.items():
+        unit = "" if name == "log_scale_bias" else "_deg"
+        evidence[f"{name}{unit}"] = value
+        evidence[f"{name}_std{unit}"] = std * (0.01 if name == "log_scale_bias" else 1.0)
+    fix = Fix(48.0, 2.0, np.eye(2), confidence, 35.0, 0.0, 100.0, MappingProxyType(evidence))
+    return ViewResult(f"{number:03d}.jpg", number * 10**9, fix, 50.0, "tracking")
+
+
+def flight(count=40, seed=0, true=TRUE, first=0):
+    rng = np.random.default_rng(seed)
+    return [
+        view(first + n, {name: true[name] + rng.normal(0, SCATTER[name]) for name in TRUE})
+        for n in range(count)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_biases_are_estimated(seed):
+    found = calibrate_mount(flight(seed=seed))
+    mount = found.mount
+    assert mount.heading_deg.value == pytest.approx(4.0, abs=3 * mount.heading_deg.std)
+    assert mount.log_scale.value == pytest.approx(-0.1, abs=3 * mount.log_scale.std)
+    assert mount.pitch_deg.value == pytest.approx(6.0, abs=0.4)
+    assert mount.heading_deg.scatter == pytest.approx(1.5, rel=0.5)
+    assert (mount.views, found.first, found.last, found.moved) == (40, "000.jpg", "039.jpg", False)
+
+
+def test_more_views_give_a_smaller_standard_deviation():
+    few, many = (calibrate_mount(flight(count)).mount.heading_deg.std for count in (6, 200))
+    assert many < few and many >= 0.2
+
+
+def test_correlated_errors_give_a_larger_standard_deviation():
+    rng = np.random.default_rng(1)
+    slow = np.repeat(rng.normal(0, 1.5, 8), 10)
+    lasting = [view(n, {**TRUE, "heading_bias": 4 + slow[n]}) for n in range(80)]
+    independent = [view(n, {**TRUE, "heading_bias": 4 + rng.normal(0, 3.0)}) for n in range(80)]
+    stds = [calibrate_mount(each).mount.heading_deg.std for each in (lasting, independent)]
+    assert stds[0] / 1.5 > 1.5 * stds[1] / 3.0
+
+
+def test_outliers_do_not_change_the_biases():
+    results = flight(30)
+    results[7] = view(7, {**TRUE, "heading_bias": 120.0})
+    assert calibrate_mount(results).mount.heading_deg.value == pytest.approx(4.0, abs=1.0)
+
+
+def test_only_confident_views_are_used():
+    doubtful = [view(n, {**TRUE, "pitch_bias": 20.0}, confidence=0.5) for n in range(30)]
+    missing = [ViewResult("x.jpg", 0, NoFix("blank", "it is blank"), 1.0, "lost")]
+    found = calibrate_mount(doubtful + flight(10, first=30) + missing)
+    assert found.mount.views == 10 and found.mount.pitch_deg.value == pytest.approx(6.0, abs=0.5)
+    with pytest.raises(FlightError, match="4 of 35 views"):
+        calibrate_mount(doubtful + flight(4) + missing)
+
+
+def test_a_moved_mount_is_that_at_the_end():
+    before = flight(20, true={**TRUE, "pitch_bias": -3.0})
+    found = calibrate_mount(before + flight(20, seed=1, first=20))
+    assert found.moved and found.first == "020.jpg"
+    assert found.mount.pitch_deg.value == pytest.approx(6.0, abs=0.5)
+
+
+class VehicleState:
+    """A locator that records the telemetry of its views."""
+
+    state_name = "tracking"
+
+    def __init__(self):
+        self.telemetry = []
+
+    def locate(self, view):
+        self.telemetry.append(view.telemetry)
+        return NoFix("test", "nothing was looked at")
+
+    def passed(self, telemetry, reason):
+        self.telemetry.append(telemetry)
+        return reason
+
+
+MOUNT = Mount(
+    Bias(4.0, 0.5, 1.0), Bias(0.1, 0.01, 0.02), Bias(6.5, 0.8, 0.7), Bias(-1.0, 0.4, 0.5), 17
+)
+
+
+def test_a_mount_corrected_locator_gets_corrected_telemetry():
+    locator = VehicleState()
+    mounted, telemetry = MountCorrected(locator, MOUNT), Telemetry(0, 10.0, 0.0, 1.0, 100.0)
+    mounted.locate(View(np.zeros((4, 4), np.uint8), CAMERA, telemetry))
+    reason = NoFix("bad_image", "it is broken")
+    assert mounted.passed(telemetry, reason) is reason
+    assert [(t.yaw_deg, t.pitch_deg, t.roll_deg) for t in locator.telemetry] == [
+        (14.0, 6.5, 0.0)
+    ] * 2
+    assert mounted.state_name == "tracking"
+
+
+def test_the_model_has_the_deviations_of_the_mount():
+    model = model_of(MOUNT)
+    assert model.tilt_rad == pytest.approx(math.radians(0.8))
+    assert model.heading_rad == pytest.approx(math.radians(1.0))
+    assert model.log_scale == 0.02 and model.accel_mps2 == Model().accel_mps2
+    assert model.off_mount == 0.0
