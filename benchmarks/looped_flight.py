@@ -15,7 +15,7 @@ import orthonav.ground.simulate as simulate
 from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import FLIGHT_SEED, Workplace
 from orthonav.core.flight import read_truth
-from orthonav.core.geo import camera, lens
+from orthonav.core.geo import camera
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.planning.route import Route
@@ -101,7 +101,7 @@ def _sources() -> bytes:
     """Digest of what makes the pictures."""
     digest = hashlib.sha256()
     paths = sorted(Path(str(simulate.__file__)).parent.glob("*.py"))
-    for path in [*paths, Path(camera.__file__), Path(lens.__file__)]:
+    for path in [*paths, Path(camera.__file__)]:
         digest.update(path.read_bytes())
     return digest.digest()
 

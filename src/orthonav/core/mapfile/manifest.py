@@ -316,7 +316,7 @@ def _fields(record: type, plain: Any) -> dict[str, Any]:
     found = {}
     for each in fields(record):
         kind: Any = each.type
-        value = _number(plain, each.name) if kind is float else _get(plain, each.name, kind)
+        value: Any = _number(plain, each.name) if kind is float else _get(plain, each.name, kind)
         found[each.name] = value[:MAX_NAME] if kind is str else value
     return found
 
