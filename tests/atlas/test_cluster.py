@@ -17,8 +17,6 @@ from orthonav.core.errors import MissingExtraError, WorkerError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.sheets import WorldSheets
 
 SMALL = {
     "sheet_km": 0.3,
@@ -52,14 +50,6 @@ def content(place):
     """All files of an atlas by name."""
     paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
     return {str(path.relative_to(place)): path.read_bytes() for path in paths}
-
-
-def two_sheets(ortho):
-    """Bounds of two neighbouring sheets in the middle of the orthophoto."""
-    lattice = WorldSheets(1000 * SMALL["sheet_km"])
-    name = lattice.name_at(*Mosaic.open([ortho]).outline_latlon_deg.mean(axis=0))
-    west, south, east, north = lattice.bounds_deg(name)
-    return west + 1e-6, south + 1e-6, east + (east - west) / 2, north - 1e-6
 
 
 def plain(place, ortho, recipe, bounds_deg=None):
@@ -137,20 +127,6 @@ def fake_ray(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray.util", SimpleNamespace())
     monkeypatch.setitem(sys.modules, "ray.util.scheduling_strategies", strategies)
     return made
-
-
-@pytest.mark.long
-def test_an_atlas_built_by_tasks_of_ray_is_the_same(fake_ray, ortho, tmp_path):
-    bounds_deg = two_sheets(ortho)
-    alone = plain(tmp_path / "alone", ortho, SMALL, bounds_deg)
-    before = signal.getsignal(signal.SIGTERM)
-    with RayRunner(workers=2) as runner:
-        assert signal.getsignal(signal.SIGTERM) is before
-        request = AtlasRequest(str(tmp_path / "shared"), [ortho], SMALL, bounds_deg, index=False)
-        shared = build_atlas(request, runner)
-    assert len(shared.names("built")) == 2 and shared.names("built") == alone.names("built")
-    assert content(tmp_path / "shared") == content(tmp_path / "alone")
-    assert not fake_ray.is_initialized()
 
 
 def test_tasks_of_ray_fail_by_themselves_and_are_stopped_at_the_end(fake_ray):
