@@ -12,19 +12,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from test_atlas_build import SMALL, content, made
 
 from orthonav.core.errors import MissingExtraError, WorkerError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
+from orthonav.ground.atlas.cluster import Failure, RayRunner, attempted
 
-SMALL = {
-    "sheet_km": 0.3,
-    "tile_px": 64,
-    "overlap": 0.5,
-    "calibration_views": 1,
-    "coarse": {"gsd_m": 4.0, "tile_px": 32, "overlap": 0.5},
-}
 LONGER = {**SMALL, "calibration_views": 96}
 """A sheet takes about a second."""
 START_S, END_S = 60.0, 240.0
@@ -38,24 +32,6 @@ def ray():
     logging.getLogger("ray").setLevel(logging.ERROR)
     yield ray
     ray.shutdown()
-
-
-@pytest.fixture(scope="module")
-def ortho(make_ortho, tmp_path_factory):
-    """An orthophoto of 400 x 400 m at 1 m, all valid."""
-    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
-
-
-def content(place):
-    """All files of an atlas by name."""
-    paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
-    return {str(path.relative_to(place)): path.read_bytes() for path in paths}
-
-
-def plain(place, ortho, recipe, bounds_deg=None):
-    with SerialRunner() as runner:
-        request = AtlasRequest(str(place), [ortho], recipe, bounds_deg, index=False)
-        return build_atlas(request, runner)
 
 
 class DiedError(Exception):
@@ -189,7 +165,7 @@ def two_nodes(ray):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_sheets_of_killed_workers_are_built_again(two_nodes, ortho, tmp_path):
-    alone = plain(tmp_path / "alone", ortho, LONGER)
+    alone = made(tmp_path / "alone", ortho, recipe=LONGER)
     killed = []
 
     def progress(stage, share):
@@ -234,7 +210,7 @@ def test_a_killed_driver_resumes_when_run_again(two_nodes, ortho, tmp_path, with
     )
     assert again.returncode == 0, again.stderr
     assert f"{8 - there} built, {there} unchanged" in again.stdout or there < 7
-    plain(tmp_path / "alone", ortho, LONGER)
+    made(tmp_path / "alone", ortho, recipe=LONGER)
     assert content(place) == content(tmp_path / "alone")
 
 
