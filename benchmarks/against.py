@@ -1,50 +1,65 @@
-"""Views placed by this checkout and by another one, in turn, in one run: speed and verdicts.
+"""This checkout against another one: accuracy, confidence, time and memory of the same views.
 
-`python -m benchmarks.against OTHER [--views N] [--rounds N] [--only WORDS ..] [--work DIR] [--out
-DIR]`. OTHER is a checkout of an earlier commit. Both place the same views on the same maps, which
-are built once by OTHER; imagery beside the checkout that is absent is left out. Times are of the
-processor, so that other work on the machine counts little.
+`python -m benchmarks.against OTHER [--views N] [--rounds N] [--only TEXT ..] [--work DIR]`. OTHER
+is a checkout of any commit that has `orthonav localize`. Both localize the same flights on the same
+maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes that
+they write. Imagery beside the checkout that is absent is left out.
 """
 
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
+import cv2
 import numpy as np
-import rasterio
 
-from benchmarks.inputs import DATA, FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace
-from benchmarks.placing import BOTH, Task
-from benchmarks.record import Section, Table, git, number, provenance, save
-from benchmarks.verdicts import Verdict, from_placed, percent
+from benchmarks.record import Section, Table, git, number, percent, run, say
+from benchmarks.scenes import (
+    PAST,
+    PRESENT,
+    SCENES,
+    WIDE,
+    agl_of,
+    area,
+    far_m,
+    flight,
+    gsd_of,
+    is_there,
+    ortho,
+)
+from orthonav.core.flight import read_truth
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
+NAME = "against"
 ROOT = Path(__file__).resolve().parents[1]
 HERE, THERE = "here", "other"
+SEED = 7
+LAUNCHER = """
+import json, resource, subprocess, sys
+code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e6]))
+sys.exit(code)
+"""
+"""A process remembers the memory of the one that starts it, so that is a small one."""
 HEADER = (
-    *("map", "views", "n", "ms", "other", "times faster", "p90 ms", "other", "p99 ms", "other"),
-    *("right", "other", "accepted", "other", "wrong accepted", "other", "peak MB", "other"),
+    *("map", "views", "n", "CPU ms", "other", "times faster", "ms", "other", "p99 ms", "other"),
+    *("correct", "other", "accepted", "other", "false", "other", "peak MB", "other"),
 )
 
 
 @dataclass(frozen=True)
 class Case:
-    """Views over a map.
-
-    - `map`, `views`: orthophotos below `DATA`; or a generated square, by its side in km.
-    - `width_px`: shorter side of a view on the ground, pixels of the map.
-    - `heading_known`; `prior_px`: standard deviation of a prior, pixels of the map; None: none.
-    """
+    """Views over a map: `map` and `views` are names of orthophotos, or sides of generated squares
+    in metres; `prior_px`: standard deviation of a prior, pixels of the map."""
 
     map: str
     views: str
@@ -53,191 +68,173 @@ class Case:
     prior_px: float | None = None
 
     @property
-    def words(self) -> str:
-        """Width of its views, knowledge of heading and prior."""
+    def name(self) -> str:
         heading = "heading to 10 deg" if self.heading_known else "heading unknown"
         prior = "" if self.prior_px is None else f", prior to {self.prior_px:g} px"
-        return f"{self.width_px} px, {heading}{prior}"
-
-    @property
-    def name(self) -> str:
-        """Its map and its views."""
-        return f"{self.map}: {self.words}"
+        return f"{self.map}: {self.width_px} px, {heading}{prior}"
 
 
-NAIP = "naip_nd/20090818.tif", "naip_nd/20180716.tif"
-MOSAIC = "airchange/szada_mosaic_a.tif", "airchange/szada_mosaic_b.tif"
-SCHIPHOL = "scenes/schiphol/2004_05.tif", "scenes/schiphol/2018_04.tif"
-CASES = (
-    Case("2 km", "2 km"),
-    Case("2 km", "2 km", heading_known=False),
-    Case("2 km", "2 km", 128),
-    Case("2 km", "2 km", 128, prior_px=40.0),
-    Case(*NAIP),
-    Case(*NAIP, heading_known=False),
-    Case(*NAIP, 128),
-    Case(*MOSAIC),
-    Case(*MOSAIC, 128),
-    Case(*SCHIPHOL),
-    Case(*SCHIPHOL, 128),
-    Case("4 km", "2 km"),
-    Case("4 km", "2 km", heading_known=False),
-    Case("10 km", "2 km"),
-    Case("10 km", "2 km", heading_known=False),
-)
+def cases() -> Iterator[Case]:
+    yield Case("2000", "2000")
+    yield Case("2000", "2000", heading_known=False)
+    yield Case("2000", "2000", 128)
+    yield Case("2000", "2000", 128, prior_px=40.0)
+    naip = SCENES["naip"].pair("20090818", "20180716")
+    yield Case(naip.map, naip.views)
+    yield Case(naip.map, naip.views, heading_known=False)
+    yield Case(naip.map, naip.views, 128)
+    mosaic = SCENES["szada_mosaic"].pair("szada_mosaic_a", "szada_mosaic_b")
+    schiphol = SCENES["schiphol"].pair("2004_05", "2018_04")
+    for pair in (mosaic, schiphol):
+        yield Case(pair.map, pair.views)
+        yield Case(pair.map, pair.views, 128)
+    for side_m in ("4000", "10000"):
+        yield Case(side_m, "2000")
+        yield Case(side_m, "2000", heading_known=False)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Place all views, print and write; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.against", description=str(__doc__).splitlines()[0]
-    )
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """A checkout, and what it made of the views of a case: rows of error (m) and confidence, clock
+    times (ms), processor times of a view by round (ms), largest memory."""
+
+    root: Path
+    rows: list[tuple[float, float]] = field(default_factory=list)
+    clock_ms: list[float] = field(default_factory=list)
+    cpu_ms: list[float] = field(default_factory=list)
+    peak_mb: float = 0.0
+
+    def orthonav(self, *arguments: str) -> tuple[float, float]:
+        """Run a command of this checkout; processor seconds and largest memory (MB) it took."""
+        environment = {**os.environ, "PYTHONPATH": str(self.root / "src")}
+        command = [sys.executable, "-c", LAUNCHER, sys.executable, "-m", "orthonav", *arguments]
+        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=False)
+        if done.returncode:
+            raise RuntimeError(f"{self.root}: orthonav {' '.join(arguments)} failed")
+        cpu_s, peak_mb = json.loads(done.stdout)
+        return cpu_s, peak_mb
+
+    def localized(self, case: Case, map_path: Path, folder: Path, out: Path) -> "Tree":
+        """With another round over a flight."""
+        heading = "known" if case.heading_known else "unknown"
+        prior = "none" if case.prior_px is None else "telemetry"
+        more = ["--heading", heading, "--prior", prior, "--out", str(out), "--quiet"]
+        start_s, _ = self.orthonav("localize", str(map_path), str(_blank(folder)), *more)
+        whole_s, peak_mb = self.orthonav("localize", str(map_path), str(folder), *more)
+        fixes = [json.loads(line) for line in out.read_text(encoding="ascii").splitlines()]
+        truth = read_truth(folder / "truth.csv")
+        rows = [_row_of(each, truth[each["frame"]]) for each in fixes]
+        cpu_ms = 1e3 * (whole_s - start_s) / len(fixes)
+        clock_ms = [each["latency_ms"] for each in fixes[1:]]
+        return replace(
+            self,
+            rows=rows,
+            clock_ms=self.clock_ms + clock_ms,
+            cpu_ms=[*self.cpu_ms, cpu_ms],
+            peak_mb=max(self.peak_mb, peak_mb),
+        )
+
+
+def _blank(folder: Path) -> Path:
+    """The same flight with one blank view: what starting and opening take."""
+    out = folder.with_name(f"{folder.name}-blank")
+    if not out.is_dir():
+        (out / "frames").mkdir(parents=True)
+        header, first = (folder / "telemetry.csv").read_text(encoding="utf-8").splitlines()[:2]
+        (out / "telemetry.csv").write_text(f"{header}\n{first}\n", encoding="utf-8")
+        name = first.split(",")[0]
+        grey = cv2.imread(str(folder / "frames" / name))
+        cv2.imwrite(str(out / "frames" / name), np.full_like(grey, 128))
+        shutil.copyfile(folder / "flight.json", out / "flight.json")
+    return out
+
+
+def _row_of(fix: dict[str, Any], truth: tuple[float, float]) -> tuple[float, float]:
+    if fix["status"] != "fix":
+        return float("inf"), 0.0
+    off = LocalFrame(*truth).en_from_latlon(fix["lat_deg"], fix["lon_deg"])
+    return float(np.hypot(*off)), float(fix["confidence"])
+
+
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("other", type=Path, help="checkout of another commit")
     parser.add_argument("--views", type=int, default=100, help="views per row")
-    parser.add_argument("--rounds", type=int, default=2, help="times that both place them")
-    parser.add_argument("--only", nargs="+", default=[], help="rows that contain one of these")
-    parser.add_argument("--work", type=Path, default=Path("against_work"), metavar="DIR")
-    parser.add_argument("--out", type=Path, default=Path("bench_results"), metavar="DIR")
-    options = parser.parse_args(arguments)
-    if not (options.other / "src" / "orthonav").is_dir():
-        parser.error(f"not a checkout of orthonav: {options.other}")
-    start, started = time.perf_counter(), provenance("against")
-    options.work.mkdir(parents=True, exist_ok=True)
-    section = Section("Against another commit")
+    parser.add_argument("--rounds", type=int, default=2, help="times that both localize them")
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="rows that contain one of these")
+
+
+def measure(options: argparse.Namespace) -> Section:
     rows = []
-    for case in _wanted(options.only):
-        rows.append(_row(section, case, options))
-        print(Table(section.title, HEADER, rows[-1:], ()).markdown(), file=sys.stderr, flush=True)
+    for case in cases():
+        if options.only and not any(text in case.name for text in options.only):
+            continue
+        if case.map.endswith(".tif") and not is_there(case.map, case.views):
+            continue
+        rows.append(_row(case, options))
+        say(" | ".join(rows[-1]))
     commit = git("-C", str(options.other), "describe", "--always", "--dirty")
     notes = (
-        f"other: commit {commit}; {options.rounds} rounds in turn, the least time "
-        "of each view; processor time of one core; height known to 10 %; right: within 35 m or "
-        f"10 px; accepted: of the right ones, confidence at least {CONFIDENT:g}",
+        f"other: commit {commit}; CPU ms: processor time of a view, less that of a blank one, "
+        f"least of {options.rounds} rounds in turn; ms, p99: on the clock, by the "
+        "fixes; peak: of the process; height known to 10 %",
+        f"correct: within 35 m or 10 px; accepted: of these, confidence of {CONFIDENT:g} or more",
     )
-    section.tables = [Table("Against another commit", HEADER, rows, notes)]
-    print(section.markdown())
-    for path in save(
-        options.out, [section], started, wall_s=time.perf_counter() - start, latest=False
-    ):
-        print(path, file=sys.stderr)
-    return 0
+    title = "Against another commit"
+    return Section(title, [Table(title, HEADER, rows, notes)])
 
 
-def _wanted(words: Sequence[str]) -> Iterator[Case]:
-    """The chosen cases whose imagery is there."""
-    for case in CASES:
-        if words and not any(word in case.name for word in words):
-            continue
-        if case.map.endswith(".tif") and not (DATA / case.map).is_file():
-            print(f"{case.name}: skipped, imagery is absent", file=sys.stderr)
-            continue
-        yield case
-
-
-def _row(section: Section, case: Case, options: argparse.Namespace) -> list[str]:
-    map_path, flight, gsd_m = _inputs(case, options)
-    task = Task(
-        BOTH,
-        str(map_path),
-        str(flight),
-        heading_known=case.heading_known,
-        use_prior=case.prior_px is not None,
-    )
-    trees = {HERE: ROOT, THERE: options.other.resolve()}
-    done: dict[str, list[dict[str, Any]]] = {name: [] for name in trees}
+def _row(case: Case, options: argparse.Namespace) -> list[str]:
+    trees = {HERE: Tree(ROOT), THERE: Tree(options.other.resolve())}
+    map_path, folder, gsd_m = _inputs(case, trees[THERE], options)
     for _ in range(options.rounds):
         for name, tree in trees.items():
-            done[name].append(_placed(task, tree))
-    verdicts = {name: from_placed(results[0]) for name, results in done.items()}
-    times_ms = {
-        name: np.min([[row[-1] for row in each["rows"]] for each in results], axis=0)
-        for name, results in done.items()
-    }
-    for name, values in times_ms.items():
-        section.add(f"{case.name}, {name}", "ms", values, data=case.map, seed=FLIGHT_SEED)
-    far_m = max(35.0, 10 * gsd_m)
+            trees[name] = tree.localized(case, map_path, folder, options.work / f"{name}.jsonl")
 
-    def both(figure: Any) -> list[str]:
-        return [figure(name) for name in trees]
+    def both(cell: Any) -> list[str]:
+        return [cell(tree) for tree in trees.values()]
 
-    def at(share: float) -> list[str]:
-        return both(lambda name: number(float(np.quantile(times_ms[name], share))))
+    def right(tree: Tree) -> Any:
+        return np.array([error_m <= far_m(gsd_m) for error_m, _ in tree.rows])
 
-    def wrong(verdict: Verdict) -> int:
-        return int((verdict.accepted & ~verdict.within(far_m)).sum())
+    def accepted(tree: Tree) -> Any:
+        return np.array([confidence >= CONFIDENT for _, confidence in tree.rows])
 
-    faster = float(np.median(times_ms[THERE]) / np.median(times_ms[HERE]))
+    def share(tree: Tree) -> float:
+        return float(accepted(tree)[right(tree)].mean()) if right(tree).any() else float("nan")
+
+    faster = min(trees[THERE].cpu_ms) / min(trees[HERE].cpu_ms)
+    where, _, what = case.name.partition(": ")
     return [
-        *(case.map, case.words, str(len(times_ms[HERE]))),
-        *(*at(0.5), f"{faster:.2f}", *at(0.9), *at(0.99)),
-        *both(lambda name: percent(float(verdicts[name].within(far_m).mean()))),
-        *both(lambda name: percent(verdicts[name].accepted_of_right(far_m))),
-        *both(lambda name: str(wrong(verdicts[name]))),
-        *both(lambda name: number(done[name][0]["peak_mb"])),
+        *(where, what, str(len(trees[HERE].rows))),
+        *(*both(lambda tree: number(min(tree.cpu_ms))), f"{faster:.2f}"),
+        *both(lambda tree: number(float(np.median(tree.clock_ms)))),
+        *both(lambda tree: number(float(np.percentile(tree.clock_ms, 99)))),
+        *both(lambda tree: percent(float(right(tree).mean()))),
+        *both(lambda tree: percent(share(tree))),
+        *both(lambda tree: str(int((accepted(tree) & ~right(tree)).sum()))),
+        *both(lambda tree: number(tree.peak_mb)),
     ]
 
 
-def _placed(task: Task, tree: Path) -> dict[str, Any]:
-    """The views placed by the code of a checkout, in a process of its own."""
-    made = _run_of(tree, "benchmarks.placing", json.dumps(asdict(task)))
-    result: dict[str, Any] = json.loads(made)
-    return result
-
-
-def _run_of(tree: Path, module: str, *arguments: str) -> str:
-    """What a module prints with the code of a checkout; raises `RuntimeError` where it fails."""
-    paths = os.pathsep.join([str(tree / "src"), str(ROOT)])
-    run = subprocess.run(
-        [sys.executable, "-m", module, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": paths},
-    )
-    if run.returncode:
-        raise RuntimeError(f"{tree}: {run.stderr[-2000:]}")
-    return run.stdout
-
-
-def _inputs(case: Case, options: argparse.Namespace) -> tuple[Path, Path, float]:
+def _inputs(case: Case, other: Tree, options: argparse.Namespace) -> tuple[Path, Path, float]:
     """Map, flight and ground resolution of a case; made once."""
-    work, views = options.work, options.views
-    ortho, flown = (_ortho(name, work) for name in ((case.map, PAST), (case.views, PRESENT)))
-    with rasterio.open(ortho) as source:
-        gsd_m = float(abs(source.transform.a))
-    folder = work / f"{flown.parent.name}-{flown.stem}-{case.width_px}-{case.prior_px}-{views}"
-    if not folder.is_dir():
-        errors = Errors(
-            yaw_std_deg=WIDE_ERRORS.yaw_std_deg,
-            agl_std=WIDE_ERRORS.agl_std,
-            prior_std_m=None if case.prior_px is None else case.prior_px * gsd_m,
-        )
-        simulate_flight(
-            SimulateRequest(
-                [flown],
-                folder,
-                random=views,
-                agl_m=case.width_px * gsd_m / min(DEFAULT_CAMERA.extent),
-                errors=errors,
-                seed=FLIGHT_SEED,
-            )
-        )
-    built = work / f"{ortho.parent.name}-{ortho.stem}.onav"
+    work = options.work
+    past = _ortho(case.map, PAST, work)
+    flown = _ortho(case.views, PRESENT, work)
+    gsd_m = gsd_of(past)
+    prior_m = None if case.prior_px is None else case.prior_px * gsd_m
+    errors, agl_m = replace(WIDE, prior_std_m=prior_m), agl_of(case.width_px, gsd_m)
+    views = 6 if options.quick else options.views
+    folder = flight(flown, work, views=views, errors=errors, seed=SEED, agl_m=agl_m)
+    built = work / f"{past.parent.name}-{past.stem}.onav"
     if not built.is_file():
-        arguments = "build", "--ortho", str(ortho), "--out", str(built)
-        _run_of(options.other.resolve(), "orthonav", *arguments)
+        other.orthonav("build", "--ortho", str(past), "--out", str(built))
     return built, folder, gsd_m
 
 
-def _ortho(named: tuple[str, Any], work: Path) -> Path:
-    """An orthophoto below `DATA`, or of a generated square."""
-    name, date = named
-    if name.endswith(".tif"):
-        return DATA / name
-    return Workplace(work, work / "areas", quick=False).area(
-        round(1000 * float(name.split()[0])), 1.0, [date]
-    )[0]
+def _ortho(name: str, date: str, work: Path) -> Path:
+    return area(work, date, side_m=int(name)) if name.isdigit() else ortho(name, work)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(NAME, __doc__, measure, add))

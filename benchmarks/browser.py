@@ -61,7 +61,6 @@ def started() -> Iterator[Browser]:
 
 
 def main() -> int:
-    """Say which."""
     path = chromium()
     if path is None:
         print(f"the page is not tested in a browser: {HOW_TO_GET_ONE}")

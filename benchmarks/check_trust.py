@@ -1,46 +1,49 @@
 """How far the verdict of a check can be trusted: predicted against measured, scenes left out.
 
-`python -m benchmarks.check_trust --work DIR [--views 20] [--conditions N] [--fit] [--out FILE]`
-checks maps of all scenes of two dates beside the checkout (`../shared/data`, or the folder that
-ORTHONAV_DATA names) and of generated ones, without the second date, and places simulated views of
-that date. Views are 256, 160 and 112 px of the map wide, with a prior position and without: each
-pair is measured under three of these six conditions, so that all occur in every scene. What is
-predicted for a scene is recalibrated by the others. `--fit` prints the recalibration by all scenes.
-DIR keeps maps, flights and outcomes; an interrupted run goes on where it was.
+`python -m benchmarks.check_trust --work DIR [--views 20] [--conditions N] [--fit]` checks maps of
+scenes of two dates without the second date, and places simulated views of that date. Views are 256,
+160 and 112 px of the map wide, with a prior position and without: each pair is measured under three
+of these six conditions, so that all occur in every scene. What is predicted for a scene is
+recalibrated by the others. `--fit` prints the recalibration by all scenes. Rerun to resume.
 """
 
 import argparse
-import json
 import math
-import os
+import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from benchmarks.inputs import file_of, map_of
-from benchmarks.record import Table, provenance
-from benchmarks.trust_views import Pair, pairs
-from orthonav.core.files import write_text
-from orthonav.core.flight import open_flight, read_truth
+from benchmarks.placing import views_in
+from benchmarks.record import Section, Table, resumed, run, say
+from benchmarks.scenes import (
+    WIDE,
+    Pair,
+    agl_of,
+    chosen,
+    flight,
+    leave_one_out_pairs,
+    map_of,
+    ortho,
+    place_of,
+)
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
-from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
+from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
 from orthonav.ground.check.verdict import GO_LOW, NARROW_PX
-from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.onboard.run import SingleViews, localize_flight
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA
+from orthonav.onboard.run import SingleViews, locate_view
 
-YAW_STD_DEG, AGL_STD = 10.0, 0.1
+NAME = "check_trust"
 WIDTHS_PX = (256, 160, 112)
 PRIOR_PX = 60.0
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
@@ -53,7 +56,7 @@ RIDGE = Recalibration(0.1, 2.0, 0.5, 0.5, 0.0)
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Outcome:
     """A check and a flight: shares by trials at the places of views, and which were right.
 
@@ -68,11 +71,11 @@ class Outcome:
     map: str
     width_px: int
     prior: bool
-    shares: list[float]
-    right: list[bool]
-    wrong: int
-    error_m: float
-    measured_m: float
+    shares: list[float] = field(default_factory=list)
+    right: list[bool] = field(default_factory=list)
+    wrong: int = 0
+    error_m: float = math.nan
+    measured_m: float = math.nan
 
     @property
     def side_px(self) -> float:
@@ -94,83 +97,62 @@ class Outcome:
         return float(expit(logit(self.predicted(by)) - SPREAD * by.std).mean())
 
 
-def main() -> None:
-    """Check, fly, compare, print; write Markdown where a file is named."""
-    options = _parser().parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
-    cv2.setNumThreads(1)
-    about = provenance("check trust")
-    chosen = _scenes_in_turn([each for each in pairs() if each.is_there])
-    found: list[Outcome] = []
-    for turn in range(len(WIDTHS_PX)):
-        for number, pair in enumerate(chosen):
-            if options.conditions and len(found) >= options.conditions:
-                continue
-            width_px = WIDTHS_PX[(turn + number) % len(WIDTHS_PX)]
-            found.append(_outcome(pair, width_px, (turn + number // 3) % 2 == 0, options))
-            print(" ".join(_row(found[-1], LEARNT)), flush=True)
-    head = f"commit {about['commit'][:10]}, sources {about['sources']}, {about['cpu']}"
-    text = "\n".join([head, "", *(each.markdown() for each in tables(found, options))])
-    print("\n" + text)
-    if options.fit:
-        print("LEARNT =", fitted(found))
-    if options.out:
-        write_text(options.out, text + "\n")
-
-
-def _scenes_in_turn(chosen: Sequence[Pair]) -> list[Pair]:
-    """The first pair of every scene, then the second, so that a part of a run has all scenes."""
-    turns = [
-        sum(other.scene == each.scene for other in chosen[:i]) for i, each in enumerate(chosen)
-    ]
-    return [chosen[i] for i in sorted(range(len(chosen)), key=lambda i: turns[i])]
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.check_trust", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--work", type=Path, required=True, help="folder for maps and flights")
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=20, help="views per condition (default 20)")
     parser.add_argument("--effort", type=float, default=0.05, help="of the checks (default 0.05)")
     parser.add_argument("--conditions", type=int, help="end after so many (default: all)")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="pairs whose name has this")
     parser.add_argument("--fit", action="store_true", help="print what all scenes say")
-    parser.add_argument("--out", type=Path, help="Markdown file to write too")
-    return parser
 
 
-def _outcome(pair: Pair, width_px: int, prior: bool, options: argparse.Namespace) -> Outcome:
-    """The outcome of a pair under one condition, stored in the folder of work."""
-    name = f"{pair.map}-{pair.views}-{width_px}-{prior}-{options.views}-{options.seed}"
-    stored: Path = options.work / f"check-{name.replace('/', '-').replace(':', '-')}.json"
-    if not stored.is_file():
-        made = _measured(pair, width_px, prior, options)
-        write_text(stored, json.dumps(asdict(made)))
-    return Outcome(**json.loads(stored.read_text(encoding="utf-8")))
+def measure(options: argparse.Namespace) -> Section:
+    pairs = _scenes_in_turn(chosen(leave_one_out_pairs(), options.only))
+    views = 4 if options.quick else options.views
+    tasks: dict[str, Any] = {}
+    for turn in range(1 if options.quick else len(WIDTHS_PX)):
+        for number, pair in enumerate(pairs):
+            width_px = WIDTHS_PX[(turn + number) % len(WIDTHS_PX)]
+            prior = (turn + number // 3) % 2 == 0
+            name = f"{pair.name} {width_px} px{', prior' * prior}, {views} views"
+            tasks[name] = (pair, width_px, prior, views, options)
+    found = []
+    for each in resumed(
+        options.work / f"conditions-{options.seed}.jsonl",
+        _measured,
+        dict(list(tasks.items())[: options.conditions]),
+    ):
+        found.append(Outcome(**each))
+        say(" ".join(_row(found[-1], LEARNT)))
+    if options.fit:
+        print("LEARNT =", fitted(found))
+    return Section("Checks, scenes left out", tables(found, options))
 
 
-def _measured(pair: Pair, width_px: int, prior: bool, options: argparse.Namespace) -> Outcome:
-    ortho, over = (file_of(each, options.work) for each in (pair.map, pair.views))
-    path = map_of(ortho, options.work)
+def _scenes_in_turn(pairs: Sequence[Pair]) -> list[Pair]:
+    """The first pair of every scene, then the second, so that a part of a run has all scenes."""
+    turns = [
+        sum(place_of(other) == place_of(each) for other in pairs[:i])
+        for i, each in enumerate(pairs)
+    ]
+    return [pairs[i] for i in sorted(range(len(pairs)), key=lambda i: turns[i])]
+
+
+def _measured(task: tuple[Pair, int, bool, int, argparse.Namespace]) -> dict[str, Any]:
+    pair, width_px, prior, views, options = task
+    work: Path = options.work
+    path, over = map_of(ortho(pair.map, work), work), ortho(pair.views, work)
     localizer = Localizer(open_map(path))
     gsd_m = localizer.sheet.grid.gsd_m
-    agl_m = width_px * gsd_m / min(DEFAULT_CAMERA.extent)
-    prior_m = PRIOR_PX * gsd_m if prior else None
-    errors = Errors(yaw_std_deg=YAW_STD_DEG, agl_std=AGL_STD, prior_std_m=prior_m)
-    name = f"check-{over.parent.name}-{over.stem}-{width_px}-{prior}-{options.views}"
-    folder = options.work / f"{name}-{options.seed}"
-    if not folder.is_dir():
-        request = SimulateRequest(
-            [over], folder, random=options.views, agl_m=agl_m, errors=errors, seed=options.seed
-        )
-        simulate_flight(request)
+    agl_m, prior_m = agl_of(width_px, gsd_m), PRIOR_PX * gsd_m if prior else None
+    errors = replace(WIDE, prior_std_m=prior_m)
+    folder = flight(over, work, views=views, errors=errors, seed=options.seed, agl_m=agl_m)
     asked = CheckRequest(
         path,
         camera=DEFAULT_CAMERA,
         agl_m=agl_m,
-        yaw_std_deg=YAW_STD_DEG,
-        agl_std=AGL_STD,
+        yaw_std_deg=errors.yaw_std_deg,
+        agl_std=errors.agl_std,
         prior_std_m=prior_m,
         relief_m=0.0,
         tilt_std_deg=0.0,
@@ -181,30 +163,31 @@ def _measured(pair: Pair, width_px: int, prior: bool, options: argparse.Namespac
     )
     cells = check_map(asked)[0].cells
     grid = cells.grid
-    shares, right, wrong, off_m, expected_m = [], [], 0, [], []
-    truth = read_truth(folder / "truth.csv")
-    for result in localize_flight(SingleViews(localizer), open_flight(folder)):
-        true = localizer.sheet.frame.en_from_latlon(*truth[result.frame])
-        at = np.argmax(grid.counts(np.array([true])))
-        inside = bool(grid.counts(np.array([true])).any())
-        share = float(cells.probability.ravel()[at]) if inside else math.nan
+    found = Outcome(place_of(pair), pair.map, width_px, prior)
+    off_m, expected_m, frame = [], [], localizer.sheet.frame
+    alone = SingleViews(localizer)
+    for each in views_in(folder):
+        true = frame.en_from_latlon(*each.truth_latlon_deg)
+        counts = grid.counts(np.array([true]))
+        share = float(cells.probability.ravel()[np.argmax(counts)]) if counts.any() else math.nan
         if not share > 0:  # beside the map
             continue
-        fix, error_m, confident = result.outcome, math.inf, False
+        fix, _ = locate_view(alone, each.view)
+        confident = isinstance(fix, Fix) and fix.confidence >= CONFIDENT
+        error_m = math.inf
         if isinstance(fix, Fix):
-            place = localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-            error_m, confident = math.dist(place, true), fix.confidence >= CONFIDENT
+            error_m = math.dist(frame.en_from_latlon(fix.lat_deg, fix.lon_deg), true)
         near = isinstance(fix, Fix) and error_m <= fix.radius_m
-        shares.append(round(share, 4))
-        right.append(confident and near)
-        wrong += confident and not near
+        found.shares.append(round(share, 4))
+        found.right.append(confident and near)
+        found.wrong += confident and not near
         if confident and near:
             off_m.append(error_m)
-            expected_m.append(float(cells.error_m.ravel()[at]))
-    rms = [
+            expected_m.append(float(cells.error_m.ravel()[np.argmax(counts)]))
+    found.error_m, found.measured_m = (
         math.sqrt(np.mean(np.square(each))) if each else math.nan for each in (expected_m, off_m)
-    ]
-    return Outcome(pair.scene, pair.map, width_px, prior, shares, right, int(wrong), *rms)
+    )
+    return asdict(found)
 
 
 def fitted(found: Sequence[Outcome]) -> Recalibration:
@@ -220,7 +203,7 @@ def fitted(found: Sequence[Outcome]) -> Recalibration:
             chance = np.where(each.right, predicted, 1 - predicted)
             total -= float(np.log(np.clip(chance, 1e-6, 1.0)).sum()) / counts[each.scene]
         off = values - np.array(astuple(PLAIN)[:4])
-        return total / len(scenes) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
+        return total / max(len(scenes), 1) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
 
     values = minimize(loss, np.array(astuple(PLAIN)[:4]), method="Nelder-Mead").x
     by = _recalibration(np.round(values, 2))
@@ -264,14 +247,14 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     rows = [_row(each, by[each.scene]) for each in found if each.right]
     header = (
         *("scene, map", "views", "n", "predicted", "80 % low", "measured", "verdict alone"),
-        *("error m expected", "measured", "confident and wrong"),
+        *("error m expected", "measured", "false"),
     )
     gone = [each for each in found if each.right and each.is_go(by[each.scene])]
     bad = [each for each in gone if np.mean(each.right) < GO_LOW]
     above = [each for each in found if each.right]
     under = sum(np.mean(each.right) < each.low(by[each.scene]) for each in above)
     notes = (
-        f"heading sd {YAW_STD_DEG:g} deg, height sd {AGL_STD:.0%}, prior {PRIOR_PX:g} px or none; "
+        f"heading sd 10 deg, height sd 10 %, prior {PRIOR_PX:g} px or none; "
         f"{options.views} views over the later date each, those beside the map left out, checks of "
         f"effort {options.effort:g} (40 trials); recalibrated by the other scenes",
         f"go by the low bound and the width: {len(gone)} of {len(above)}, of which {len(bad)} "
@@ -319,4 +302,4 @@ def _bins_table(
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NAME, __doc__, measure, add))

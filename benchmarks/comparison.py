@@ -1,220 +1,192 @@
-"""orthonav compared with first-choice methods: same views, same run, same seeds."""
+"""Registration and embedding beside other methods: the same views, each method in a process.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+The others get the view rectified by orthonav's code with a mask, once per pose of orthonav's bank
+or under the reported pose only, and the whole map.
+"""
+
+import argparse
+import math
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.baselines import Method, Orthonav, Reference, SiftMatch, TemplateMatch
-from benchmarks.flights import Flight
-from benchmarks.inputs import (
-    FLIGHT_SEED,
-    NAIP_ABSENT,
-    NAIP_PAST,
-    NAIP_PRESENT,
-    NO_ERRORS,
+from benchmarks.placing import (
+    BOTH,
+    CANNY,
+    MUTUAL,
+    OWN,
+    PHASE,
+    REGISTRATION,
+    SIFT,
+    TEMPLATE,
+    TILES,
+    Task,
+    placed,
+)
+from benchmarks.posed import canny_edges
+from benchmarks.record import Section, Table, number, percent, run, say
+from benchmarks.scenes import (
     PAST,
     PRESENT,
-    USUAL_ERRORS,
-    Workplace,
-    naip,
+    SCENES,
+    WIDE,
+    Pair,
+    agl_of,
+    flight,
+    gsd_of,
+    localizer_of,
+    map_of,
+    ortho,
+    store,
 )
-from benchmarks.machine import timed
-from benchmarks.record import Section, Table, number
-from orthonav.core.localize import Localizer
-from orthonav.core.mapfile import open_map
+from benchmarks.verdicts import Verdict
+from orthonav.core.records import CONFIDENT
 from orthonav.ground.simulate.flight import Errors
 
-TURNS_DEG = (-6.0, 0.0, 6.0)
-CONTROL_VIEWS = 10
+NAME = "comparison"
+SEED = 7
 DENSER = 0.9375
-OFF, EXACT = "heading off by 5 deg, height by 5 % (sd)", "heading and height exact"
-RADII = ("0.75 stride", "1 stride", "15 m")
+USUAL_ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
+# With this deviation only the reported heading is tried; the error is far below a pixel.
+NO_ERRORS = Errors(yaw_std_deg=0.001)
+HEADER = (
+    *("method", "pixels m", "15 m", "35 m", "median m", "ms", "p99 ms", "peak MB", "carried MB"),
+    *(f"accepted at {CONFIDENT:g}", "false", "ECE"),
+)
 NOTES = (
-    "shares of all views, whole map, no prior, whatever the confidence; a view without an answer "
-    "counts as wrong; ms: median per view on one core, decoded view to position",
-    "carried: what must be aboard for this area; bold: better than orthonav's default",
+    "whole map, no prior; a view without an answer counts as wrong; ms: processor time of a view, "
+    "warm, from the decoded image; peak MB: resident memory of a process that does nothing else; "
+    "carried: map file; orthophoto as grey JPEG, or its edges as 1-bit PNG",
 )
 
 
 @dataclass(frozen=True)
-class Scene:
-    """One map and one flight over it; `kind` says how good the telemetry is."""
+class Entrant:
+    """A method: name in the table, what is run, and `overlap` of the tiles of its map."""
 
-    area: str
-    kind: str
-    past: Path
-    present: Path
+    name: str
+    method: str
+    factor: int = 1
+    telemetry_only: bool = False
+    overlap: float = 0.875
+
+
+REGISTERED = (
+    Entrant("orthonav (default)", BOTH),
+    Entrant("orthonav, registration only", REGISTRATION),
+    Entrant("orthonav, embedding only", TILES),
+    Entrant("matchTemplate, grey, reported pose", TEMPLATE, 1, True),
+    Entrant("matchTemplate, grey, pose bank", TEMPLATE, 4),
+    Entrant("matchTemplate, Canny, reported pose", CANNY, 1, True),
+    Entrant("matchTemplate, Canny, pose bank", CANNY, 4),
+    Entrant("phase correlation, reported pose", PHASE, 1, True),
+    Entrant("phase correlation, pose bank", PHASE, 4),
+    Entrant("mutual information, pose bank", MUTUAL, 8),
+    Entrant("SIFT, ratio test, RANSAC", SIFT),
+)
+EMBEDDED = (
+    Entrant("orthonav, embedding only", TILES),
+    Entrant(f"orthonav, embedding only, overlap {DENSER:g}", TILES, overlap=DENSER),
+    Entrant("matchTemplate, grey, reported pose", TEMPLATE, 1, True),
+    Entrant("matchTemplate, Canny, reported pose", CANNY, 1, True),
+    Entrant("SIFT, ratio test, RANSAC", SIFT),
+)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Entrants on the views of one pair: `registered`, or `embedded` without registration."""
+
+    part: str
+    title: str
+    pair: Pair
     errors: Errors
-    views: int
-
-    @property
-    def title(self) -> str:
-        """The scene in one line."""
-        return f"{self.area}: {self.kind}"
+    heading_known: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
-    """How one method did: `errors_m` (N,) infinite where there was no answer."""
-
-    method: Method
-    errors_m: NDArray[np.float64]
-    times_ms: NDArray[np.float64]
-    stride_m: float
-
-    @property
-    def shares(self) -> list[float]:
-        """Share of views within each of `RADII`."""
-        return [float((self.errors_m <= radius).mean()) for radius in self.radii_m]
-
-    @property
-    def radii_m(self) -> tuple[float, float, float]:
-        """`RADII` in metres."""
-        return 0.75 * self.stride_m, self.stride_m, 15.0
+def rounds() -> list[Round]:
+    """All of them; those over imagery that is absent are left out."""
+    generated = SCENES["generated_1"].pair(PAST, PRESENT)
+    naip = SCENES["naip"].pair("20090818", "20180716")
+    found = [
+        Round("registered", "heading off by 10 deg, height by 10 %", generated, WIDE),
+        Round("registered", "heading unknown, height off by 10 %", generated, WIDE, False),
+    ]
+    for pair in (generated, naip):
+        if pair.is_there:
+            off = f"{pair.name}, embedding only, heading off by 5 deg, height by 5 %"
+            found.append(Round("embedded", off, pair, USUAL_ERRORS))
+            exact = f"{pair.name}, embedding only, heading and height exact"
+            found.append(Round("embedded", exact, pair, NO_ERRORS))
+    return found
 
 
-def measure(place: Workplace) -> Section:
-    """Every method on every scene; then the scenes and figures where orthonav loses."""
-    section = Section("Comparison with first-choice methods")
-    losses = []
-    scenes = _scenes(place)
-    for past in dict.fromkeys(scene.past for scene in scenes):
-        methods = _methods(place, past)
-        for scene in scenes:
-            if scene.past == past:
-                results = _results(place, scene, methods)
-                notes = () if section.tables else NOTES
-                section.tables.append(_table(section, scene, results, notes))
-                losses += _losses(scene, results)
-    if naip(NAIP_PRESENT) is None:
-        losses.append([NAIP_ABSENT, "-", "-", "-", "-"])
-    header = ("scene", "method", "figure", "method's", "orthonav's")
-    note = (
-        f"with {place.views} views a share is known to about "
-        f"{1.28 * 50 / place.views**0.5:.0f} points (80 % interval); intervals are in the JSON"
-    )
-    section.tables.append(Table("Where another method beats orthonav", header, losses, (note,)))
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--views", type=int, default=100, help="a quarter with unknown heading")
+    parser.add_argument("--part", choices=("registered", "embedded"), help="only this part")
+
+
+def measure(options: argparse.Namespace) -> Section:
+    section = Section("Registration beside other methods")
+    views = 12 if options.quick else options.views
+    for each in rounds():
+        if options.part in (None, each.part):
+            count = views if each.heading_known else max(1, views // 4)
+            section.tables.append(_table(each, count, options.work, NOTES))
     return section
 
 
-def _scenes(place: Workplace) -> list[Scene]:
-    past, present = place.area(2000, 1.0, [PAST, PRESENT])
-    name = "Generated 2 x 2 km, 1 m, 2016 to 2021"
-    scenes = [Scene(name, OFF, past, present, USUAL_ERRORS, place.views)]
-    if not place.quick:
-        scenes.append(Scene(name, EXACT, past, present, NO_ERRORS, place.views))
-    scenes.append(
-        Scene("Control, generated, same date", EXACT, past, past, NO_ERRORS, CONTROL_VIEWS)
-    )
-    real_past, real_present = naip(NAIP_PAST), naip(NAIP_PRESENT)
-    if real_past and real_present:
-        name = "NAIP 4.7 x 3.6 km, 5 m, 2009 to 2018"
-        scenes.append(Scene(name, OFF, real_past, real_present, USUAL_ERRORS, place.views))
-        if not place.quick:
-            scenes.append(Scene(name, EXACT, real_past, real_present, NO_ERRORS, place.views))
-    return scenes
-
-
-def _methods(place: Workplace, past: Path) -> list[Method]:
-    """All methods on one orthophoto, orthonav's default first."""
-    builds = [("gradient", 0.875), ("gray", 0.875), ("canny", 0.875)]
-    if not place.quick:
-        builds.insert(1, ("gradient", DENSER))
-    path = place.map(past)
-    default = Orthonav("orthonav (default)", Localizer(open_map(path)), path.stat().st_size)
-    methods: list[Method] = [default]
-    for edges, overlap in builds:
-        path = place.map(past, edges, overlap, registration=False)
-        name = "embedding only" + (f", --edges {edges}" if edges != "gradient" else "")
-        if overlap == DENSER:
-            name += f", --overlap {overlap}"
-        localizer = Localizer(open_map(path), registration=False)
-        methods.append(Orthonav(f"orthonav, {name}", localizer, path.stat().st_size))
-    reference = Reference.of(past, Localizer(open_map(place.map(past))))
-    turns: tuple[Sequence[float], ...] = ((0.0,), TURNS_DEG)
-    methods += [
-        TemplateMatch(reference, canny=canny, turns_deg=turn)
-        for canny in (False, True)
-        for turn in turns
-    ]
-    return [*methods, SiftMatch(reference)]
-
-
-def _results(place: Workplace, scene: Scene, methods: Sequence[Method]) -> list[Result]:
-    flight = place.fly(scene.present, scene.views, scene.errors)
-    localizer = Localizer(open_map(place.map(scene.past)))
-    exact = scene.errors is NO_ERRORS
-    return [
-        _run(method, flight, localizer)
-        for method in methods
-        if not (exact and isinstance(method, TemplateMatch) and len(method.turns_deg) > 1)
-    ]
-
-
-def _run(method: Method, flight: Flight, localizer: Localizer) -> Result:
-    errors_m, times_ms = [], []
-    method.locate(flight.views[0].view)  # warm-up
-    for flown in flight.views:
-        place, took_s = timed(method.locate, flown.view)
-        times_ms.append(1e3 * took_s)
-        truth = localizer.sheet.frame.en_from_latlon(*flown.truth_latlon_deg)
-        errors_m.append(np.inf if place is None else float(np.hypot(*(place - truth))))
-    return Result(method, np.array(errors_m), np.array(times_ms), localizer.grid.stride_m)
-
-
-def _table(
-    section: Section, scene: Scene, results: Sequence[Result], notes: Sequence[str]
-) -> Table:
+def _table(each: Round, views: int, work: Path, notes: tuple[str, ...]) -> Table:
+    past, present = ortho(each.pair.map, work), ortho(each.pair.views, work)
+    localizer = localizer_of(each.pair.map, work)
+    pixels = store(past, localizer, work / f"{past.parent.name}-{past.stem}.npz")
+    agl_m = agl_of(256, gsd_of(present))
+    flown = flight(present, work, views=views, errors=each.errors, seed=SEED, agl_m=agl_m)
+    entrants = REGISTERED if each.part == "registered" else EMBEDDED
     rows = []
-    for result in results:
-        name, seed = f"{scene.title}: {result.method.name}", FLIGHT_SEED
-        for radius, limit_m in zip(RADII, result.radii_m, strict=True):
-            hits = result.errors_m <= limit_m
-            section.add_share(f"{name}: within {radius}", hits, data=scene.title, seed=seed)
-        time = section.add(f"{name}: time", "ms", result.times_ms, data=scene.title, seed=seed)
-        what, size_bytes = result.method.carried
-        section.add(f"{name}: carried", "MB", [size_bytes / 1e6], data=scene.title, seed=seed)
-        shares = [
-            f"**{share:.0%}**" if share > best else f"{share:.0%}"
-            for share, best in zip(result.shares, results[0].shares, strict=True)
-        ]
-        right = result.errors_m[result.errors_m <= result.radii_m[1]]
-        median = number(float(np.median(right))) if len(right) else "-"
-        none = f"{np.isinf(result.errors_m).mean():.0%}"
-        carried = f"{number(size_bytes / 1e6)} ({what})"
-        rows.append([result.method.name, *shares, median, none, number(time.median), carried])
-    header = ("method", *RADII, "median error if right, m", "no answer", "ms", "carried MB")
-    stride_m = results[0].stride_m
-    about = f"n = {len(results[0].errors_m)} views, stride {number(stride_m)} m"
-    return Table(scene.title, header, rows, (about, *_imagery_note(results), *notes))
-
-
-def _imagery_note(results: Sequence[Result]) -> list[str]:
-    for result in results:
-        if isinstance(result.method, TemplateMatch):
-            png = result.method.reference.png_bytes / 1e6
-            return [f"the grey orthophoto without loss (PNG): {number(png)} MB"]
-    return []
-
-
-def _losses(scene: Scene, results: Sequence[Result]) -> list[list[str]]:
-    """Rows where a method not of orthonav beats its default in a share, in time or in size."""
-    default = results[0]
-    rows = []
-    for result in results:
-        if isinstance(result.method, Orthonav):
+    for entrant in entrants:
+        if entrant.telemetry_only and not each.heading_known:
             continue
-        head = [scene.title, result.method.name]
-        for radius, share, own in zip(RADII, result.shares, default.shares, strict=True):
-            if share > own:
-                rows.append([*head, f"within {radius}", f"{share:.0%}", f"{own:.0%}"])
-        time_ms, own_ms = float(np.median(result.times_ms)), float(np.median(default.times_ms))
-        if time_ms < own_ms:
-            rows.append([*head, "ms per view", number(time_ms), number(own_ms)])
-        size, own_size = result.method.carried[1], default.method.carried[1]
-        if size < own_size and scene.errors is USUAL_ERRORS:  # does not depend on the telemetry
-            rows.append([*head, "carried MB", number(size / 1e6), number(own_size / 1e6)])
-    return rows
+        map_path = map_of(past, work, overlap=entrant.overlap)
+        task = Task(entrant.method, str(map_path), str(flown), each.heading_known)
+        task = replace(task, pixels=str(pixels), factor=entrant.factor)
+        result = placed(replace(task, telemetry_only=entrant.telemetry_only))
+        carried_mb = _carried_mb(entrant, map_path, pixels)
+        rows.append(_row(entrant, Verdict.of(result["rows"]), result["peak_mb"], carried_mb))
+        say(f"        {each.title}: {' '.join(rows[-1])}")
+    return Table(f"{each.title}, {views} views", HEADER, rows, notes)
+
+
+def _carried_mb(entrant: Entrant, map_path: Path, pixels: Path) -> float:
+    """Megabytes that must be on board; NaN for keypoints."""
+    if entrant.method in OWN:
+        return map_path.stat().st_size / 1e6
+    with np.load(pixels) as stored:
+        grey, valid = stored["grey"], stored["valid"]
+    if entrant.method == CANNY:
+        bilevel = [int(cv2.IMWRITE_PNG_BILEVEL), 1]
+        return len(cv2.imencode(".png", canny_edges(grey, valid), bilevel)[1]) / 1e6
+    jpeg = [int(cv2.IMWRITE_JPEG_QUALITY), 90]
+    return math.nan if entrant.method == SIFT else len(cv2.imencode(".jpg", grey, jpeg)[1]) / 1e6
+
+
+def _row(entrant: Entrant, verdict: Verdict, peak_mb: float, carried_mb: float) -> list[str]:
+    stated = ["-", "-", "-"]
+    if verdict.states_confidence:
+        accepted = percent(float(verdict.accepted.mean()))
+        stated = [accepted, str(verdict.wrong_accepted), f"{verdict.ece:.3f}"]
+    return [
+        entrant.name,
+        "own" if entrant.method in OWN else str(entrant.factor),
+        *(percent(float(verdict.within(radius_m).mean())) for radius_m in (15.0, 35.0)),
+        *(number(v) for v in (verdict.median_m, float(np.median(verdict.times_ms)))),
+        *(number(v) for v in (float(np.percentile(verdict.times_ms, 99)), peak_mb, carried_mb)),
+        *stated,
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(run(NAME, __doc__, measure, add))

@@ -109,12 +109,7 @@ CAMERA_FAULTS = (
     Fault("2 s late without a gap", "camera", 15.0, delay_s=lambda n, t: 2.0),
     Fault("latency grows by 0.1 s/s", "camera", 15.0, delay_s=lambda n, t: STATED_S + 0.1 * t),
     Fault("latency grows by 0.02 s/s", "camera", 40.0, delay_s=lambda n, t: STATED_S + 0.02 * t),
-    Fault(
-        "reordered",
-        "camera",
-        15.0,
-        delay_s=lambda n, t: STATED_S + (0.0, 0.4, 0.2)[n % 3],
-    ),
+    Fault("reordered", "camera", 15.0, delay_s=lambda n, t: STATED_S + (0.0, 0.4, 0.2)[n % 3]),
     Fault("mirrored", "camera", picture=lambda f, grey, t: np.ascontiguousarray(grey[:, ::-1])),
     Fault(
         "rotated by 180 deg",

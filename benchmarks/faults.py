@@ -1,9 +1,8 @@
 """The fault suite: what is sent while camera, telemetry, map or ground are wrong.
 
-`python -m benchmarks.faults [--only TEXT ..] [--quick] [--seeds N] [--work DIR] [--out DIR]` flies
-every fault of `benchmarks.fault_scenarios` over a generated area, photographed at another date than
-its map, with the flight loop of `orthonav fly` and simulated clocks, and prints one row per fault.
-A JSON and a Markdown record go to the output folder.
+`python -m benchmarks.faults [--only TEXT ..] [--quick] [--seeds N] [--jobs N]` flies every fault of
+`benchmarks.fault_scenarios` over a generated area, photographed at another date than its map, with
+the flight loop of `orthonav fly` and simulated clocks, and prints one row per fault.
 """
 
 import argparse
@@ -11,15 +10,10 @@ import copy
 import os
 import shutil
 import sys
-import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
@@ -44,15 +38,15 @@ from benchmarks.fault_scenarios import (
     GROUND_FAULTS,
     TELEMETRY_FAULTS,
 )
-from benchmarks.inputs import PAST, PRESENT, Workplace
-from benchmarks.record import Section, Table, number, provenance, save
-from orthonav.core.geo.frames import LocalFrame
+from benchmarks.record import Section, Table, number, quantiles, run, say, side_by_side
+from benchmarks.scenes import PAST, PRESENT, area, map_of
+from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.render import ViewEffects, render_view
 
+NAME = "faults"
 SIDE_M, MAP_M = 1600, 1200
 """Sides of the generated area, and of the map in its middle."""
 REACH_M, AGL_M, SPEED_MPS = 380.0, 150.0, 18.0
@@ -60,35 +54,36 @@ EFFECTS = ViewEffects(exposure_std=0.05)
 LEAD_S, RECOVERY_S, SEED = 15.0, 60.0, 5
 QUICK_LEAD_S, QUICK_RECOVERY_S, QUICK_FAULT_S = 10.0, 20.0, 10.0
 CALM_S, CALM_SEEDS = 60.0, (11, 12, 13)
-OWN_MAPS = (
+MIRRORED, TRUNCATED = OWN_MAPS = (
     Fault("another place (mirrored ground)", "map", 30.0, from_start=True),
     Fault("map truncated in place", "map", 10.0),
 )
-HEADER = (*("fault", "s", "views", "sent", "worst m", "wrong", "recovered s", "lead-in sent"),)
+HEADER = ("fault", "s", "views", "sent", "worst m", "false", "recovered s", "lead-in sent")
 
 
 class Ground:
     """An orthophoto on the plane of a map.
 
-    `corner` (2,): its first pixel, metres east and north. `size_px`: columns and rows.
+    `side_m`: of a square around the origin, at 1 m; None: the raster of the map.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        frame: LocalFrame,
-        *,
-        corner: tuple[float, float] = (-SIDE_M / 2, SIDE_M / 2),
-        size_px: tuple[int, int] = (SIDE_M, SIDE_M),
-        gsd_m: float = 1.0,
-    ) -> None:
-        (west_m, north_m), (cols, rows) = corner, size_px
+    def __init__(self, path: Path, localizer: Localizer, side_m: int | None = None) -> None:
+        grid = localizer.grid
+        west_m, north_m, gsd_m = grid.west_m, grid.north_m, grid.gsd_m
+        cols, rows = grid.width_px, grid.height_px
+        if side_m is not None:
+            west_m, north_m, gsd_m, cols, rows = -side_m / 2, side_m / 2, 1.0, side_m, side_m
         sheet = Mosaic.open([path]).sheet(
-            frame, west_m=west_m, north_m=north_m, width_px=cols, height_px=rows, gsd_m=gsd_m
+            localizer.sheet.frame,
+            west_m=west_m,
+            north_m=north_m,
+            width_px=cols,
+            height_px=rows,
+            gsd_m=gsd_m,
         )
         with sheet as raster:
             rgb = np.asarray(raster.read(0, 0, rows, cols).rgb)
-        self._corner, self._rgb, self._gsd_m = np.array(corner), rgb, gsd_m
+        self._corner, self._rgb, self._gsd_m = np.array([west_m, north_m]), rgb, gsd_m
 
     def mirrored(self) -> "Ground":
         """The same, east and west exchanged."""
@@ -102,82 +97,70 @@ class Ground:
         attitude: tuple[float, float, float],
         agl_m: float,
         rng: np.random.Generator,
+        camera: Camera = CAMERA,
+        effects: ViewEffects = EFFECTS,
     ) -> Grey:
         """What the camera sees."""
-        corner = self._corner - place
-        gsd_m = self._gsd_m
-        seen = render_view(CAMERA, (*attitude, agl_m), self._rgb, corner, gsd_m, EFFECTS, rng)
+        pose, corner, gsd_m = (*attitude, agl_m), self._corner - place, self._gsd_m
+        seen = render_view(camera, pose, self._rgb, corner, gsd_m, effects, rng)
         return np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _cut(path: Path, out: Path, side_m: int) -> Path:
-    """The middle of an orthophoto."""
-    if out.is_file():
-        return out
-    with rasterio.open(path) as source:
-        first = (SIDE_M - side_m) // 2
-        rgb = source.read(window=Window(first, first, side_m, side_m))
-        profile = source.profile
-        profile.update(
-            width=side_m,
-            height=side_m,
-            transform=source.window_transform(Window(first, first, side_m, side_m)),
-        )
-        tags = source.tags()
-    with rasterio.open(out, "w", **profile) as target:
-        target.write(rgb)
-        target.update_tags(**tags)
+def middle_of(path: Path, side_m: int, out: Path) -> Path:
+    """The middle of an orthophoto at 1 m as a file of its own."""
+    if not out.is_file():
+        with rasterio.open(path) as source:
+            first = (source.width - side_m) // 2, (source.height - side_m) // 2
+            part = Window(*first, side_m, side_m)
+            rgb, tags = source.read(window=part), source.tags()
+            profile = source.profile | {"width": side_m, "height": side_m}
+            profile["transform"] = source.window_transform(part)
+        with rasterio.open(out, "w", **profile) as target:
+            target.write(rgb)
+            target.update_tags(**tags)
     return out
 
 
 @cache
-def _world(work: Path, kind: str) -> World:
-    """The map and the ground of a kind: usual, mirrored."""
-    place = Workplace(work, work, quick=True)
-    past, present = place.area(SIDE_M, 1.0, [PAST, PRESENT])
-    name = f"{past.parent.name}-map"
-    path = work / f"{name}.onav"
-    if not path.is_file():
-        build_map(BuildRequest([_cut(past, work / f"{name}.tif", MAP_M)], path))
+def _world(work: Path, mirrored: bool) -> tuple[World, Path]:
+    """The map and the ground, and the file of the map."""
+    past, present = (area(work, date, side_m=SIDE_M) for date in (PAST, PRESENT))
+    path = map_of(middle_of(past, MAP_M, work / "middle.tif"), work)
     localizer = Localizer(open_map(path))
+    ground = Ground(present, localizer, SIDE_M)
+    ground = ground.mirrored() if mirrored else ground
     frame = localizer.sheet.frame
-    ground = Ground(present, frame)
-    if kind == "mirrored":
-        ground = ground.mirrored()
-    return World(localizer, frame, ground.picture, REACH_M, AGL_M, SPEED_MPS)
+    return World(localizer, frame, ground.picture, REACH_M, AGL_M, SPEED_MPS), path
 
 
-def _fly(job: tuple[Path, Fault, int], quick: bool) -> Report:
-    """One flight; `quick`: a shorter one."""
-    work, fault, seed = job
+def _fly(job: tuple[Path, str, int, bool]) -> tuple[int, Report]:
+    """One flight: folder of work, name of the fault, seed, and whether it is a shorter one."""
+    work, name, seed, quick = job
     cv2.setNumThreads(1)
-    change: Callable[[], str | None] | None = None
-    kinds = {OWN_MAPS[0].name: "mirrored"}
-    world = _world(work, kinds.get(fault.name, "usual"))
-    if fault.name == OWN_MAPS[1].name:
-        usual = next(work.glob("*-map.onav"))
-        copy = work / f"truncated-{os.getpid()}.onav"
-        shutil.copyfile(usual, copy)
-        opened = open_map(copy)
-        world = replace(world, localizer=Localizer(opened))
-        change = opened.change
-        fault = replace(fault, begins=lambda _: os.truncate(copy, copy.stat().st_size // 3))
+    fault = next(each for each in _faults() if each.name == name)
+    world, path = _world(work, name == MIRRORED.name)
+    change: Callable[[], str | None] = lambda: None  # noqa: E731
+    if name == TRUNCATED.name:
+        broken = work / f"truncated-{os.getpid()}.onav"
+        shutil.copyfile(path, broken)
+        opened = open_map(broken)
+        world, change = replace(world, localizer=Localizer(opened)), opened.change
+        fault = replace(fault, begins=lambda _: os.truncate(broken, broken.stat().st_size // 3))
     calm = fault.group == "none"
-    recovery_s = QUICK_RECOVERY_S if quick else RECOVERY_S
     if quick and not calm and not fault.leaves_map and not fault.from_start:
         fault = replace(fault, seconds=min(fault.seconds, QUICK_FAULT_S))
-    flight = FaultFlight(
+    recovery_s = QUICK_RECOVERY_S if quick else RECOVERY_S
+    report = FaultFlight(
         world,
         fault,
         seed=seed,
         lead_s=0.0 if calm else QUICK_LEAD_S if quick else LEAD_S,
-        recovery_s=0.0 if calm or fault.name == OWN_MAPS[1].name else recovery_s,
-        map_change=change or (lambda: None),
-    )
-    report = flight.fly()
+        recovery_s=0.0 if calm or name == TRUNCATED.name else recovery_s,
+        map_change=change,
+    ).fly()
     # Functions cannot be passed between processes.
     plain = Fault(fault.name, fault.group, fault.seconds, detectable=fault.detectable)
-    return replace(report, fault=plain)
+    return seed, replace(report, fault=plain)
 
 
 def _row(report: Report) -> list[str]:
@@ -196,107 +179,57 @@ def _row(report: Report) -> list[str]:
     ]
 
 
-def _calm_row(report: Report, seed: int) -> list[str]:
+def calm_cells(report: Report) -> list[str]:
+    """First message, share sent after it, median and largest error, and false messages."""
     begin = report.sent[0].at_s if report.sent else np.inf
     views = sum(each >= begin for each in report.views)
-    share = len(report.sent) / max(views, 1)
-    errors = [each.error_m for each in report.sent] or [np.nan]
-    return [
-        f"seed {seed}",
-        str(len(report.views)),
-        number(begin),
-        f"{share:.1%}",
-        number(float(np.median(errors))),
-        number(max(errors)),
-        str(len(report.wrong())),
-    ]
+    errors = [each.error_m for each in report.sent]
+    share = f"{len(report.sent) / max(views, 1):.1%}"
+    return [number(begin), share, *quantiles(errors, 50, 100), str(len(report.wrong()))]
 
 
-def _tables(reports: list[tuple[int, Report]]) -> list[Table]:
-    rows = [_row(each) for _, each in reports if each.fault.group != "none"]
-    notes = (
-        f"{AGL_M:g} m above generated ground of another date than the map's ({MAP_M / 1000:g} km "
-        f"square), {SPEED_MPS:g} m/s with turns and turbulence, live camera of {CAMERA.width_px} x "
-        f"{CAMERA.height_px} px at {VIEWS_HZ:g} Hz, telemetry at 25 Hz; {LEAD_S:g} s (--quick: "
-        f"{QUICK_LEAD_S:g} s) undisturbed before the fault, unless it is there from the start",
-        "s, views, sent: length of the fault, images and messages during it; worst: largest error "
-        "of a message from its begin to the end of the flight; wrong: messages of the whole flight "
-        f"more than {FAR_M:g} m and {FAR_STD:g} standard deviations of their own fix off",
-        "recovered: from the end of the fault to the next message within "
-        f"{FAR_M:g} m, none: within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s) or as long "
-        "as the map stays truncated; lead-in sent: share of its views, from the first message on",
-    )
-    made = [Table("Faults", HEADER, rows, notes)] if rows else []
-    calm = [_calm_row(each, seed) for seed, each in reports if each.fault.group == "none"]
-    if calm:
-        header = ("undisturbed", "views", "first message s", "sent", "median m", "worst m", "wrong")
-        made.append(Table("Undisturbed flights", header, calm))
-    return made
-
-
-def _jobs(options: argparse.Namespace) -> list[tuple[Path, Fault, int]]:
+def _faults() -> list[Fault]:
     faults = [*COMBINED_FAULTS, *OWN_MAPS, *GROUND_FAULTS, *CAMERA_FAULTS, *TELEMETRY_FAULTS]
-    if options.only:
-        faults = [f for f in faults if any(each in f.name for each in options.only)]
-    jobs = [(f, SEED + i) for f in faults for i in range(options.seeds)]
-    if not options.only or "undisturbed" in options.only:
-        seeds = CALM_SEEDS[:1] if options.quick else CALM_SEEDS
-        jobs += [(undisturbed(CALM_S), seed) for seed in seeds]
-    return [(options.work, fault, seed) for fault, seed in jobs]
+    return [*faults, undisturbed(CALM_S)]
 
 
-def _flown(job_number: tuple[list[str], int]) -> tuple[int, Report]:
-    """One flight by the names of its fault, for processes."""
-    arguments, index = job_number
-    options = _parser().parse_args(arguments)
-    job = _jobs(options)[index]
-    return job[2], _fly(job, options.quick)
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Fly all faults and print the tables; returns the exit code, 1 where a message was wrong."""
-    options = _parser().parse_args(arguments)
-    started = provenance("faults-quick" if options.quick else "faults")
-    begin = time.perf_counter()
-    options.work.mkdir(parents=True, exist_ok=True)
-    jobs = _jobs(options)
-    _world(options.work, "usual")  # made once, before processes share it
-    reports: list[tuple[int, Report]] = []
-    # Not forked: threads of this process would be lost in a child.
-    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
-        for seed, report in pool.map(_flown, [(list(arguments), i) for i in range(len(jobs))]):
-            reports.append((seed, report))
-            cells = _row(report) if report.fault.group != "none" else _calm_row(report, seed)
-            wall_s = time.perf_counter() - begin
-            print(f"{wall_s:5.0f} s  {' | '.join(cells)}  {report.withheld}", file=sys.stderr)
-    section = Section("Faults", _tables(reports))
-    wrong = sum(len(each.wrong()) for _, each in reports if each.fault.detectable)
-    section.facts = {
-        "views": sum(len(each.views) for _, each in reports),
-        "messages": sum(len(each.sent) for _, each in reports),
-        "wrong_messages": wrong,
-    }
-    print(section.markdown())
-    print(", ".join(f"{value:g} {key.replace('_', ' ')}" for key, value in section.facts.items()))
-    wall_s = time.perf_counter() - begin
-    save(options.out, [section], started, wall_s=wall_s, latest=False)
-    return int(wrong > 0)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.faults", description=(__doc__ or "").splitlines()[0]
-    )
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="faults whose name has this")
-    parser.add_argument(
-        "--quick", action="store_true", help="shorter flights, only one without a fault"
-    )
     parser.add_argument("--seeds", type=int, default=1, help="flights per fault (default 1)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
-    parser.add_argument("--work", type=Path, default=Path("bench_results/faults"))
-    parser.add_argument("--out", type=Path, default=Path("bench_results"))
-    return parser
+
+
+def measure(options: argparse.Namespace) -> Section:
+    """Fly all faults; failed where a message was false that could be known."""
+    _world(options.work, False)  # made once, before processes share it
+    jobs = []
+    for fault in _faults():
+        if not options.only or any(text in fault.name for text in options.only):
+            seeds = [SEED + i for i in range(options.seeds)]
+            if fault.group == "none":
+                seeds = list(CALM_SEEDS[: 1 if options.quick else None])
+            jobs += [(options.work, fault.name, seed, options.quick) for seed in seeds]
+    rows, calm, wrong = [], [], 0
+    for seed, report in side_by_side(_fly, jobs, options.jobs):
+        if report.fault.group == "none":
+            calm.append([f"seed {seed}", str(len(report.views)), *calm_cells(report)])
+        else:
+            rows.append(_row(report))
+        say(f"{' | '.join((calm if report.fault.group == 'none' else rows)[-1])} {report.withheld}")
+        wrong += len(report.wrong()) * report.fault.detectable
+    notes = (
+        f"{AGL_M:g} m above generated ground of another date than the map's, {SPEED_MPS:g} m/s "
+        f"with turns and turbulence, {VIEWS_HZ:g} Hz; s, views, sent: during the fault; worst: "
+        "from its begin to the end of the flight; false: messages of the flight more than "
+        f"{FAR_M:g} m and {FAR_STD:g} standard deviations off; recovered: from the end of the "
+        f"fault to a correct message within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s)",
+    )
+    tables = [Table("Faults", HEADER, rows, notes)] if rows else []
+    if calm:
+        header = ("undisturbed", "views", "first message s", "sent", "median m", "worst m", "false")
+        tables.append(Table("Undisturbed flights", header, calm))
+    return Section("Faults", tables, failed=wrong > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run(NAME, __doc__, measure, add))

@@ -8,16 +8,14 @@ images are involved.
 import argparse
 import math
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.record import Section, Table, number, provenance, save
+from benchmarks.record import Section, Table, number, run, say
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.simulate.motion import gauss_markov
@@ -31,13 +29,9 @@ from orthonav.ground.simulate.receiver import (
 )
 from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
-from orthonav.onboard.gnss.records import (
-    Fault,
-    GnssState,
-    GnssStatus,
-    MapPosition,
-)
+from orthonav.onboard.gnss.records import Fault, GnssState, GnssStatus, MapPosition
 
+NAME = "gnss_watch"
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
 ROLL_S = 3
@@ -260,7 +254,7 @@ def delay(
     return (found[0][0], *within[-1]) if found else (math.nan, math.nan, None)
 
 
-def false_alarm_table(hours: float, section: Section) -> Table:
+def false_alarm_table(hours: float) -> Table:
     """False alarms and learnt displacements."""
     rows: list[list[str]] = []
     for receiver in ("good", "good:std_m=5"):
@@ -268,7 +262,6 @@ def false_alarm_table(hours: float, section: Section) -> Table:
             alarms, last = false_alarms(hours, len(rows), receiver, errors)
             learnt = last.learnt
             off_m = math.hypot(*(learnt.en_m - errors.displaced_en_m))
-            section.facts[f"false alarms: {receiver}, {name}"] = len(alarms)
             std = receiver_of(receiver).std_m
             rows.append(
                 [
@@ -280,12 +273,12 @@ def false_alarm_table(hours: float, section: Section) -> Table:
                     f"{learnt.std_m:.1f}",
                 ]
             )
-            print(rows[-1], file=sys.stderr, flush=True)
+            say(" | ".join(rows[-1]))
     header = ["GNSS error", "map", "hours", "false alarms", "displacement off, m", "stated, m"]
     return Table("No fault", header, rows)
 
 
-def delay_table(trials: int, section: Section) -> Table:
+def delay_table(trials: int) -> Table:
     """Delays until faults are named."""
     rows = []
     for name, text in FAULTS.items():
@@ -294,11 +287,9 @@ def delay_table(trials: int, section: Section) -> Table:
         missed = int(np.isnan(delays).sum())
         names = Counter(each[2].value if each[2] else "none" for each in found)
         shown = ", ".join(f"{key} {count}" for key, count in names.most_common())
-        if missed < trials:
-            section.add(f"delay: {name}", "s", delays[~np.isnan(delays)], data="simulated", seed=0)
         median, most = (f"{f(delays):.1f}" for f in (np.nanmedian, np.nanmax))
         rows.append([name, str(trials), str(missed), median, most, shown])
-        print(rows[-1], file=sys.stderr, flush=True)
+        say(" | ".join(rows[-1]))
     header = ["fault", "trials", "missed", "median s", "worst s", "name after 10 s"]
     return Table("Delay until a fault is named", header, rows)
 
@@ -321,7 +312,7 @@ def recovered(
     return found
 
 
-def recovery_table(trials: int, section: Section) -> Table:
+def recovery_table(trials: int) -> Table:
     """Errors of the learnt biases over time: root mean square, and as stated."""
     scale = np.array([1.0, 1.0, math.degrees(1.0), math.degrees(1.0), 1e3])
     rows = []
@@ -339,10 +330,9 @@ def recovery_table(trials: int, section: Section) -> Table:
             pairs = [displaced, (rms[2], stated[2]), (rms[4], stated[4]), (moved, spread)]
             shown = [f"{error:.3g} / {std:.3g}" for error, std in pairs]
             rows.append([" and ".join(f"{v:g}" for v in speeds), str(minutes), *shown])
-            print(rows[-1], file=sys.stderr, flush=True)
+            say(" | ".join(rows[-1]))
     header = ["speeds, m/s", "minutes", "displacement, m", "pitch, deg", "latency, ms"]
     title = f"Learning {MAPS['usual'].displaced_m:g} m, {PITCH_DEG:g} deg and {LATE_S:g} s"
-    section.facts["trials of learning"] = trials
     return Table(f"{title}: error / stated", [*header, "their sum, m"], rows)
 
 
@@ -364,37 +354,35 @@ def slow_drag(mps: float, seed: int) -> tuple[float, float, float]:
     return math.nan, most, off_m
 
 
-def slow_drag_table(trials: int, section: Section) -> Table:
+def slow_drag_table(trials: int) -> Table:
     """Drag-offs that are slow enough to be learnt."""
     rows = []
     for mps in (0.1, 0.05, 0.02, 0.01, 0.005):
         found = np.array([slow_drag(mps, seed) for seed in range(trials)])
         missed = int(np.isnan(found[:, 0]).sum())
-        section.facts[f"slow drag-off of {mps:g} m/s: missed"] = missed
         late, most, left = (f"{value:.1f}" for value in np.nanmax(found, axis=0))
         moved = f"{np.nanmax(found[:, 0]) * mps:.0f}"
         rows.append([f"{mps:g} m/s", str(trials), str(missed), late, moved, most, left])
-        print(rows[-1], file=sys.stderr, flush=True)
+        say(" | ".join(rows[-1]))
     header = ["drag-off", "trials", "missed", "worst s", "GNSS moved, m", "learnt, m", "left, m"]
     return Table("Slow drag-offs after an hour of agreement", header, rows)
 
 
-def main(arguments: Sequence[str]) -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.gnss_watch", description=__doc__)
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hours", type=float, default=10.0, help="of each flight without a fault")
     parser.add_argument("--trials", type=int, default=20, help="of each fault")
-    parser.add_argument("--out", type=Path, default=Path("bench_results"), help="folder")
-    options = parser.parse_args(arguments)
-    started, begin = provenance("gnss-watch"), time.perf_counter()
-    section = Section("GNSS watch")
-    section.tables.append(delay_table(options.trials, section))
-    section.tables.append(recovery_table(options.trials, section))
-    section.tables.append(slow_drag_table(min(options.trials, 4), section))
-    section.tables.append(false_alarm_table(options.hours, section))
-    print(section.markdown())
-    save(options.out, [section], started, wall_s=time.perf_counter() - begin, latest=False)
+
+
+def measure(options: argparse.Namespace) -> Section:
+    hours, trials = (0.5, 1) if options.quick else (options.hours, options.trials)
+    tables = [
+        delay_table(trials),
+        recovery_table(trials),
+        slow_drag_table(min(trials, 4)),
+        false_alarm_table(hours),
+    ]
+    return Section("GNSS watch", tables)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(run(NAME, __doc__, measure, add))

@@ -1,37 +1,27 @@
 """Long flights followed over a map of another date: wind, drift, biases, clouds, kidnapping.
 
-`python -m benchmarks.long_flights [--flights 20] [--km 50] [--quick] [--only N ..] [--work DIR]`
-flies over a generated area, follows every flight with `Tracker` from no prior, and prints a table.
-Area, map, flights and what came out of each flight stay in the work folder: an interrupted run
-goes on where it ended, and `orthonav localize MAP FLIGHT --track --prior none --out fixes.jsonl`
-replays one of them. `--only` repeats the named flights even if results exist.
+`python -m benchmarks.long_flights [--flights 20] [--km 50] [--quick] [--only N ..]` flies over a
+generated area and follows every flight with `Tracker` from no prior. Rerun to resume; with
+`orthonav localize MAP FLIGHT --track --prior none --out fixes.jsonl` a flight is replayed.
 """
 
 import argparse
-import hashlib
 import json
 import math
-import os
 import sys
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
-import orthonav
-from benchmarks.flights import read_rows, write_rows
-from benchmarks.inputs import PAST, PRESENT, Workplace
-from benchmarks.record import Section, Table, number, provenance, save, sources_digest
-from benchmarks.verdicts import percent
-from orthonav.core.files import replacing
+from benchmarks.looped_flight import read_rows, route_of, write_rows
+from benchmarks.record import Section, Table, number, percent, quantiles, resumed, run, say
+from benchmarks.scenes import FAR_M, PAST, PRESENT, area, map_of
+from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
@@ -39,12 +29,11 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
-from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
-from orthonav.ground.simulate.render import Clouds
 from orthonav.onboard.run import localize_flight
 
+NAME = "long_flights"
 CAMERA = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)
 AGL_M, GSD_M, SPACING_M, SPEED_MPS, TURN_RADIUS_M = 2000.0, 2.5, 100.0, 25.0, 400.0
 AREA_M, QUICK_AREA_M, BORDER_M = 12_000, 6_000, 1300.0
@@ -56,24 +45,13 @@ SCATTER = Errors(
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
 """A kidnapped flight leaves out at least this path length and this straight distance."""
-RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 35.0, 60.0, 10
+DIVERGED_M, DIVERGED_VIEWS = 60.0, 10
 SEED = 100
 Array = NDArray[np.float64]
 HEADER = (
     *("flight", "kidnapped", "views", "all: median m", "tracking from", "median m", "95 % m"),
-    *(
-        "max m",
-        "confident",
-        "confident and wrong",
-        "diverged",
-        "back after",
-        "NEES",
-        "below 5.99",
-        "ms",
-    ),
+    *("max m", "confident", "false", "diverged", "back after", "NEES", "below 5.99", "ms"),
 )
-# What a map does not hang on.
-_NOT_IN_MAPS = ("cli", "simulate", "evaluate", "onboard", "sources", "track", "publish")
 
 
 @dataclass(frozen=True)
@@ -89,119 +67,66 @@ class Plan:
         """Every third flight, the two ways in turn."""
         return ("gap", "jump")[self.number // 3 % 2] if self.number % 3 == 1 else ""
 
-    @property
-    def name(self) -> str:
-        """Name of its files: other settings or another simulator, another name."""
-        settings = repr((asdict(self), CAMERA, AGL_M, GSD_M, SPACING_M, TURN_RADIUS_M, SCATTER))
-        digest = hashlib.sha256(settings.encode() + _digest("simulate").encode()).hexdigest()[:8]
-        return f"flight-{self.number:02d}-{digest}"
-
     def rng(self) -> np.random.Generator:
         """Random generator for values drawn once per flight."""
         return np.random.default_rng([SEED, self.number])
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Fly, follow, print and write the tables; returns the exit code."""
-    options = _parser().parse_args(arguments)
-    cv2.setNumThreads(1)
-    cv2.setRNGSeed(0)
-    start, started = time.perf_counter(), provenance("long-flights")
-    area_m = QUICK_AREA_M if options.quick else AREA_M
-    options.work.mkdir(parents=True, exist_ok=True)
-    place = Workplace(options.work, options.work / "data", options.quick)
-    past, present = place.area(area_m, GSD_M, [PAST, PRESENT])
-    localizer = Localizer(open_map(_map(options.work, place, past)))
-    km = min(options.km, 8.0) if options.quick else options.km
-    count = min(options.flights, 3) if options.quick else options.flights
-    outcomes = []
-    for index in options.only or range(count):
-        plan = Plan(index, km, area_m)
-        folder = _flown(options.work, plan, localizer, present)
-        outcomes.append(_followed(options.work, plan, folder, localizer, bool(options.only)))
-        took_s = time.perf_counter() - start
-        print(f"{took_s:5.0f} s  {'  '.join(_row(outcomes[-1]))}", file=sys.stderr, flush=True)
-    section = _section(outcomes, km, area_m)
-    print(section.markdown())
-    wall_s = time.perf_counter() - start
-    paths = save(options.out, [section], started, wall_s=wall_s, latest=False)
-    print(f"written to {', '.join(map(str, paths))}", file=sys.stderr)
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.long_flights", description=__doc__.splitlines()[0]
-    )
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flights", type=int, default=20, help="how many (default 20)")
     parser.add_argument("--km", type=float, default=50.0, help="length of each (default 50)")
-    parser.add_argument("--quick", action="store_true", help="3 flights of 8 km, a smaller area")
-    parser.add_argument(
-        "--only", type=int, nargs="+", metavar="N", help="repeat these flights only"
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="these flights only")
+
+
+def measure(options: argparse.Namespace) -> Section:
+    side_m = QUICK_AREA_M if options.quick else AREA_M
+    km = min(options.km, 8.0) if options.quick else options.km
+    count = min(options.flights, 3) if options.quick else options.flights
+    past, present = (
+        area(options.work, date, side_m=side_m, gsd_m=GSD_M) for date in (PAST, PRESENT)
     )
-    parser.add_argument("--work", type=Path, default=Path("bench_results/long_flights"))
-    parser.add_argument("--out", type=Path, default=Path("bench_results"))
-    return parser
+    map_path = map_of(past, options.work)
+    tasks = {
+        f"{i} {km:g} km {side_m} m": (Plan(i, km, side_m), options.work, map_path, present)
+        for i in options.only or range(count)
+    }
+    outcomes = []
+    for outcome in resumed(options.work / "flights.jsonl", _followed, tasks):
+        outcomes.append(outcome)
+        say("  ".join(_row(outcome)))
+    return _section(outcomes, km)
 
 
-def _digest(*parts: str, but: Sequence[str] = ()) -> str:
-    """Short digest of the package's sources, of named parts of it or all `but` some."""
-    root, digest = Path(orthonav.__file__).parent, hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        inside = path.relative_to(root)
-        tracker = but and inside.name == "tracker.py"
-        if (not parts or inside.parts[0] in parts) and inside.parts[0] not in but and not tracker:
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]
-
-
-def _map(work: Path, place: Workplace, ortho: Path) -> Path:
-    """The map with the defaults of `orthonav build`, built again when its sources changed."""
-    maps = work / f"maps-{_digest(but=_NOT_IN_MAPS)}"
-    maps.mkdir(exist_ok=True)
-    return replace(place, scratch=maps).map(ortho)
-
-
-def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
-    """Folder of the flight, simulated if absent, with the drawn values in a file."""
-    folder, about = work / plan.name, work / f"{plan.name}.plan.json"
+def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> tuple[Path, str]:
+    """Folder of the flight, simulated if absent, and the first view after a kidnapping."""
+    folder = work / f"flight-{plan.number:02d}-{plan.km:g}km-{plan.area_m}m"
+    about = folder.with_suffix(".json")
     if about.is_file():
-        return folder
+        return folder, str(json.loads(about.read_text(encoding="utf-8")))
     rng = plan.rng()
     line = random_legs(rng, plan.km * 1000, plan.area_m / 2 - BORDER_M)
-    lat, lon = localizer.sheet.frame.latlon_from_en(line)
     yaw_bias, agl_bias = rng.normal(0, 1, 2) * [YAW_BIAS_DEG, AGL_BIAS]
     wind = Wind(WIND_MPS, float(rng.uniform(0, 360)))
     errors = replace(SCATTER, yaw_bias_deg=float(yaw_bias), agl_bias=float(agl_bias))
-    seed = SEED + plan.number
     if not folder.is_dir():
         request = SimulateRequest(
             [ortho],
             folder,
-            route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+            route=route_of(localizer.sheet.frame, line),
             agl_m=AGL_M,
             spacing_m=SPACING_M,
             airspeed_mps=SPEED_MPS,
             camera=CAMERA,
             errors=errors,
-            seed=seed,
+            seed=SEED + plan.number,
             wind=wind,
             turn_radius_m=TURN_RADIUS_M,
             cloud_share=CLOUD_SHARE,
         )
         simulate_flight(request)
-    names = list(read_truth(folder / "truth.csv"))
-    clouds = Clouds(len(names), CLOUD_SHARE, seed)
-    record: dict[str, Any] = {
-        "yaw_bias_deg": errors.yaw_bias_deg,
-        "agl_bias": errors.agl_bias,
-        "wind_from_deg": wind.from_deg,
-        "clouds": {name: round(clouds.degree(index), 3) for index, name in enumerate(names)},
-        "first_after": _kidnap(folder, plan, localizer, rng) if plan.kidnapped else None,
-    }
-    with replacing(about) as temporary:
-        temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
-    return folder
+    first_after = _kidnap(folder, plan, localizer, rng) if plan.kidnapped else ""
+    write_text(about, json.dumps(first_after))
+    return folder, first_after
 
 
 def random_legs(
@@ -244,55 +169,31 @@ def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Gener
     return rows[after]["frame"]
 
 
-def _followed(
-    work: Path, plan: Plan, folder: Path, localizer: Localizer, repeat: bool
-) -> dict[str, Any]:
-    """What came out view by view, read where this very program has followed the flight before."""
-    path = work / f"{plan.name}.followed.json"
-    if path.is_file() and not repeat:
-        stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if stored["sources"] == sources_digest():
-            return stored
-    about = json.loads((work / f"{plan.name}.plan.json").read_text(encoding="utf-8"))
-    sources, truth = sources_digest(), read_truth(folder / "truth.csv")
+def _followed(task: tuple[Plan, Path, Path, Path]) -> dict[str, Any]:
+    """What came out view by view."""
+    plan, work, map_path, ortho = task
+    cv2.setNumThreads(1)
+    localizer = Localizer(open_map(map_path))
+    folder, first_after = _flown(work, plan, localizer, ortho)
+    truth = read_truth(folder / "truth.csv")
     placed = localize_flight(Tracker(localizer, use_prior=False), open_flight(folder))
-    rows = [
-        {**_record(each, localizer, truth[each.frame]), "clouds": about["clouds"][each.frame]}
-        for each in placed
-    ]
-    followed = {
+    return {
         "flight": plan.number,
         "kidnapped": plan.kidnapped,
-        "first_after": about["first_after"],
-        "sources": sources,
-        "views": rows,
+        "first_after": first_after,
+        "views": [_record(each, localizer, truth[each.frame]) for each in placed],
     }
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(followed, indent=1), encoding="utf-8")
-    return followed
 
 
 def _record(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> dict[str, Any]:
-    """One view for JSON: error east and north in m and stated values; None without a fix."""
-    out = result.outcome
-    record: dict[str, Any] = {
-        "frame": result.frame,
-        "time_s": result.time_ns / 1e9,
-        "state": result.state,
-        "ms": round(result.latency_ms, 2),
-    }
+    """One view: error east and north in m and stated values; None without a fix."""
+    out, frame = result.outcome, localizer.sheet.frame
+    record = {"frame": result.frame, "state": result.state, "ms": round(result.latency_ms, 2)}
     if not isinstance(out, Fix):
-        return {**record, "reason": out.reason, "error_en_m": None, "confidence": None}
-    frame = localizer.sheet.frame
+        return {**record, "error_en_m": None, "confidence": None}
     error = frame.en_from_latlon(out.lat_deg, out.lon_deg) - frame.en_from_latlon(*truth)
-    return {
-        **record,
-        "error_en_m": error.tolist(),
-        "confidence": out.confidence,
-        "radius_m": out.radius_m,
-        "cov_en_m2": out.cov_en_m2.tolist(),
-        "evidence": dict(out.evidence),
-    }
+    stated = {"confidence": out.confidence, "radius_m": out.radius_m}
+    return {**record, **stated, "error_en_m": error.tolist(), "cov_en_m2": out.cov_en_m2.tolist()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,7 +237,7 @@ class Figures:
     @property
     def wrong(self) -> int:
         """Number of views that are confident and wrong."""
-        far = self.errors_m > np.fmax(RIGHT_M, self.radius_m)
+        far = self.errors_m > np.fmax(FAR_M, self.radius_m)
         return int((self.confident & far).sum())
 
     @property
@@ -366,7 +267,7 @@ def _back_after(followed: dict[str, Any]) -> int | None:
     views = followed["views"]
     first = [view["frame"] for view in views].index(followed["first_after"])
     figures = Figures.of(views[first:])
-    right = np.flatnonzero(figures.tracking & (figures.errors_m <= RIGHT_M))
+    right = np.flatnonzero(figures.tracking & (figures.errors_m <= FAR_M))
     return int(right[0]) + 1 if right.size else None
 
 
@@ -385,75 +286,33 @@ def _row(followed: dict[str, Any]) -> list[str]:
         *figures.cells(),
         back,
         *figures.consistency(),
-        number(float(np.median(figures.ms))),
+        *quantiles(figures.ms, 50),
     ]
 
 
-def _section(outcomes: Sequence[dict[str, Any]], km: float, area_m: int) -> Section:
-    section = Section("Long flights")
-    every = Figures.of([view for followed in outcomes for view in followed["views"]])
-    data = f"generated {area_m} m square, {GSD_M:g} m"
-    means = []
-    for followed in outcomes:
-        figures, name = Figures.of(followed["views"]), f"flight {followed['flight']}"
-        if figures.tracking.any():
-            errors, nees = figures.errors_m[figures.tracking], figures.nees[figures.tracking]
-            section.add(f"{name}: error", "m", errors, data=data, seed=SEED)
-            means.append(float(nees.mean()))
-        section.add(f"{name}: time", "ms", figures.ms, data=data, seed=SEED)
-    lost = [f for f in outcomes if f["kidnapped"]]
-    found = sum(_back_after(followed) is not None for followed in lost)
-    divergences = sum(Figures.of(followed["views"]).divergences for followed in outcomes)
+def _section(outcomes: Sequence[dict[str, Any]], km: float) -> Section:
+    figures = [Figures.of(each["views"]) for each in outcomes]
+    every = Figures.of([view for each in outcomes for view in each["views"]])
+    means = [float(f.nees[f.tracking].mean()) for f in figures if f.tracking.any()]
+    lost = [each for each in outcomes if each["kidnapped"]]
+    found = sum(_back_after(each) is not None for each in lost)
     total = ["**all**", "", str(len(every.ms)), number(every.median_m), "", *every.cells()]
-    total[-1] = str(divergences)
+    total[-1] = str(sum(each.divergences for each in figures))
     back = f"{found} of {len(lost)}" if lost else "-"
-    total += [back, *every.consistency(), number(float(np.median(every.ms)))]
-    rows = [*map(_row, outcomes), total]
-    notes = (*_notes(km), *_nees_notes(every, means))
-    section.tables = [Table("Long flights", HEADER, rows, notes)]
-    errors = every.errors_m[every.tracking]
-    if errors.size:
-        section.facts = {
-            "long_median_m": float(np.median(errors)),
-            "long_p95_m": float(np.percentile(errors, 95)),
-            "long_nees": float(every.nees[every.tracking].mean()),
-            "long_divergences": float(divergences),
-            "long_not_recovered": float(len(lost) - found),
-        }
-    return section
-
-
-def _nees_notes(every: Figures, means: Sequence[float]) -> list[str]:
-    count = int(every.tracking.sum())
-    if not count:
-        return []
-    low, high = chi2.ppf([0.025, 0.975], 2 * count) / count
-    text = f"NEES of {count} views, were each independent: 95 % bounds {low:.2f} to {high:.2f}"
-    if len(means) > 1:
-        half = 1.96 * float(np.std(means, ddof=1)) / math.sqrt(len(means))
-        text += f"; mean of the flights {np.mean(means):.2f} +- {half:.2f} (95 %), 2 is right"
-    return [text]
-
-
-def _notes(km: float) -> tuple[str, ...]:
-    return (
-        f"{km:g} km of random legs, turns of {TURN_RADIUS_M:g} m radius, {AGL_M:g} m above ground, "
-        f"a view every {SPACING_M / SPEED_MPS:g} s (about {SPACING_M:g} m), over another date than "
-        f"the map's; wind {WIND_MPS:g} m/s; reported velocity off by {DRIFT:.0%} of scale and "
-        f"{DRIFT:g} rad; heading by {YAW_BIAS_DEG:g} deg, drawn once per flight, and "
-        f"{SCATTER.yaw_std_deg:g} deg at every view; height by {AGL_BIAS:.0%} and "
-        f"{SCATTER.agl_std:.0%}; tilt {SCATTER.attitude_std_deg:g} deg, reported with an error of "
-        f"{SCATTER.tilt_std_deg:g} deg (all standard deviations); clouds over {CLOUD_SHARE:.0%} of "
-        "the route; no prior, whole map, one core",
-        f"kidnapped: {GAP_M / 1000:g} km or more left out in the middle, no velocity reported; "
-        "gap: the clock runs on, jump: it does not; back after: views until tracking and within "
-        f"{RIGHT_M:g} m again",
-        "all: median: of views that have a position; median, 95 %, max, NEES: of tracking views; "
-        "confident: confidence of 0.9 or more, of all views; "
-        f"wrong: more than {RIGHT_M:g} m and the stated radius off; diverged: more than "
-        f"{DIVERGED_VIEWS} tracking views in a row more than {DIVERGED_M:g} m off",
+    total += [back, *every.consistency(), *quantiles(every.ms, 50)]
+    half = 1.96 * float(np.std(means, ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else 0.0
+    notes = (
+        f"{km:g} km of random legs over another date than the map's, {AGL_M:g} m high, a view "
+        f"every {SPACING_M:g} m, wind, biases drawn per flight, clouds over {CLOUD_SHARE:.0%}; "
+        "no prior, whole map; kidnapped: gap: the clock runs on, jump: it does not",
+        "median, 95 %, max, NEES: of tracking views; false: confident, more than "
+        f"{FAR_M:g} m and the stated radius off; diverged: more than {DIVERGED_VIEWS} tracking "
+        f"views in a row more than {DIVERGED_M:g} m off; NEES 2 is right, mean of the flights "
+        f"{np.mean(means) if means else math.nan:.2f} +- {half:.2f}",
     )
+    rows = [*map(_row, outcomes), total]
+    return Section("Long flights", [Table("Long flights", HEADER, rows, notes)])
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run(NAME, __doc__, measure, add))

@@ -1,9 +1,10 @@
 """Looped flights played in real time: one lap is rendered, cached and repeated."""
 
+import csv
 import hashlib
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
@@ -11,11 +12,9 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-import orthonav.ground.simulate as simulate
-from benchmarks.flights import read_rows, write_rows
-from benchmarks.inputs import FLIGHT_SEED, Workplace
+from orthonav.core.files import replacing
 from orthonav.core.flight import read_truth
-from orthonav.core.geo import camera, lens
+from orthonav.core.geo import camera
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.planning.route import Route
@@ -31,6 +30,7 @@ AGL_M, SPEED_MPS = 250.0, 25.0
 HALF_M, TURN_RADIUS_M = 300.0, 120.0
 LINE_EN_M = ((0, 1), (1, 1), (1, -1), (-1, -1), (-1, 1), (0, 1))
 """Corners of a lap in `HALF_M` from the middle of the map; it ends where it begins."""
+SEED = 7
 ERRORS = Errors(
     yaw_std_deg=0.5,
     agl_std=0.01,
@@ -59,24 +59,28 @@ class LoopedFlight:
         return np.array(line, np.float64) * HALF_M
 
 
-def rendered(place: Workplace, ortho: Path, frame: LocalFrame, lap: LoopedFlight) -> Path:
-    """Flight folder of a lap, cached until its settings or the simulator change."""
+def route_of(frame: LocalFrame, corners_en_m: Array) -> Route:
+    """A route along corners (N, 2)."""
+    lat, lon = frame.latlon_from_en(corners_en_m)
+    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
+
+
+def rendered(work: Path, ortho: Path, frame: LocalFrame, lap: LoopedFlight) -> Path:
+    """Flight folder of a lap, rendered once."""
     settings = repr((lap, lap.corners_en_m.tolist(), AGL_M, SPEED_MPS, TURN_RADIUS_M, ERRORS))
-    digest = hashlib.sha256(settings.encode() + ortho.parent.name.encode())
-    digest.update(_sources())
-    folder = place.cache / f"lap-{lap.camera.width_px}-{digest.hexdigest()[:8]}"
+    digest = hashlib.sha256(settings.encode() + ortho.parent.name.encode()).hexdigest()
+    folder = work / f"lap-{lap.camera.width_px}-{digest[:8]}"
     if not folder.is_dir():
-        lat, lon = frame.latlon_from_en(lap.corners_en_m)
         request = SimulateRequest(
             [ortho],
             folder,
-            route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+            route=route_of(frame, lap.corners_en_m),
             agl_m=AGL_M,
             spacing_m=SPEED_MPS / lap.rate_hz,
             airspeed_mps=SPEED_MPS,
             camera=lap.camera,
             errors=ERRORS,
-            seed=FLIGHT_SEED,
+            seed=SEED,
             turn_radius_m=TURN_RADIUS_M,
         )
         with patch.object(render, "undistort", _kept(camera.undistort)):
@@ -95,15 +99,6 @@ def _kept(undistort: Callable[[Camera, Array], Array]) -> Callable[[Camera, Arra
         return found[key]
 
     return once
-
-
-def _sources() -> bytes:
-    """Digest of what makes the pictures."""
-    digest = hashlib.sha256()
-    paths = sorted(Path(str(simulate.__file__)).parent.glob("*.py"))
-    for path in [*paths, Path(camera.__file__), Path(lens.__file__)]:
-        digest.update(path.read_bytes())
-    return digest.digest()
 
 
 def played(
@@ -144,6 +139,20 @@ def rest_of(folder: Path, out: Path, from_s: float) -> Path:
     shutil.copyfile(folder / "flight.json", out / "flight.json")
     (out / "frames").symlink_to((folder / "frames").resolve(), target_is_directory=True)
     return out
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a table with a header, as text."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def write_rows(path: Path, rows: Sequence[dict[str, str]]) -> None:
+    """Write what `read_rows` reads."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def views_of(folder: Path) -> int:

@@ -6,12 +6,11 @@ It imports nothing but what it measures. `python -m benchmarks.placing JSON` pri
 import importlib
 import json
 import math
-import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,8 @@ if TYPE_CHECKING:
     from orthonav.core.geo.frames import LocalFrame
     from orthonav.core.records import View
 
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    Placer = Callable[[View], Any]
+
 BOTH, TILES, REGISTRATION = OWN = "both", "tiles", "registration"
 TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "sift"
 
@@ -35,9 +35,6 @@ class Task:
     - `pixels`: orthophoto in the map's raster, for methods other than orthonav's.
     - `factor`: map pixels averaged to one, for methods other than orthonav's.
     - `telemetry_only`: try the reported pose only.
-    - `views`: largest number of views; None: all.
-    - `track`: follow the views as one flight instead of placing them one by one.
-    - `threads`: threads that share the search of a view, for orthonav's methods.
     """
 
     method: str
@@ -48,69 +45,85 @@ class Task:
     pixels: str = ""
     factor: int = 1
     telemetry_only: bool = False
-    views: int | None = None
-    track: bool = False
-    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class FlownView:
+    """A view, the name of its image, and where it was taken."""
+
+    frame: str
+    view: "View"
+    truth_latlon_deg: tuple[float, float]
+
+
+def views_in(folder: Path) -> Iterator[FlownView]:
+    """Views of a flight folder, each read on demand."""
+    from orthonav.core.flight import open_flight, read_truth
+    from orthonav.core.flight.folder import read_image
+    from orthonav.core.records import View
+
+    recorded, truth = open_flight(folder), read_truth(folder / "truth.csv")
+    for each in recorded.views:
+        if each.frame in truth:
+            view = View(read_image(each.path), recorded.camera, each.telemetry)
+            yield FlownView(each.frame, view, truth[each.frame])
 
 
 def placed(task: Task) -> dict[str, Any]:
     """Run a task in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.placing", json.dumps(asdict(task))]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
-    result: dict[str, Any] = json.loads(done.stdout)
+    result: dict[str, Any] = child("placing", json.dumps(asdict(task)))
     return result
 
 
+def child(module: str, *arguments: str) -> Any:
+    """The JSON in the last line that a module of the benchmarks prints, in a process of its own."""
+    command = [sys.executable, "-m", f"benchmarks.{module}", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def memory_mb(kind: str = "VmHWM") -> float:
+    """Resident memory of this process in MB: the largest (`VmHWM`), or now (`VmRSS`).
+
+    Linux's own count: `ru_maxrss` of a started process also remembers its parent's memory.
+    """
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{kind}:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    raise RuntimeError(f"this system does not report {kind} of a process")
+
+
 def run(task: Task) -> dict[str, Any]:
-    """Place every view, the first one twice: cold, and again when warm; once, where it is tracked.
+    """Place every view, the first one twice: cold, and again when warm.
 
     `rows` hold east and north error in m, confidence, radius in m, the covariance's three numbers
-    and the processor time in ms; NaN where there is none. `wall_ms` are times on the clock.
+    and the processor time in ms; NaN where there is none.
     """
     import cv2
 
-    from benchmarks.child import memory_mb
-    from benchmarks.flights import read_views
     from orthonav.core.mapfile import open_map
 
     if task.method in OWN:
-        importlib.import_module(
-            "orthonav.core.localize"
-        )  # opening a map is timed, importing is not
-
+        importlib.import_module("orthonav.core.localize")  # opening a map is timed, importing not
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
-    _, views = read_views(Path(task.flight))
     start = time.perf_counter()
     place = _method(task)
     opened_ms = 1e3 * (time.perf_counter() - start)
     frame = open_map(Path(task.map_path)).manifest.sheets[0].frame
-    cold_ms, rows, wall_ms = math.nan, [], []
-    for number, flown in enumerate(views):
-        if number == task.views:
-            break
-        if number == 0 and not task.track:
+    cold_ms: float = math.nan
+    rows: list[list[float]] = []
+    for flown in views_in(Path(task.flight)):
+        if not rows:
             cold_ms = _timed(place, flown.view)[1]
-        start = time.perf_counter()
         found, took_ms = _timed(place, flown.view)
-        wall_ms.append(1e3 * (time.perf_counter() - start))
         rows.append([*row_of(found, frame, flown.truth_latlon_deg), took_ms])
-    return {
-        "rows": rows,
-        "wall_ms": wall_ms,
-        "opened_ms": opened_ms,
-        "cold_ms": rows[0][-1] if task.track else cold_ms,
-        "peak_mb": memory_mb("VmHWM"),
-        "mapped_mb": memory_mb("RssFile"),
-    }
+    return {"rows": rows, "opened_ms": opened_ms, "cold_ms": cold_ms, "peak_mb": memory_mb()}
 
 
-Placer = Callable[["View"], Any]
-
-
-def _timed(place: Placer, view: "View") -> tuple[Any, float]:
+def _timed(place: "Placer", view: "View") -> tuple[Any, float]:
     start = time.process_time()
     found = place(view)
     return found, 1e3 * (time.process_time() - start)
@@ -132,43 +145,24 @@ def row_of(found: Any, frame: "LocalFrame", truth_latlon_deg: tuple[float, float
     return [float(v) for v in (*error, found.confidence, found.radius_m, *spread)]
 
 
-def _method(task: Task) -> Placer:
-    return _orthonav(task) if task.method in OWN else _other(task)
-
-
-def _orthonav(task: Task) -> Placer:
+def _method(task: Task) -> "Placer":
+    if task.method not in OWN:
+        return _other(task)
     from orthonav.core.localize import Localizer
-    from orthonav.core.localize.policy import DEFAULT_PLAN
     from orthonav.core.mapfile import open_map
-    from orthonav.core.track.tracker import Tracker
 
-    localizer = Localizer(
-        open_map(Path(task.map_path)),
-        registration=task.method != TILES,
-        plan=replace(DEFAULT_PLAN, threads=task.threads),
-    )
-    if task.method == REGISTRATION:
-        without_tiles(localizer)
-    if task.track:
-        return Tracker(localizer, heading_known=task.heading_known, use_prior=task.use_prior).locate
+    localizer = Localizer(open_map(Path(task.map_path)), registration=task.method != TILES)
+    if task.method == REGISTRATION:  # the whole sheet is searched by FFT, never asking for tiles
+        setattr(localizer.registration, "propose", None)  # noqa: B010
 
     def place(view: "View") -> Any:
-        return localizer.locate(
-            view,
-            prior=view.telemetry.prior if task.use_prior else None,
-            heading_known=task.heading_known,
-        )
+        prior = view.telemetry.prior if task.use_prior else None
+        return localizer.locate(view, prior=prior, heading_known=task.heading_known)
 
     return place
 
 
-def without_tiles(localizer: Any) -> None:
-    """Registration that searches the whole sheet by FFT and never asks for tiles."""
-    if hasattr(localizer.registration, "propose"):
-        localizer.registration.propose = None
-
-
-def _other(task: Task) -> Placer:
+def _other(task: Task) -> "Placer":
     from benchmarks import posed
 
     picture = posed.Picture.read(Path(task.map_path), Path(task.pixels), task.factor)
@@ -183,14 +177,8 @@ def _other(task: Task) -> Placer:
             MUTUAL: lambda: posed.MutualSurface(picture),
         }
         method = posed.BestOfPoses(picture, surfaces[task.method](), task.telemetry_only)
-
-    def place(view: "View") -> Any:
-        return method.locate(view, task.heading_known)
-
-    return place
+    return lambda view: method.locate(view, task.heading_known)
 
 
 if __name__ == "__main__":
-    for name in THREADS:
-        os.environ[name] = "1"
     print(json.dumps(run(Task(**json.loads(sys.argv[1])))))

@@ -15,20 +15,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines import canny_edges
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import View
 from orthonav.core.register.search import bank
+from orthonav.core.tiles.represent import Canny
 
 Array = NDArray[np.float32]
 Place = NDArray[np.float64] | None
 TURN_STEP_DEG, SCALE_STEP, SIGMAS = 8.0, 0.13, 3.0
 SCALE_STD = 0.1
 LEVELS_MI = 6
-MAP_ORB, VIEW_ORB = 40_000, 2_000
-"""Number of ORB keypoints of 4 km2 of map, and of a view."""
 LOWE, MIN_INLIERS, RANSAC_PX, BORDER_PX = 0.75, 8, 4.0, 9
 
 
@@ -46,7 +44,7 @@ class Picture:
 
     @classmethod
     def read(cls, map_path: Path, pixels_path: Path, factor: int) -> "Picture":
-        """From the files that `benchmarks.side_by_side` stored with a map."""
+        """From the file that `scenes.store` made with a map."""
         with np.load(pixels_path) as stored:
             grey, valid = stored["grey"], stored["valid"]
         size = grey.shape[1] // factor, grey.shape[0] // factor
@@ -242,42 +240,30 @@ class MutualSurface:
 
 
 class Keypoints:
-    """SIFT or ORB of the view against the map: ratio test, RANSAC similarity.
+    """SIFT of the view against all of the map's, through an index that is made once: ratio test,
+    RANSAC similarity."""
 
-    With `near_m` the keypoints within that distance of the prior are compared exhaustively;
-    without, all keypoints of the map, through an index that is made once.
-    """
+    def __init__(self, picture: Picture) -> None:
+        self._picture = picture
+        self._detector: Any = cv2.SIFT_create()  # type: ignore[attr-defined]  # not in its stubs
+        self._points, descriptors = self._features(picture.grey, picture.valid)
+        self._matcher: Any = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 64})
+        self._matcher.add([descriptors])
+        self._matcher.train()
 
-    def __init__(self, picture: Picture, *, orb: bool = False, near_m: float | None = None) -> None:
-        self._picture, self._near_m = picture, near_m
-        # `SIFT_create` and `ORB_create` are not in the stubs of OpenCV.
-        self._detector: Any = cv2.SIFT_create()  # type: ignore[attr-defined]
-        index: dict[str, Any] = {"algorithm": 1, "trees": 5}
-        if orb:
-            self._detector = cv2.ORB_create(nfeatures=MAP_ORB)  # type: ignore[attr-defined]
-            index = {"algorithm": 6, "table_number": 6, "key_size": 12, "multi_probe_level": 1}
-        self._points, self._descriptors = self._features(picture.grey, picture.valid)
-        self._norm = cv2.NORM_HAMMING if orb else cv2.NORM_L2
-        self._matcher: Any = cv2.FlannBasedMatcher(index, {"checks": 64})
-        if near_m is None:
-            self._matcher.add([self._descriptors])
-            self._matcher.train()
-        if orb:
-            self._detector.setMaxFeatures(VIEW_ORB)
-
-    def locate(self, view: View, heading_known: bool, near_en_m: Place = None) -> Place:
+    def locate(self, view: View, heading_known: bool) -> Place:
         """Position of the centre of the view; None with too few inliers. No heading is needed."""
         seen = next(posed(view, self._picture.gsd_m, [(0.0, 1.0)]))
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < MIN_INLIERS:
             return None
-        theirs, pairs = self._pairs(descriptors, near_en_m)
+        pairs = self._matcher.knnMatch(descriptors, k=2)
         good = [a for a, b in (p for p in pairs if len(p) == 2) if a.distance < LOWE * b.distance]
         if len(good) < MIN_INLIERS:
             return None
         matrix, inliers = cv2.estimateAffinePartial2D(
             points[[match.queryIdx for match in good]],
-            theirs[[match.trainIdx for match in good]],
+            self._points[[match.trainIdx for match in good]],
             method=cv2.RANSAC,
             ransacReprojThreshold=RANSAC_PX,
         )
@@ -286,18 +272,6 @@ class Keypoints:
         centre = matrix @ [*(np.array(seen.grey.shape[::-1]) / 2), 1.0]
         return np.asarray(self._picture.place_en_m(*centre) - seen.offset_en_m)
 
-    def _pairs(
-        self, descriptors: NDArray[Any], near_en_m: Place
-    ) -> tuple[NDArray[np.float64], Any]:
-        """Compared keypoints of the map (N, 2), and two nearest neighbours of each of the view."""
-        if self._near_m is None or near_en_m is None:
-            return self._points, self._matcher.knnMatch(descriptors, k=2)
-        grid, gsd_m = self._picture.grid, self._picture.gsd_m
-        col, row = (near_en_m - [grid.west_m, grid.north_m]) / [gsd_m, -gsd_m]
-        near = np.hypot(*(self._points - [col, row]).T) * gsd_m <= self._near_m
-        each: Any = cv2.BFMatcher(self._norm)
-        return self._points[near], each.knnMatch(descriptors, self._descriptors[near], k=2)
-
     def _features(
         self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[Any]]:
@@ -305,6 +279,11 @@ class Keypoints:
         mask = cv2.erode(valid.astype(np.uint8), kernel, borderValue=1)
         keypoints, descriptors = self._detector.detectAndCompute(grey, mask)
         return np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5, descriptors
+
+
+def canny_edges(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Edge map (H, W) of 0 and 255."""
+    return np.asarray(Canny()(grey, valid)[0] * 255, dtype=np.uint8)
 
 
 def _classes(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.intp]:

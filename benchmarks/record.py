@@ -1,68 +1,31 @@
-"""What a run leaves behind: measurements for programs, tables for people, and the machine."""
+"""How a question is run, and what it leaves: tables for people, rows for programs, the machine."""
 
+import argparse
+import contextlib
 import datetime
-import hashlib
 import json
 import math
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
-
-import orthonav
 
 PACKAGES = (
-    "orthonav",
-    "numpy",
-    "scipy",
-    "opencv-python-headless",
-    "safetensors",
-    "pymavlink",
-    "mcap",
-    "rasterio",
-    "torch",
-    "onnx",
-    "onnxruntime",
-    "faiss-cpu",
-    "scikit-image",
-    "transformers",
-    "playwright",
-    "XStatic-Leaflet",
+    *("orthonav", "numpy", "scipy", "opencv-python-headless", "safetensors", "pymavlink", "mcap"),
+    *("rasterio", "torch", "onnx", "onnxruntime", "faiss-cpu", "scikit-image", "transformers"),
 )
-WILSON_Z = 1.2816
-"""For 80 % intervals of shares, so that their p10 and p90 mean what those of timings mean."""
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One measured quantity.
-
-    - `section`, `name`: section of the report, and name of the quantity.
-    - `unit`: its unit; "1" for a share.
-    - `median`, `p10`, `p90`, `p99`: quantiles of the samples. For a share, `median` is the
-      share, and p10 to p90 is its Wilson interval.
-    - `n`: number of samples.
-    - `data`, `seed`: input data, and the seed it was generated with.
-    """
-
-    section: str
-    name: str
-    unit: str
-    median: float
-    p10: float
-    p90: float
-    p99: float | None
-    n: int
-    data: str
-    seed: int | None
+Adds = Callable[[argparse.ArgumentParser], None]
 
 
 @dataclass(frozen=True)
@@ -91,47 +54,15 @@ class Table:
 
 @dataclass
 class Section:
-    """Everything one part of the suite found. `facts` are figures that targets ask for."""
+    """What a question found. `failed`: whether the exit code says so."""
 
     title: str
     tables: list[Table] = field(default_factory=list)
-    measurements: list[Measurement] = field(default_factory=list)
-    facts: dict[str, float] = field(default_factory=dict)
-
-    def add(
-        self, name: str, unit: str, samples: ArrayLike, *, data: str, seed: int | None = None
-    ) -> Measurement:
-        """Keep the median and the spread of samples (N,)."""
-        values = np.asarray(samples, dtype=np.float64).reshape(-1)
-        p10, median, p90, p99 = (float(v) for v in np.percentile(values, [10, 50, 90, 99]))
-        tail = p99 if len(values) >= 50 else None
-        made = Measurement(self.title, name, unit, median, p10, p90, tail, len(values), data, seed)
-        self.measurements.append(made)
-        return made
-
-    def add_share(self, name: str, hits: ArrayLike, *, data: str, seed: int) -> Measurement:
-        """Keep the share of true values among (N,) and the interval it is known to."""
-        values = np.asarray(hits, dtype=bool).reshape(-1)
-        low, high = _wilson(int(values.sum()), len(values))
-        share = float(values.mean())
-        made = Measurement(self.title, name, "1", share, low, high, None, len(values), data, seed)
-        self.measurements.append(made)
-        return made
+    failed: bool = False
 
     def markdown(self) -> str:
         """Title and tables in Markdown."""
-        if len(self.tables) == 1:
-            return self.tables[0].markdown(level=2)
         return "\n".join([f"## {self.title}", "", *(table.markdown() for table in self.tables)])
-
-
-def _wilson(hits: int, count: int) -> tuple[float, float]:
-    """Wilson interval of a share (Wilson 1927)."""
-    share, z2 = hits / count, WILSON_Z**2
-    centre = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = WILSON_Z * math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
-    half /= 1 + z2 / count
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def number(value: float) -> str:
@@ -142,74 +73,107 @@ def number(value: float) -> str:
     return f"{value:,.{min(6, max(0, digits))}f}"
 
 
-def timing_cells(timing: Measurement) -> list[str]:
-    """Median, p10, p90 and p99 as cells of a table."""
-    tail = "-" if timing.p99 is None else number(timing.p99)
-    return [number(timing.median), number(timing.p10), number(timing.p90), tail]
+def percent(share: float, digits: int = 0) -> str:
+    """A share as text."""
+    return "-" if math.isnan(share) else f"{share:.{digits}%}"
 
 
-TARGETS = (
-    ("naip_build_s", "NAIP map (17 km2 at 5 m, 256 px tiles) built in, s", 10.0),
-    ("view_ms", "one view, embedding only, 3 headings, one core, ms", 10.0),
-    ("search_100k_ms", "3 queries on 100,000 tiles, one core, ms", 10.0),
-    (
-        "map_mb_per_km2",
-        "map at 1 m, 256 px tiles, 87.5 % overlap, less registration layer, MB per km2",
-        0.3,
-    ),
-    ("onboard_p99_ms", "exposure to message at 5 Hz, 1280 x 960 px, one core, p99 ms", 60.0),
-    ("onboard_peak_mb", "resident memory in flight, largest, MB", 350.0),
-)
+def quantiles(values: Any, *percents: float) -> list[str]:
+    """Percentiles of values (N,) as cells of a table."""
+    known = np.asarray(values, np.float64)
+    return [number(float(np.percentile(known, p))) if known.size else "-" for p in percents]
 
 
-def targets_table(done: Sequence[Section]) -> Section:
-    """Each target with its measured value."""
-    facts = {key: value for section in done for key, value in section.facts.items()}
-    rows = []
-    for key, text, limit in TARGETS:
-        found = facts.get(key)
-        verdict = "not measured" if found is None else "yes" if found < limit else "NO"
-        rows.append([text, f"< {number(limit)}", "-" if found is None else number(found), verdict])
-    header = ("target", "limit", "measured", "met")
-    return Section("Targets", [Table("Targets", header, rows)], facts=facts)
+def say(text: str) -> None:
+    """A line on stderr."""
+    print(text, file=sys.stderr, flush=True)
 
 
-def save(
-    out: Path, done: Sequence[Section], started: dict[str, Any], *, wall_s: float, latest: bool
-) -> list[Path]:
-    """Write JSON and Markdown named by date and commit; also `latest.md` after a full run.
+def options_of(
+    name: str, about: str | None, add: Adds | None, arguments: Sequence[str]
+) -> argparse.Namespace:
+    """Options of a question: those of all, and what `add` adds."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{name}", description=str(about).splitlines()[0]
+    )
+    parser.add_argument("--quick", action="store_true", help="smaller areas, fewer views")
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR", help="maps, flights and rows are kept here"
+    )
+    parser.add_argument("--out", type=Path, default=Path("bench_results"), metavar="DIR")
+    if add is not None:
+        add(parser)
+    options = parser.parse_args(arguments)
+    options.work = options.work or options.out / "work" / name
+    options.work.mkdir(parents=True, exist_ok=True)
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    return options
 
-    `started` is the `provenance` taken before anything was measured.
+
+def run(
+    name: str,
+    about: str | None,
+    measure: Callable[[argparse.Namespace], Section],
+    add: Adds | None = None,
+) -> int:
+    """Run a question by the command line, print its tables, write them; returns the exit code."""
+    options = options_of(name, about, add, sys.argv[1:])
+    start, started = time.perf_counter(), provenance(name)
+    section = measure(options)
+    print(section.markdown(), flush=True)
+    save(options.out, [section], started, time.perf_counter() - start)
+    return int(section.failed)
+
+
+def side_by_side(
+    function: Callable[[Any], Any], tasks: Sequence[Any], workers: int
+) -> Iterator[Any]:
+    """`function(task)` of each task, in order, by so many processes."""
+    if workers == 1:
+        yield from map(function, tasks)
+        return
+    # Not forked: threads of this process would be lost in a child.
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        yield from pool.map(function, tasks)
+
+
+def resumed(
+    path: Path, function: Callable[[Any], Any], tasks: dict[str, Any], workers: int = 1
+) -> Iterator[Any]:
+    """`function(task)` by key, in order, as JSON; each is a line of `path` as soon as it is there.
+
+    Those that have a line are not made again, so an interrupted run goes on.
     """
-    same = started["sources"] == sources_digest()
-    about = {
-        **started,
-        "wall_s": round(wall_s),
-        "load_1_5_15_min": " ".join(f"{load:.2f}" for load in os.getloadavg()),
-        "sources": started["sources"] if same else "CHANGED DURING THE RUN: figures are mixed",
-    }
-    plain = {
-        **about,
-        "measurements": [asdict(one) for section in done for one in section.measurements],
-        "facts": done[-1].facts,
-    }
-    commit = str(about["commit"])[:10]
-    stem = f"{about['date'][:19].replace(':', '')}-{commit}-{about['run']}"
-    head = "\n".join(f"- {key}: {_said(value)}" for key, value in about.items())
-    text = "\n".join([head, "", *(section.markdown() for section in done)])
-    contents = {f"{stem}.json": json.dumps(plain, indent=1) + "\n", f"{stem}.md": text}
-    if latest:
-        contents["latest.md"] = text
+    found: dict[str, Any] = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+        with contextlib.suppress(ValueError):  # the line that was being written
+            found.update([json.loads(line)])
+    missing = [key for key in tasks if key not in found]
+    with path.open("a", encoding="utf-8") as stream:
+        stream.write("\n" if path.stat().st_size else "")
+        made = side_by_side(function, [tasks[key] for key in missing], workers)
+        for key in tasks:
+            if key not in found:
+                found[key] = next(made)
+                stream.write(json.dumps([key, found[key]]) + "\n")
+                stream.flush()
+            yield found[key]
+
+
+def save(out: Path, done: Iterable[Section], started: dict[str, Any], wall_s: float) -> None:
+    """Write JSON and Markdown named by date and commit. `started`: the `provenance` of before."""
+    load = " ".join(f"{value:.2f}" for value in os.getloadavg())
+    about = {**started, "wall_s": round(wall_s), "load_1_5_15_min": load}
+    stem = f"{about['date'][:19].replace(':', '')}-{about['commit'][:10]}-{about['run']}"
+    head = "\n".join(f"- {key}: {value}" for key, value in about.items())
+    sections = list(done)
+    plain = {**about, "sections": [asdict(section) for section in sections]}
     out.mkdir(parents=True, exist_ok=True)
-    for name, content in contents.items():
-        (out / name).write_text(content, encoding="utf-8")
-    return [out / name for name in contents]
-
-
-def _said(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {item}" for key, item in value.items())
-    return str(value)
+    text = "\n".join([head, "", *(section.markdown() for section in sections)])
+    (out / f"{stem}.md").write_text(text, encoding="utf-8")
+    (out / f"{stem}.json").write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    say(f"{wall_s:5.0f} s  written to {out / stem}.md and .json")
 
 
 def provenance(run: str) -> dict[str, Any]:
@@ -220,7 +184,6 @@ def provenance(run: str) -> dict[str, Any]:
         "commit": git("rev-parse", "HEAD") or "unknown",
         "dirty": bool(git("status", "--porcelain")),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "sources": sources_digest(),
         "run": run,
         "cpu": _cpu(),
         "cores": os.cpu_count(),
@@ -228,19 +191,7 @@ def provenance(run: str) -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
-        "threads": {
-            "BLAS": os.environ.get("OPENBLAS_NUM_THREADS", "unset"),
-            "OpenCV": f"{cv2.getNumThreads()} (map builds: all cores)",
-        },
     }
-
-
-def sources_digest() -> str:
-    """Short digest of the package's sources, to detect changes during a run."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(orthonav.__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 def _version(name: str) -> str:

@@ -1,122 +1,94 @@
-"""Following a flight against placing its views one by one: time, accuracy, growth with the map."""
+"""Following a flight against localizing its views one by one: time and accuracy by map size."""
 
+import argparse
 import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
-from benchmarks.record import Section, Table, number
-from benchmarks.verdicts import percent
+from benchmarks.looped_flight import route_of
+from benchmarks.record import Section, Table, number, percent, quantiles, run, say
+from benchmarks.scenes import FAR_M, PAST, PRESENT, area, map_of
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import CONFIDENT, Fix, ViewResult
+from orthonav.core.records import Fix
 from orthonav.core.track.tracker import Tracker
-from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.onboard.run import Locator, SingleViews, localize_flight
 
+NAME = "tracking"
 SIDES_M = (1000, 4000, 10000)
 TURNS_EN_M = ((-330, -330), (-330, 300), (-60, 330), (60, -330), (330, -300), (330, 330))
 """A route over the inner kilometre, metres east and north of its centre."""
-SPACING_M, AGL_M = 40.0, 150.0
-ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
+SPACING_M, AGL_M, SEED, RIGHT_M = 40.0, 150.0, 7, 15.0
 HEADER = (
-    *("area km2", "views", "method", "ms", "p99 ms", "first view ms", "found at view"),
-    *("15 m", "median m", "confident and wrong"),
+    *("area km2", "views", "method", "ms", "p99 ms", "found at view", "15 m", "median m"),
+    "false",
 )
-RIGHT_M = 15.0
 
 
-def measure(place: Workplace) -> Section:
+def measure(options: argparse.Namespace) -> Section:
     """The same views over maps of growing size, followed and one by one."""
-    section = Section("Following a flight")
-    present = place.area(SIDES_M[0], 1.0, [PRESENT])[0]
+    present = area(options.work, PRESENT, side_m=SIDES_M[0])
     rows = []
-    for side_m in SIDES_M[:1] if place.quick else SIDES_M:
-        localizer = Localizer(open_map(place.map(place.area(side_m, 1.0, [PAST])[0])))
-        folder = _flown(place, localizer, present)
-        for method in ("tracked", "one by one"):
-            locator: Locator = SingleViews(localizer, use_prior=False)
-            if method == "tracked":
-                locator = Tracker(localizer, use_prior=False)
-            rows.append(_row(section, side_m, method, localizer, folder, locator))
-            print(f"        {side_m} m, {method} done", file=sys.stderr, flush=True)
+    for side_m in SIDES_M[:1] if options.quick else SIDES_M:
+        past = area(options.work, PAST, side_m=side_m)
+        localizer = Localizer(open_map(map_of(past, options.work)))
+        folder = _flown(options.work, localizer, present)
+        locators: dict[str, Locator] = {
+            "tracked": Tracker(localizer, use_prior=False),
+            "one by one": SingleViews(localizer, use_prior=False),
+        }
+        for method, locator in locators.items():
+            cells = _cells(localizer, folder, locator)
+            rows.append([number((side_m / 1000) ** 2), cells[0], method, *cells[1:]])
+            say("  ".join(rows[-1]))
     notes = (
-        f"a flight of {AGL_M:g} m height, a view every {SPACING_M:g} m, 1 s apart, of another date "
-        "than the map's, heading off by 5 deg and height by 5 % (standard deviations, drawn for "
-        "each view), no prior, whole map; one core",
+        f"{AGL_M:g} m height, a view every {SPACING_M:g} m, 1 s apart, of another date, heading "
+        "off by 5 deg and height by 5 % (standard deviations), no prior, whole map; one core",
         "found at view: the first that is tracking; 15 m, median, ms and p99 from there on (one by "
-        "one: of all); confident and wrong: views more than 35 m off with a confidence of at "
-        "least 0.9",
+        "one: of all); false: confident and more than 35 m off",
     )
-    section.tables = [Table("Following a flight", HEADER, rows, notes)]
-    return section
+    return Section("Following a flight", [Table("Following a flight", HEADER, rows, notes)])
 
 
-def _flown(place: Workplace, localizer: Localizer, present: Path) -> Path:
-    folder = place.scratch / f"followed-{present.parent.name}"
+def _flown(work: Path, localizer: Localizer, present: Path) -> Path:
+    folder = work / "followed"
     if not folder.is_dir():
-        turns = TURNS_EN_M[:2] if place.quick else TURNS_EN_M
-        lat, lon = localizer.sheet.frame.latlon_from_en(np.array(turns, np.float64))
         request = SimulateRequest(
             [present],
             folder,
-            route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+            route=route_of(localizer.sheet.frame, np.array(TURNS_EN_M, np.float64)),
             agl_m=AGL_M,
             spacing_m=SPACING_M,
-            errors=ERRORS,
-            seed=FLIGHT_SEED,
+            errors=Errors(yaw_std_deg=5.0, agl_std=0.05),
+            seed=SEED,
         )
         simulate_flight(request)
     return folder
 
 
-def _row(
-    section: Section,
-    side_m: int,
-    method: str,
-    localizer: Localizer,
-    folder: Path,
-    locator: Locator,
-) -> list[str]:
+def _cells(localizer: Localizer, folder: Path, locator: Locator) -> list[str]:
     results = list(localize_flight(locator, open_flight(folder)))
-    truth = read_truth(folder / "truth.csv")
-    errors = np.array([_error_m(each, localizer, truth[each.frame]) for each in results])
-    confident = np.array(
-        [isinstance(r.outcome, Fix) and r.outcome.confidence >= CONFIDENT for r in results]
-    )
-    times = np.array([each.latency_ms for each in results])
-    tracking = [number for number, r in enumerate(results) if r.state in (None, "tracking")]
+    truth, frame = read_truth(folder / "truth.csv"), localizer.sheet.frame
+    errors, confident = np.full(len(results), np.inf), np.zeros(len(results), np.bool_)
+    for i, each in enumerate(results):
+        if isinstance(each.outcome, Fix):
+            place = frame.en_from_latlon(each.outcome.lat_deg, each.outcome.lon_deg)
+            errors[i] = np.hypot(*(place - frame.en_from_latlon(*truth[each.frame])))
+            confident[i] = each.is_confident
+    tracking = [i for i, each in enumerate(results) if each.state in (None, "tracking")]
     first = tracking[0] if tracking else len(results)
-    # The first view of all prepares the map.
-    warm = times[max(first, 1) :]
-    name, data = f"{side_m} m, {method}", f"generated {side_m} m square, 1 m"
-    time = section.add(f"{name}: time", "ms", warm, data=data, seed=FLIGHT_SEED)
-    hits = errors[first:] <= RIGHT_M
-    section.add_share(f"{name}: within 15 m", hits, data=data, seed=FLIGHT_SEED)
-    wrong = int((confident & (errors > 35.0)).sum())
+    warm = [each.latency_ms for each in results[max(first, 1) :]]  # the first prepares the map
     return [
-        number((side_m / 1000) ** 2),
-        str(len(results)),
-        method,
-        number(time.median),
-        number(float(np.percentile(warm, 99))),
-        number(float(times[0])),
-        str(first + 1) if method == "tracked" else "-",
-        percent(float(hits.mean())),
-        number(float(np.median(errors[first:]))),
-        str(wrong),
+        *(str(len(results)), *quantiles(warm, 50, 99)),
+        "-" if results[0].state is None else str(first + 1),
+        percent(float((errors[first:] <= RIGHT_M).mean())),
+        *quantiles(errors[first:], 50),
+        str(int((confident & (errors > FAR_M)).sum())),
     ]
 
 
-def _error_m(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> float:
-    if not isinstance(result.outcome, Fix):
-        return float("inf")
-    frame = localizer.sheet.frame
-    place: NDArray[np.float64] = frame.en_from_latlon(
-        result.outcome.lat_deg, result.outcome.lon_deg
-    )
-    return float(np.hypot(*(place - frame.en_from_latlon(*truth))))
+if __name__ == "__main__":
+    sys.exit(run(NAME, __doc__, measure))

@@ -1,16 +1,19 @@
 """Metrics of located views: errors, confidence, and wrong views among the confident ones."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.placing import FlownView, row_of
+from benchmarks.scenes import FAR_M
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.evaluate.calibration import calibrate, check_covariance
+from orthonav.onboard.run import Locator, locate_view
 
-FAR_M = 35.0
 Array = NDArray[np.float64]
 
 
@@ -87,11 +90,14 @@ class Verdict:
         return float(checked.nees_mean)
 
 
-def percent(share: float, digits: int = 0) -> str:
-    """A share as text."""
-    return "-" if math.isnan(share) else f"{share:.{digits}%}"
-
-
-def from_placed(result: dict[str, Any]) -> Verdict:
-    """The verdict on the result of `benchmarks.placing.placed`."""
-    return Verdict.of(result["rows"])
+def placed(
+    locator: Locator, views: Iterable[FlownView], frame: LocalFrame, warm: bool = True
+) -> Verdict:
+    """Views located one after the other; where they are warm, the first one prepares the map."""
+    rows: list[list[float]] = []
+    for each in views:
+        if warm and not rows:
+            locate_view(locator, each.view)
+        outcome, took_ms = locate_view(locator, each.view)
+        rows.append([*row_of(outcome, frame, each.truth_latlon_deg), took_ms])
+    return Verdict.of(rows)

@@ -32,7 +32,7 @@ GSD_M = (0.25, 0.5, 1.0, 2.0, 4.0)
 SIDE_PX = 1024
 LEVELS = 2
 RIDGE = 3e-3
-OUT = Path(__file__).parents[1] / "src" / "orthonav" / "check" / MODEL
+OUT = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "check" / MODEL
 
 
 def main() -> None:

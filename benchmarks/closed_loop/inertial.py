@@ -150,9 +150,7 @@ class Filter:
         """Add an error (17,) to the estimate."""
         was, most = self.motion, self.tuning.accel_bias_limit
         self.motion = Motion(
-            was.position + error[POS],
-            was.velocity + error[VEL],
-            turned(error[TILT]) @ was.rotation,
+            was.position + error[POS], was.velocity + error[VEL], turned(error[TILT]) @ was.rotation
         )
         self.gyro_bias = self.gyro_bias + error[GYRO]
         self.accel_bias = np.clip(self.accel_bias + error[ACCEL], -most, most)

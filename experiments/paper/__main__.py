@@ -1,4 +1,4 @@
-"""`python -m experiments.paper`: run the paper's experiments; `report`: tables and plots of them.
+"""`python -m experiments.paper`: run the paper's experiments; `report`: tables of them.
 
 Every run leaves one file under `paper_results/<setting>/` and is not run again while it is there.
 `keep` copies these files into the repository and makes `docs/paper-results.md` of what is there.
@@ -9,148 +9,110 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from orthonav.core.errors import MissingExtraError
+from benchmarks.record import say
+from benchmarks.scenes import DATA
 
-if TYPE_CHECKING:
-    from experiments.paper.methods import Method
-    from experiments.paper.runs import Workplace
-    from experiments.paper.scenes import Scene
-    from experiments.paper.trajectories import Setting
+from experiments.paper import field, matchers, runs, scenes, tables
+from experiments.paper.methods import (
+    BETWEEN_DATES,
+    FIELD_SCENES,
+    GPU_SCENES,
+    SETTINGS,
+    TABLE_1,
+    Setting,
+    dry,
+    flown,
+    methods,
+)
+from experiments.paper.results import keep, stored
+from experiments.paper.scenes import Scene
+from orthonav.core.errors import MissingExtraError, OrthonavError
+from orthonav.core.extras import require
+from orthonav.core.tiles.learned import VARIABLE
 
-    Task = tuple[Workplace, Scene, Method]
-
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
-WHAT = ("run", "report", "keep")
-NETWORKS = ("triplet", "caevl", "autoencoder")
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def main(arguments: list[str]) -> int:
     """Run the chosen parts, then report; returns the exit code."""
     options = _parser().parse_args(arguments)
-    for name in THREADS:  # NumPy's BLAS reads it once, in the processes started too
-        os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
     if options.what == "keep":
-        _keep(options)
+        for name in keep(options.out, options.setting):
+            say(f"stored: {name}")
+        tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
         return 0
-    from experiments.paper.tables import report
-
     failed = 0
     if options.what == "run":
         shown = [Path(each).name if "/" in each else each for each in arguments]
         failed = _run(options, " ".join(["python -m experiments.paper", *shown]))
     folder = f"dry-{options.setting}" if options.dry_run else options.setting
-    made = report(options.out, folder)
+    made = tables.report(options.out, folder)
     if made is None:
-        _say(f"nothing to report: no results in {options.out / folder}")
+        say(f"nothing to report: no results in {options.out / folder}")
         return 1
     print(made.read_text(encoding="utf-8"))
-    _say(f"written to {made.parent}")
+    say(f"written to {made.parent}")
     return 1 if failed else 0
-
-
-def _keep(options: argparse.Namespace) -> None:
-    """Copy results into the repository and write the page."""
-    from experiments.paper import page as pages
-    from experiments.paper.results import keep, stored
-
-    for name in keep(options.out, options.setting):
-        _say(f"stored: {name}")
-    pages.PAGE.write_text(pages.page(stored()), encoding="utf-8")
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
-    from experiments.paper.estimate import lines
-    from experiments.paper.methods import BETWEEN_DATES, GPU_SCENES
-    from experiments.paper.pool import cores, side_by_side
-    from experiments.paper.runs import Workplace
-    from experiments.paper.scenes import render
-    from experiments.paper.trajectories import SETTINGS, dry
-    from orthonav.core.tiles.learned import VARIABLE
-
-    _require(options)
+    learnt = not options.methods or set(options.methods) != {"gradient"}
+    require("python -m experiments.paper", "geo", *(["train"] if learnt else []))
     os.environ[VARIABLE] = str(BETWEEN_DATES)  # maps do not say where their network lies
     start = time.perf_counter()
     setting = dry(SETTINGS[options.setting]) if options.dry_run else SETTINGS[options.setting]
-    place = Workplace(
-        options.out,
-        setting,
-        command,
-        options.device,
-        options.workers,
-        options.keep_checkpoints,
-    )
+    more = options.device, options.workers, options.keep_checkpoints
+    place = runs.Workplace(options.out, setting, command, *more)
     wanted = set(options.only or (GPU_SCENES if options.setting == "gpu" else PARTS))
     if "field" in wanted and not _has_matchers(options):
         wanted.discard("field")
     tasks = _tasks(options, place, wanted)
     # Those that learn longest first, so that no core is idle at the end.
     tasks.sort(key=lambda task: ORDER.index(task[2].family))
-    jobs = options.jobs or (cores() if options.setting == "reduced" else 1)
-    on_gpu = _has_gpu(options, tasks)
-    ahead = [task[1:] for task in tasks if not place.result(task[1], task[2].key).is_file()]
-    for line in lines(ahead, jobs, options.out, on_gpu):
-        _say(f"           {line}")
-    for scene in {task[1].name: task[1] for task in tasks}.values():
-        render(scene)
-        _say(f"{_minutes(start)}  {scene.name}: imagery is there")
+    jobs = options.jobs or (runs.cores() if options.setting == "reduced" else 1)
+    flown_over = {task[1].name: task[1] for task in tasks}.values()
+    for scene in flown_over:
+        scenes.render(scene)
+        say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
-    for (_, scene, method), minutes in side_by_side(tasks, jobs):
+    for (_, scene, method), minutes in runs.side_by_side(tasks, jobs):
         if not options.keep_checkpoints:  # `run` has removed the last one; CAEVL has an earlier one
             for left in place.work(scene, method.key).glob("*/checkpoint.pt"):
                 left.unlink()
         status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
         failed += isinstance(minutes, Exception)
-        _say(f"{_minutes(start)}  {scene.name} {method.key}: {status}")
-    for name in _on_maps(place, wanted, tasks):
-        _say(f"{_minutes(start)}  {name}")
+        say(f"{_minutes(start)}  {scene.name} {method.key}: {status}")
+    for scene in flown_over:
+        tried = scene.name == runs.TRIED_ON and "baselines" in wanted
+        if tried and runs.run_baselines(place, scene):
+            say(f"{_minutes(start)}  baselines")
+        in_field = "field" in wanted and scene.name in FIELD_SCENES
+        if in_field and field.run(place, scene):
+            say(f"{_minutes(start)}  {scene.name}: the field today")
     return failed
-
-
-def _on_maps(place: "Workplace", wanted: set[str], tasks: "Sequence[Task]") -> Iterator[str]:
-    """Run what takes the maps of the rows; what was run, as it ends."""
-    from experiments.paper import baselines
-    from experiments.paper.methods import FIELD_SCENES
-
-    for scene in {task[1].name: task[1] for task in tasks}.values():
-        tried = scene.name == baselines.TRIED_ON and "baselines" in wanted
-        if tried and baselines.run(place, scene):
-            yield "baselines"
-        if "field" in wanted and scene.name in FIELD_SCENES:
-            from experiments.paper import field
-
-            if field.run(place, scene):
-                yield f"{scene.name}: the field today"
 
 
 def _has_matchers(options: argparse.Namespace) -> bool:
     """Whether local features can be run; raises `MissingExtraError` where they were asked for."""
-    from experiments.paper.matchers import require_packages
-
     try:
-        require_packages()
+        matchers.require_packages()
     except MissingExtraError as error:
         if "field" in (options.only or ()):
             raise
-        _say(f"field skipped: {error}")
+        say(f"field skipped: {error}")
         return False
     return True
 
 
-def _tasks(options: argparse.Namespace, place: "Workplace", wanted: set[str]) -> "list[Task]":
+def _tasks(options: argparse.Namespace, place: runs.Workplace, wanted: set[str]) -> list[runs.Task]:
     """All rows of the chosen parts: workplace, scene and method."""
-    from experiments.paper import baselines
-    from experiments.paper.methods import FIELD_SCENES, flown, methods
-
-    tasks: list[Task] = []
+    tasks: list[runs.Task] = []
     for scene in _scenes(options, place.setting, wanted):
         tiles = scene.trajectory.tiles
         rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)
@@ -158,52 +120,29 @@ def _tasks(options: argparse.Namespace, place: "Workplace", wanted: set[str]) ->
         if not scene.others:
             chosen = [each for each in chosen if not each.needs_dates]
         if not _whole(scene, wanted):
-            needed = {baselines.MAP_OF} if "baselines" in wanted else set()
+            needed = {runs.MAP_OF} if "baselines" in wanted else set()
             if "field" in wanted and scene.name in FIELD_SCENES:
                 needed |= {each.key for each in flown(chosen)}
             chosen = [each for each in rows if each.key in needed]
         tasks += [(place, scene, method) for method in chosen]
-        _say(f"           {scene.name}: {tiles:,} tiles, {len(chosen)} runs")
+        say(f"           {scene.name}: {tiles:,} tiles, {len(chosen)} runs")
     return tasks
 
 
-def _whole(scene: "Scene", wanted: set[str]) -> bool:
+def _whole(scene: Scene, wanted: set[str]) -> bool:
     """Whether all rows of a scene are wanted, not only those that another part needs."""
-    from experiments.paper.scenes import REAL, UNTUNED
-    from experiments.paper.trajectories import TABLE_1
-
-    if scene.name in UNTUNED:
+    if scene.name in scenes.UNTUNED:
         return "untuned" in wanted
-    if scene.name in {name for name, _, _ in REAL}:
+    if scene.name in scenes.REAL:
         return "real" in wanted
     return scene.name not in TABLE_1 or scene.name in wanted
-
-
-def _require(options: argparse.Namespace) -> None:
-    """Raise `MissingExtraError` naming all that the chosen rows need and that is not installed."""
-    from orthonav.core.extras import require
-
-    learnt = not options.methods or set(options.methods) != {"gradient"}
-    require("python -m experiments.paper", "geo", *(["train"] if learnt else []))
 
 
 def _minutes(start: float) -> str:
     return f"{(time.perf_counter() - start) / 60:5.1f} min"
 
 
-def _has_gpu(options: argparse.Namespace, tasks: "Sequence[Task]") -> bool:
-    """Whether networks are learnt on a GPU."""
-    if options.device == "cpu" or not any(task[2].family in NETWORKS for task in tasks):
-        return False
-    import torch
-
-    return torch.cuda.is_available()
-
-
-def _scenes(options: argparse.Namespace, setting: "Setting", wanted: set[str]) -> "Iterator[Scene]":
-    from experiments.paper import scenes
-    from experiments.paper.methods import FIELD_SCENES
-
+def _scenes(options: argparse.Namespace, setting: Setting, wanted: set[str]) -> Iterator[Scene]:
     for name in ("B", "D", "A", "C"):
         if name in wanted or (name == "B" and wanted & {"baselines", "field"}):
             yield scenes.generated(setting, name, options.out / "areas", options.gsd_m)
@@ -214,7 +153,7 @@ def _scenes(options: argparse.Namespace, setting: "Setting", wanted: set[str]) -
     for name in (each for each in sets if wanted & {each, "field"}):
         found = list(sets[name])
         if not found:
-            _say(f"{name} skipped: the optional real imagery beside the checkout is absent")
+            say(f"{name} skipped: the optional real imagery beside the checkout is absent")
         for each in found:
             if name in wanted or each.name in FIELD_SCENES:
                 yield each.of(setting)
@@ -222,8 +161,8 @@ def _scenes(options: argparse.Namespace, setting: "Setting", wanted: set[str]) -
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=WHAT, default="run")
-    parser.add_argument("--setting", choices=("reduced", "gpu", "full"), default="reduced")
+    parser.add_argument("what", nargs="?", choices=("run", "report", "keep"), default="run")
+    parser.add_argument("--setting", choices=tuple(SETTINGS), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(
         "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, caevl, triplet"
@@ -272,13 +211,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
 if __name__ == "__main__":
-    from orthonav.core.errors import OrthonavError
-
     try:
         sys.exit(main(sys.argv[1:]))
     except OrthonavError as error:

@@ -19,12 +19,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.child import peak_memory_mb
+from benchmarks.placing import memory_mb
 from benchmarks.posed import Picture
 from benchmarks.record import provenance
+from benchmarks.scenes import store
 from numpy.typing import NDArray
 
-from experiments.paper import matchers, views
+from experiments.paper import matchers
+from experiments.paper import scenes as views
 from experiments.paper.methods import Method, flown, methods
 from experiments.paper.results import FIELD
 from experiments.paper.runs import MB, Workplace, head, save
@@ -32,7 +34,6 @@ from experiments.paper.scenes import Scene
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
-from orthonav.ground.imagery.mosaic import Mosaic
 
 VIEWS = 20
 YAW_STD_DEG, AGL_STD, PRIOR_STD_PX = 5.0, 0.03, 40.0
@@ -52,15 +53,7 @@ class Seen:
     truth_en_m: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Position (2,) in the sheet, and the evidence for it, comparable within a method."""
-
-    place_en_m: NDArray[np.float64]
-    evidence: float
-
-
-Locate = Callable[[View, Prior, NDArray[np.float64]], Answer | None]
+Locate = Callable[[View, Prior, NDArray[np.float64]], matchers.Found | None]
 
 
 def maps_of(place: Workplace, scene: Scene) -> list[Method]:
@@ -162,7 +155,7 @@ def _measured(place: Workplace, scene: Scene, any_map: str, name: str) -> dict[s
         ],
         "cpu_s": float(np.median(times_s[2:] or times_s)),  # the first view loads what is needed
         "prepare_cpu_s": prepared_s,
-        "peak_mb": peak_memory_mb(),
+        "peak_mb": memory_mb(),
         "carried_mb": carried / MB,
     }
 
@@ -172,12 +165,13 @@ def _method(
 ) -> tuple[Locate, float]:
     """Function that places a view, and bytes that an aircraft would carry."""
     if name in matchers.LOCAL:
-        features = matchers.FeatureMap(matchers.LOCAL[name](), picture(scene, localizer))
+        any_map, pixels = localizer.opened.path, place.work(scene, FIELD).with_suffix(".npz")
+        picture = Picture.read(any_map, store(scene.past, localizer, pixels), 1)
+        features = matchers.FeatureMap(matchers.LOCAL[name](), picture)
         std_m = PRIOR_STD_PX * localizer.grid.gsd_m
 
-        def match(view: View, _: Prior, prior_en_m: NDArray[np.float64]) -> Answer | None:
-            found = features.locate(view, prior_en_m, std_m)
-            return None if found is None else Answer(found.place_en_m, found.inliers)
+        def match(view: View, _: Prior, prior_en_m: NDArray[np.float64]) -> matchers.Found | None:
+            return features.locate(view, prior_en_m, std_m)
 
         return match, features.features.nbytes
     (method,) = (each for each in maps_of(place, scene) if each.key == name)
@@ -190,22 +184,12 @@ def _method(
     )
     criterion = "confidence" if method.registration else "lowe_ratio"
 
-    def place_by_map(view: View, prior: Prior, _: NDArray[np.float64]) -> Answer | None:
+    def place_by_map(view: View, prior: Prior, _: NDArray[np.float64]) -> matchers.Found | None:
         fix = flying.locate(view, prior=prior)
         if not isinstance(fix, Fix):
             return None
         known = {**fix.evidence, "confidence": fix.confidence}
         found = flying.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-        return Answer(np.asarray(found), float(known.get(criterion, math.nan)))
+        return matchers.Found(np.asarray(found), float(known.get(criterion, math.nan)))
 
     return place_by_map, path.stat().st_size
-
-
-def picture(scene: Scene, localizer: Localizer) -> Picture:
-    """The older orthophoto in the plane and pixels of a map."""
-    grid = localizer.grid
-    with Mosaic.open([scene.past]).grid_sheet(localizer.sheet.frame, grid) as raster:
-        pixels = raster.read(0, 0, grid.width_px, grid.height_px)
-    mean = round(float(pixels.grey[pixels.valid].mean()))
-    grey = np.where(pixels.valid, pixels.grey, mean).astype(np.uint8)
-    return Picture(grid, 1, grey, pixels.valid)

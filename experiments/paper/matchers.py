@@ -77,13 +77,11 @@ class XFeat:
         self._glue.eval()
 
     def features(self, grey: NDArray[np.uint8], most: int) -> Features:
-        """As `Local`."""
         pixels = self._torch.from_numpy(grey.astype(np.float32) / 255)[None, None]
         (found,) = self._net.detectAndCompute(pixels, top_k=most)
         return Features(found["keypoints"].numpy() + np.float32(0.5), found["descriptors"].numpy())
 
     def matches(self, view: Features, size: Shape, near: Features, near_size: Shape) -> Rows:
-        """As `Local`."""
         data: dict[str, Any] = {}
         for number, (each, shape) in enumerate(((view, size), (near, near_size))):
             data[f"keypoints{number}"] = self._torch.from_numpy(each.points_px)[None]
@@ -108,7 +106,6 @@ class Glued:
         self._glue = package.LightGlue(features=name).eval()
 
     def features(self, grey: NDArray[np.uint8], most: int) -> Features:
-        """As `Local`."""
         if most not in self._extractors:
             self._extractors = {most: self._make(most)}
         pixels = self._torch.from_numpy(grey.astype(np.float32) / 255)[None].expand(3, -1, -1)
@@ -117,7 +114,6 @@ class Glued:
         return Features(points, found["descriptors"][0].numpy())
 
     def matches(self, view: Features, size: Shape, near: Features, near_size: Shape) -> Rows:
-        """As `Local`."""
         data = {
             f"image{number}": {
                 "keypoints": self._torch.from_numpy(each.points_px)[None],
@@ -134,7 +130,6 @@ class Sift:
     """SIFT (Lowe 2004) with the ratio test."""
 
     def features(self, grey: NDArray[np.uint8], most: int) -> Features:
-        """As `Local`."""
         detector = cv2.SIFT_create(nfeatures=most)  # type: ignore[attr-defined]  # not in its stubs
         keypoints, descriptors = detector.detectAndCompute(grey, None)
         points = np.array([each.pt for each in keypoints], np.float32).reshape(-1, 2) + 0.5
@@ -143,7 +138,6 @@ class Sift:
         return Features(points.astype(np.float32)[:most], descriptors[:most])
 
     def matches(self, view: Features, size: Shape, near: Features, near_size: Shape) -> Rows:
-        """As `Local`."""
         pairs = cv2.BFMatcher().knnMatch(view.descriptors, near.descriptors, k=2)
         good = [a for a, b in (p for p in pairs if len(p) == 2) if a.distance < LOWE * b.distance]
         return np.array([(each.queryIdx, each.trainIdx) for each in good], np.intp).reshape(-1, 2)
@@ -170,10 +164,10 @@ LOCAL: dict[str, Callable[[], Local]] = {
 
 @dataclass(frozen=True)
 class Found:
-    """Position east and north (2,) in the sheet, and its number of inliers."""
+    """Position east and north (2,) in the sheet, and the evidence for it: number of inliers."""
 
     place_en_m: NDArray[np.float64]
-    inliers: int
+    evidence: float
 
 
 class FeatureMap:

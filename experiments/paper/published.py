@@ -3,7 +3,7 @@
 from experiments.paper.methods import CANNY, GREY, SAM, SEGMENTS, column
 
 TRAJECTORIES = ("A", "B", "C", "D")
-ACCURACY = {
+TABLE_2 = {
     ("bovw", GREY): (50.40, 23.92, 2.67, 1.20),
     ("triplet", GREY): (16.02, 82.16, 78.60, 54.21),
     ("triplet", CANNY): (43.91, 67.94, 85.28, 44.58),
@@ -13,7 +13,7 @@ ACCURACY = {
     ("autoencoder", SAM): (89.76, 90.40, 98.00, 83.33),
 }
 """Table 2: accuracy at 15 m in per cent for A, B, C and D."""
-CONFIDENT = {
+TABLE_3 = {
     GREY: ((0, 0), (89.5, 72.8), (99.2, 91.3), (82.0, 46.4)),
     CANNY: ((96.0, 12.1), (99.7, 91.0), (98.6, 85.7), (100, 79.7)),
     SAM: ((95.0, 0.2), (96.4, 89.8), (99.3, 98.6), (100, 67.8)),
@@ -26,7 +26,7 @@ MOST_VIEWS = 500
 """Views along a route that the paper has not."""
 
 
-def views(scene: str) -> int:
+def most_views(scene: str) -> int:
     """Most views along the route of a scene."""
     return VIEWS.get(column(scene), MOST_VIEWS)
 
@@ -36,17 +36,17 @@ def stands_for(edges: str) -> str:
     return SAM if edges in (SEGMENTS, f"{SAM}-tile") else edges
 
 
-def accuracy(family: str, edges: str, scene: str) -> str:
+def published_accuracy(family: str, edges: str, scene: str) -> str:
     """The paper's figure of Table 2 as text, "-" where it has none."""
-    row = ACCURACY.get((family, stands_for(edges)))
+    row = TABLE_2.get((family, stands_for(edges)))
     if row is None or scene not in TRAJECTORIES:
         return "-"
     return f"{row[TRAJECTORIES.index(scene)]:.1f}"
 
 
-def criterion(family: str, edges: str, scene: str) -> str:
+def published_criterion(family: str, edges: str, scene: str) -> str:
     """The paper's pair of Table 3 as text, "-" where it has none."""
-    row = CONFIDENT.get(stands_for(edges))
+    row = TABLE_3.get(stands_for(edges))
     if row is None or family != "autoencoder" or scene not in TRAJECTORIES:
         return "-"
     right, accepted = row[TRAJECTORIES.index(scene)]

@@ -1,36 +1,46 @@
 """One method on one trajectory: build the map, locate the views, write the results.
 
-Everything the tables and plots need is in the file that a run leaves; a run that has its file is
-not run again.
+Everything the tables need is in the file that a run leaves; a run that has its file is not run
+again. Baselines are the paper's related work: methods that carry the reference images on board.
 """
 
 import hashlib
 import json
+import logging
+import os
 import re
 import statistics
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from benchmarks.posed import BestOfPoses, Keypoints, MutualSurface, Picture, TemplateSurface
 from benchmarks.record import provenance
+from benchmarks.scenes import store
 from numpy.typing import NDArray
 
-from experiments.paper import published, views
-from experiments.paper.methods import Method
+from experiments.paper import scenes as views
+from experiments.paper.methods import SWEPT_ON, TILE_PX, Method, Setting
+from experiments.paper.published import most_views
 from experiments.paper.results import ACCURACY_M, compact
-from experiments.paper.rules import compared
+from experiments.paper.results import BASELINES as BASELINES_KEY
 from experiments.paper.scenes import Scene
-from experiments.paper.trajectories import TILE_PX, Setting
 from orthonav.core.files import write_text
 from orthonav.core.localize import Localizer
+from orthonav.core.localize.rectify import downsampled
+from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import Fix, View
+from orthonav.core.tiles.position import RULES
 from orthonav.ground.build import BuildRequest, build_map
 
-SWEPT_ON = "B"
 HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)
 DROPS_M = (0, 25, 50, 75, 100, 150, 200)
 EVIDENCE = ("score", "lowe_ratio", "peak_ratio")
@@ -67,6 +77,9 @@ class Workplace:
         return self.out / "work" / self.setting.folder / f"{scene.name}-{key}"
 
 
+Task = tuple[Workplace, Scene, Method]
+
+
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     """Result of a run, after building, locating and writing; one of the same recipe is reused."""
     out = place.result(scene, method.key)
@@ -96,6 +109,43 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     return written
 
 
+def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float | Exception]]:
+    """Each task with its minutes or what went wrong with it, as they end.
+
+    Raises `BrokenProcessPool` where a process died: memory has run out, or somebody ended it.
+    """
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
+        waiting = {pool.submit(run, *task): task for task in tasks}
+        try:
+            for done in as_completed(waiting):
+                error = done.exception()
+                if isinstance(error, BrokenProcessPool) or not isinstance(error, Exception | None):
+                    raise error
+                yield waiting[done], done.result()["minutes"] if error is None else error
+        except BaseException:  # interrupted: hours of work are not waited for, checkpoints stay
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+
+
+def cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _prepare(jobs: int) -> None:
+    """Give a process its part of the cores; training says epoch, loss and time left."""
+    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    logging.getLogger("orthonav.ground.build.encoders").setLevel(logging.INFO)
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    try:
+        import torch
+    except ImportError:
+        return
+    torch.set_num_threads(max(1, cores() // jobs))
+
+
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
     """Header of a result file: method, imagery and settings of the run."""
     return {
@@ -103,7 +153,7 @@ def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, A
         "trajectory": asdict(scene.trajectory),
         "setting": asdict(place.setting),
         "command": place.command,
-        "seeds": {"views": views.SEED, "build": 0},
+        "seeds": {"views": views.VIEW_SEED, "build": 0},
         "inputs": {path.name: _digest(path) for path in _imagery(scene)},
         "provenance": started,
     }
@@ -222,7 +272,7 @@ def placements(
     centres = localizer.tiles.centres_en_m
     anywhere = views.places_en_m(centres, count)
     places = {
-        "route": views.along_route(centres, published.views(scene.name)),
+        "route": views.along_route(centres, most_views(scene.name)),
         "grid": views.on_grid(anywhere, centres),
         "anywhere": anywhere,
     }
@@ -241,22 +291,41 @@ def _chance(grounds: list[views.Ground], centres_en_m: NDArray[np.float32]) -> f
 
 
 def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
-    """Positions by each rule, with scalar product and cosine, on the same embeddings."""
+    """Views within 15 m by each rule of position, with scalar product and cosine.
+
+    "We use the position of the reference embedding leading to the highest scalar product, as we
+    observed that it yields better results than the weighted average" (section Methodology).
+    """
     localizer = Localizer(opened, registration=False, flying=False)
-    agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
+    placer, gsd_m, agl_m = localizer.tiles, localizer.grid.gsd_m, scene.trajectory.agl_m
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
+    tiles, centres = opened.array("sheet0/embeddings", np.float16, 2), placer.centres_en_m
     made: dict[str, Any] = {}
     for name, grounds in placements(scene, localizer, setting.views):
         if name == "route":
             continue
-        seen = [
-            View(views.view_of(ground, camera, agl_m, gsd_m), camera, telemetry)
-            for ground in grounds
-        ]
-        truths = [ground.truth_en_m for ground in grounds]
-        errors = compared(localizer, opened, seen, truths)
-        made[name] = {rule: _hits(errors_m) for rule, errors_m in errors.items()}
+        queries = []
+        for ground in grounds:
+            view = View(views.view_of(ground, camera, agl_m, gsd_m), camera, telemetry)
+            rectified = placer.rectified(downsampled(view, gsd_m), telemetry.yaw_deg)
+            queries.append(placer.embedded([rectified]))
+        for similarity in ("product", "cosine"):
+            cosine = similarity == "cosine"
+            scaled = _unit(tiles).astype(np.float16) if cosine else tiles
+            for rule in RULES:
+                matcher, errors = TileMatcher(localizer.grid, centres, scaled, rule), []
+                for query, ground in zip(queries, grounds, strict=True):
+                    match = matcher.match(_unit(query) if cosine else query)
+                    found = centres[match.tile].astype(np.float64) + match.shift_en_m
+                    errors.append(float(np.hypot(*(found - ground.truth_en_m))))
+                made.setdefault(name, {})[f"{similarity} {rule}"] = _hits(errors)
     return made
+
+
+def _unit(vectors: NDArray[Any]) -> NDArray[np.float32]:
+    values = np.asarray(vectors, dtype=np.float32)
+    norms = np.linalg.norm(values, axis=1, keepdims=True)
+    return np.asarray(values / np.maximum(norms, 1e-12), dtype=np.float32)
 
 
 def _hits(errors_m: Iterable[float]) -> list[int]:
@@ -268,3 +337,97 @@ def _hits(errors_m: Iterable[float]) -> list[int]:
 def _digest(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+MAP_OF = "gradient-gradient"
+"""The baselines get the plane and pixels of this run's map."""
+TRIED_ON = "B"
+COARSER = 2
+"""Mutual information is taken on pixels of so many of the map's, averaged: it is slow."""
+BASELINE_VIEWS = 50
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A method on the map's picture; `sobel` gives it edges instead of grey levels."""
+
+    name: str
+    make: Callable[[Picture], Any]
+    factor: int = 1
+    sobel: bool = False
+
+
+def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
+    return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
+
+
+BASELINES = (
+    Baseline("mutual information (Patel et al.)", _reported_pose(MutualSurface), COARSER),
+    Baseline(
+        "Sobel edges matched (Conte and Doherty)",
+        _reported_pose(lambda picture: TemplateSurface(picture, False)),
+        sobel=True,
+    ),
+    Baseline("Canny edges matched", _reported_pose(lambda picture: TemplateSurface(picture, True))),
+    Baseline(
+        "grey levels matched", _reported_pose(lambda picture: TemplateSurface(picture, False))
+    ),
+    Baseline("SIFT, ratio test, RANSAC", Keypoints),
+)
+
+
+def run_baselines(place: Workplace, scene: Scene) -> bool:
+    """Place views by every baseline; false where an earlier run has its file or there is no map."""
+    out, map_path = place.result(scene, BASELINES_KEY), place.work(scene, MAP_OF) / "map.onav"
+    if out.is_file() or not map_path.is_file():
+        return False
+    start, made = time.perf_counter(), head(place, scene, provenance("paper"))
+    localizer = Localizer(open_map(map_path), registration=False)
+    pixels_path = place.work(scene, BASELINES_KEY).with_suffix(".npz")
+    store(scene.past, localizer, pixels_path)
+    count = min(BASELINE_VIEWS, place.setting.views)
+    grounds = dict(placements(scene, localizer, count))
+    del grounds["route"]
+    made["baselines"] = {
+        each.name: _placed_by(each, scene, localizer, map_path, pixels_path, grounds)
+        for each in BASELINES
+    }
+    save(out, made, start)
+    return True
+
+
+def _placed_by(
+    baseline: Baseline,
+    scene: Scene,
+    localizer: Localizer,
+    map_path: Path,
+    pixels_path: Path,
+    grounds: dict[str, list[views.Ground]],
+) -> dict[str, Any]:
+    picture = Picture.read(map_path, pixels_path, baseline.factor)
+    if baseline.sobel:
+        picture = replace(picture, grey=sobel(picture.grey))
+    method = baseline.make(picture)
+    agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
+    camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
+    hits: dict[str, list[int]] = {}
+    times_ms = []
+    for name, seen in grounds.items():
+        hits[name] = [0, len(seen)]
+        for ground in seen:
+            grey = views.view_of(ground, camera, agl_m, gsd_m)
+            start = time.perf_counter()
+            grey = sobel(grey) if baseline.sobel else grey
+            view = View(grey, camera, telemetry)
+            found = method.locate(view, True)
+            times_ms.append(1e3 * (time.perf_counter() - start))
+            right = found is not None and np.hypot(*(found - ground.truth_en_m)) <= ACCURACY_M
+            hits[name][0] += bool(right)
+    return {"views": hits, "view_ms": float(np.median(times_ms))}
+
+
+def sobel(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Magnitude of the Sobel gradient (H, W), a quarter of it: it fits into bytes."""
+    east = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
+    south = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    return np.asarray(np.clip(cv2.magnitude(east, south) / 4, 0, 255), dtype=np.uint8)

@@ -1,48 +1,60 @@
-"""What is flown over: two orthophotos of two dates, generated, real or a user's own."""
+"""What is flown over, two orthophotos of two dates, and the views, cut from the later one.
+
+The paper's numbers of views are those of tile steps along its trajectories, and its figures at 15 m
+can only be had where views lie on the tile grid. So every figure here comes for views *along the
+route*, one per tile step, for views *on the grid* all over the search band, and *anywhere*.
+"""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from benchmarks.scenes import SCENES
 from lab.landscape import DEFAULT_DATES, generate_area
 from numpy.typing import NDArray
 
-from experiments.paper.methods import REDUCED_NETWORKS
-from experiments.paper.trajectories import TABLE_1, TILE_PX, Setting, Trajectory, two_tiles
+from experiments.paper.methods import (
+    REDUCED_NETWORKS,
+    TABLE_1,
+    TILE_PX,
+    VIEW_ROOM,
+    Setting,
+    Trajectory,
+    two_tiles,
+)
+from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.records import Telemetry
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
+from orthonav.ground.simulate.render import ViewEffects, render_view
 
+Array = NDArray[np.float64]
 SEED = 1
 AGL_M = 2000.0
 """Told height over imagery that no trajectory of the paper is flown over; any would do."""
-REAL = (
-    ("naip-2012", "naip_nd/20090818.tif", "naip_nd/20120731.tif"),
-    ("naip-2018", "naip_nd/20090818.tif", "naip_nd/20180716.tif"),
-    ("szada-1", "airchange/szada_1_a.tif", "airchange/szada_1_b.tif"),
-    ("szada-5", "airchange/szada_5_a.tif", "airchange/szada_5_b.tif"),
-    ("szada-7", "airchange/szada_7_a.tif", "airchange/szada_7_b.tif"),
-)
+REAL = {
+    "naip-2012": ("naip", "20090818", "20120731"),
+    "naip-2018": ("naip", "20090818", "20180716"),
+    **{f"szada-{n}": (f"szada_{n}", f"szada_{n}_a", f"szada_{n}_b") for n in "157"},
+}
+"""Scene of the catalogue, dates of the map and of the views."""
 REDUCED_REAL = ("naip-2018", "szada-1", "szada-7")
-OTHERS = {
-    "naip-2012": ("naip_nd/20150926.tif", "naip_nd/20180716.tif"),
-    "naip-2018": ("naip_nd/20120731.tif", "naip_nd/20150926.tif"),
-}
-"""Further dates of real scenes, for what learns from several: neither the map's nor the views'."""
 UNTUNED = {
-    "garching": ("2009_04", "2015_04", "2001_09", "2018_04", "2020_03"),
-    "schiphol": ("2008_05", "2018_04", "2004_05", "2015_09", "2021_06"),
-    "solar_farm": ("2017_12", "2020_12", "2009_12", "2012_12", "2015_12"),
-    "atlanta": ("2016_12", "2021_08", "2012_11", "2024_02"),
-    "aral": ("2012_12", "2020_12", "1985_12", "1995_12", "2000_12", "2006_12", "2015_12"),
-    "tours": ("1964", "1976"),
+    "garching": ("garching", "2009_04", "2015_04"),
+    "schiphol": ("schiphol", "2008_05", "2018_04"),
+    "solar_farm": ("solar_farm", "2017_12", "2020_12"),
+    "atlanta": ("atlanta", "2016_12", "2021_08"),
+    "aral": ("aral", "2012_12", "2020_12"),
+    "tours": ("tours", "1964", "1976"),
 }
-"""Scenes on which nothing was tuned but the confidence of registered views: dates of the map, of
-the views, and further ones."""
+"""Scenes on which nothing was tuned but the confidence of registered views."""
 
 
 @dataclass(frozen=True)
@@ -111,11 +123,7 @@ def render(scene: Scene) -> None:
 
 
 def over(
-    name: str,
-    past: Path,
-    present: Path,
-    gsd_m: float | None = None,
-    others: tuple[Path, ...] = (),
+    name: str, past: Path, present: Path, gsd_m: float | None = None, others: tuple[Path, ...] = ()
 ) -> Scene:
     """The same protocol over two orthophotos: all of the first that holds whole views."""
     area, mosaic = _outline(past), Mosaic.open([past])
@@ -135,20 +143,24 @@ def over(
 
 def real(data: Path, setting: Setting) -> Iterator[Scene]:
     """Scenes of the optional real imagery, those that are there; fewer in the reduced setting."""
-    for name, past, present in REAL:
-        if setting.name == "reduced" and name not in REDUCED_REAL:
-            continue
-        if (data / past).is_file() and (data / present).is_file():
-            others = tuple(data / other for other in OTHERS.get(name, ()))
-            yield over(name, data / past, data / present, others=others)
+    yield from _there(data, REAL, REDUCED_REAL if setting.name == "reduced" else tuple(REAL))
 
 
 def untuned(data: Path) -> Iterator[Scene]:
     """Those of `UNTUNED` that are there."""
-    for name, dates in UNTUNED.items():
-        past, present, *others = (data / "scenes" / name / f"{date}.tif" for date in dates)
-        if past.is_file() and present.is_file():
-            yield over(name, past, present, others=tuple(others))
+    yield from _there(data, UNTUNED, tuple(UNTUNED))
+
+
+def _there(
+    data: Path, pairs: dict[str, tuple[str, str, str]], names: Sequence[str]
+) -> Iterator[Scene]:
+    """Scenes of two dates; all others of the catalogue are for what learns from several."""
+    for name in names:
+        place, past, present = pairs[name]
+        dates = [each for each in SCENES[place].dates if each not in (past, present)]
+        first, second, *others = (data / SCENES[place].file(d) for d in (past, present, *dates))
+        if first.is_file() and second.is_file():
+            yield over(name, first, second, others=tuple(others))
 
 
 def _outline(path: Path) -> Area:
@@ -165,3 +177,95 @@ def _box_deg(
     )
     lat, lon = frame.latlon_from_en(sides)
     return float(lon[0]), float(lat[2]), float(lon[1]), float(lat[3])
+
+
+VIEW_SEED = 7
+PLACEMENTS = ("route", "grid", "anywhere")
+NO_EFFECTS = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
+HEADING_TOLD_DEG = 0.001
+"""With this deviation only the reported heading is tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Imagery of the later date (H, H, 3) around the place `truth_en_m` (2,) of a view."""
+
+    truth_en_m: Array
+    rgb: NDArray[np.uint8]
+
+
+def places_en_m(centres_en_m: NDArray[np.floating[Any]], count: int) -> Array:
+    """Places (count, 2) along the trajectory, evenly spaced, anywhere across the search band."""
+    low, high = centres_en_m.min(axis=0), centres_en_m.max(axis=0)
+    rng = np.random.default_rng(VIEW_SEED)
+    along = low[0] + (np.arange(count) + rng.random(count)) / count * (high[0] - low[0])
+    return np.stack([along, rng.uniform(low[1], high[1], count)], axis=1)
+
+
+def on_grid(places: Array, centres_en_m: NDArray[np.floating[Any]]) -> Array:
+    """The nearest tile centre of each place (N, 2)."""
+    away = places[:, None] - centres_en_m[None].astype(np.float64)
+    nearest = (away**2).sum(axis=2).argmin(axis=1)
+    return np.asarray(centres_en_m[nearest], dtype=np.float64)
+
+
+def along_route(centres_en_m: NDArray[np.floating[Any]], most: int) -> Array:
+    """Tile centres (N, 2) of the line along the middle of the search band, evenly thinned."""
+    lines = np.unique(centres_en_m[:, 1])
+    line = lines[np.abs(lines - (lines[0] + lines[-1]) / 2).argmin()]
+    places = centres_en_m[centres_en_m[:, 1] == line].astype(np.float64)
+    places = places[np.argsort(places[:, 0])]
+    chosen = np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int)
+    return np.asarray(places[chosen])
+
+
+def grounds(scene: Scene, frame: LocalFrame, grid: TileGrid, places: Array) -> list[Ground]:
+    """What the later date shows around places (N, 2); those without whole imagery are left out."""
+    side_px = 2 * round(VIEW_ROOM * TILE_PX / 2)
+    half_m = side_px * grid.gsd_m / 2
+    mosaic, found = Mosaic.open([scene.present]), []
+    for place in places:
+        west, north = place[0] - half_m, place[1] + half_m
+        with mosaic.sheet(
+            frame,
+            west_m=float(west),
+            north_m=float(north),
+            width_px=side_px,
+            height_px=side_px,
+            gsd_m=grid.gsd_m,
+        ) as raster:
+            pixels = raster.read(0, 0, side_px, side_px)
+        if pixels.valid.all():
+            found.append(Ground(place, pixels.rgb))
+    return found
+
+
+def camera_of(agl_m: float, gsd_m: float) -> Camera:
+    """The camera whose views from `agl_m` are exactly one tile."""
+    focal, middle = agl_m / gsd_m, TILE_PX / 2
+    return Camera(TILE_PX, TILE_PX, focal, focal, middle, middle)
+
+
+def view_of(
+    ground: Ground,
+    camera: Camera,
+    agl_m: float,
+    gsd_m: float,
+    *,
+    turned_deg: float = 0.0,
+    drop_m: float = 0.0,
+) -> NDArray[np.uint8]:
+    """Grey view (256, 256) from the place, with these errors of heading and height."""
+    half_m = ground.rgb.shape[0] * gsd_m / 2
+    attitude = (turned_deg, 0.0, 0.0, agl_m - drop_m)
+    corner = np.array([-half_m, half_m])
+    rng = np.random.default_rng(0)
+    seen = render_view(camera, attitude, ground.rgb, corner, gsd_m, NO_EFFECTS, rng)
+    return np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def telemetry_at(agl_m: float, *, exact: bool = True) -> Telemetry:
+    """Telemetry of every view: north up, nominal height, straight down without an error of pitch
+    and roll; `exact` tries no other heading."""
+    std = HEADING_TOLD_DEG if exact else None
+    return Telemetry(0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=std, tilt_std_deg=0.0)

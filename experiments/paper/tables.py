@@ -1,63 +1,86 @@
-"""Tables 2 and 3 and further tables, from result files alone."""
+"""Tables 2 and 3 and further tables from result files alone, and `docs/paper-results.md`."""
 
+import json
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from benchmarks.record import Table, number
+from numpy.typing import NDArray
 
-from experiments.paper import published
-from experiments.paper.comparison import above_default
-from experiments.paper.field_tables import field
-from experiments.paper.labels import (
+from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
+from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
+from experiments.paper.results import (
+    ACCURACY_M,
+    EDGES,
+    FAMILIES,
+    FIELD,
     TUNED,
+    Result,
     Row,
+    accepted_at,
     best_words,
     by_scene,
-    is_tuned,
-    label,
-    named,
-    row_label,
-    row_of,
-)
-from experiments.paper.results import (
-    Result,
-    accepted_at,
     ceiling,
     confident,
+    is_tuned,
+    label,
     name_of,
+    named,
+    numbers,
     percent,
     read,
+    row_label,
+    row_of,
     share,
 )
-from experiments.paper.runs import SWEPT_ON
-from experiments.paper.views import PLACEMENTS
+from experiments.paper.scenes import PLACEMENTS
 from orthonav.core.records import CONFIDENT
 
 PROGRAM = "python -m experiments.paper"
 SHOWN_RULES = ("product best", "product weighted", "cosine best", "cosine neighbours")
+STEPS = (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m"))
 Cell = Callable[[Result], str]
 Published = Callable[[str, str, str], str]
 """The paper's figure of a family, an input and a scene."""
 
 
 def report(out: Path, setting: str) -> Path | None:
-    """Write `tables.md` and the plots next to the result files; None without results."""
+    """Write `tables.md` and the plot beside the result files; None without results."""
     folder = out / setting
     results = read(folder)
     if not results:
         return None
-    made = [r for r in results if r.family]
-    try:
-        from experiments.paper.plots import draw
-    except ImportError:
-        notes = ["Plots need matplotlib: pip install 'orthonav[report]'"]
-    else:
-        notes = [f"![{path.stem}]({path.name})" for path in draw(made, folder)]
-    text = "\n".join([*(table.markdown() for table in tables(results)), *notes, ""])
+    text = [table.markdown() for table in tables(results)]
+    swept = [each for each in results if each.family and each.plain.get("sweep")]
+    if swept:
+        text.append(f"![sensitivity]({_plot(swept, folder / 'sensitivity.png').name})")
     path = folder / "tables.md"
-    path.write_text(text, encoding="utf-8")
+    path.write_text("\n".join([*text, ""]), encoding="utf-8")
     return path
+
+
+def _plot(results: Sequence[Result], out: Path) -> Path:
+    """Accuracy at 15 m against heading and height errors, a column per method."""
+    from matplotlib.figure import Figure
+
+    families = list(dict.fromkeys(each.family for each in results))
+    figure = Figure((3.5 * len(families), 6), layout="constrained")
+    grid = figure.subplots(2, len(families), sharey=True, squeeze=False)
+    for row, (step, title) in enumerate(STEPS):
+        for axis, family in zip(grid[row], families, strict=True):
+            for each in (each for each in results if each.family == family):
+                sweep = each.plain["sweep"][step]
+                values = [100 * share(errors) for errors in sweep.values()]
+                name = "default" if each.registration else EDGES[each.edges]
+                axis.plot([float(value) for value in sweep], values, "o-", ms=3, label=name)
+            axis.set(xlabel=title, ylim=(0, 102), title=FAMILIES[family])
+            axis.legend(fontsize=8)
+        grid[row, 0].set_ylabel("within 15 m, %")
+    figure.savefig(out, dpi=110)
+    return out
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
@@ -72,7 +95,7 @@ def tables(results: Sequence[Result]) -> list[Table]:
         *rules(made),
         *sensitivity(made),
         *baselines(results, made),
-        *field(results, label),
+        *field(results),
         *costs(made),
         provenance(results),
     ]
@@ -110,25 +133,23 @@ def accuracy(results: Sequence[Result]) -> list[Table]:
 
     notes = ("views along the route / on the grid / anywhere", TUNED)
     title = "Table 2: accuracy at 15 m, %"
-    return _by_scene(title, results, cell, notes, published.accuracy, chance)
+    return _by_scene(title, results, cell, notes, published_accuracy, chance)
 
 
 def criterion(results: Sequence[Result]) -> list[Table]:
     """Table 3: accuracy of the views that the confidence criterion accepts."""
 
     def cell(each: Result) -> str:
-        name, threshold = (
-            ("confidence", CONFIDENT) if each.registration else ("lowe_ratio", published.LOWE)
-        )
+        name, threshold = ("confidence", CONFIDENT) if each.registration else ("lowe_ratio", LOWE)
         return _joined(confident(each.right("grid"), each.column("grid", name), threshold))
 
     notes = (
         "accuracy at 15 m of the accepted views / fraction accepted; views on the grid, whose "
         "accuracy without the criterion is in Table 2",
-        f"criterion: Lowe's ratio of {published.LOWE}; orthonav, default: confidence {CONFIDENT:g}",
+        f"criterion: Lowe's ratio of {LOWE}; orthonav, default: confidence {CONFIDENT:g}",
     )
     found = [each for each in results if each.family != "bovw"]
-    return _by_scene("Table 3: with the criterion, %", found, cell, notes, published.criterion)
+    return _by_scene("Table 3: with the criterion, %", found, cell, notes, published_criterion)
 
 
 def accepted(results: Sequence[Result]) -> list[Table]:
@@ -147,7 +168,7 @@ def accepted(results: Sequence[Result]) -> list[Table]:
     found = [
         each
         for each in results
-        if each.scene in published.TRAJECTORIES and each.family != "bovw" and not each.registration
+        if each.scene in TRAJECTORIES and each.family != "bovw" and not each.registration
     ]
     return _by_scene("Accepted at 95 % correct, %", found, cell, notes)
 
@@ -163,7 +184,7 @@ def _by_scene(
     """A table of the paper's trajectories and one of other imagery: methods by scenes."""
     made: list[Table] = []
     for papers, what in ((True, "trajectories"), (False, "other imagery")):
-        found = [(s, f) for s, f in by_scene(results) if (s in published.TRAJECTORIES) == papers]
+        found = [(s, f) for s, f in by_scene(results) if (s in TRAJECTORIES) == papers]
         if found:
             names = [scene for scene, _ in found]
             rows = _rows(found, cell, paper if papers else None)
@@ -219,7 +240,7 @@ def rules(results: Sequence[Result]) -> list[Table]:
 def sensitivity(results: Sequence[Result]) -> list[Table]:
     """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
     made: list[Table] = []
-    for step, title in (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m")):
+    for step, title in STEPS:
         swept = [each for each in best_words(results) if each.plain.get("sweep")]
         if swept:
             values = list(swept[0].plain["sweep"][step])
@@ -300,3 +321,212 @@ def provenance(results: Sequence[Result]) -> Table:
         "committed",
     )
     return Table("Measured at", header, rows, notes)
+
+
+def above_default(results: Sequence[Result]) -> list[Table]:
+    """Every row that locates more views within 15 m than orthonav's default on its scene."""
+    rows, compared = [], 0
+    for scene, found in by_scene(results):
+        for ours in (each for each in found if each.registration):
+            for each in (other for other in best_words(found) if not other.registration):
+                compared += len(PLACEMENTS)
+                rows += [
+                    _above_row(scene, name, ours, each)
+                    for name in PLACEMENTS
+                    if each.accuracy(name) > ours.accuracy(name)
+                ]
+    if not compared:
+        return []
+    header = ("scene", "views", "of", "default", "method", "accuracy", "difference")
+    notes = (
+        f"accuracy at 15 m in %; the default is as good or better in {compared - len(rows)} of "
+        f"{compared} comparisons",
+        "within the noise: less than two standard errors of the difference",
+    )
+    return [Table("Rows above orthonav's default", header, rows, notes)]
+
+
+def _above_row(scene: str, name: str, ours: Result, each: Result) -> list[str]:
+    shares = [ours.accuracy(name), each.accuracy(name)]
+    count = len(each.plain["views"][name])
+    spread = math.sqrt(sum(p * (1 - p) for p in shares) / count)
+    size = "within the noise" if shares[1] - shares[0] <= 2 * spread else "significant"
+    return [
+        *(scene, name, str(count), percent(shares[0])),
+        *(named(each), percent(shares[1]), size),
+    ]
+
+
+FAR_M, FAR_PX = 35.0, 10.0
+"""A position beyond both is wrong; pixels, for imagery on which 35 m are less than a view shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """What a method made of the views of one or several scenes.
+
+    - `error_m` (N,): infinite without an answer. `far_m` (N,): error above which it is wrong.
+    - `evidence` (N,): -inf without an answer. `mirrored` (M,): that of mirrored views.
+    """
+
+    error_m: NDArray[np.float64]
+    far_m: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+    mirrored: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rows: Sequence[Result], name: str) -> "Placed":
+        """All views of these scenes."""
+        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+        shapes = [each.plain["trajectory"] for each in rows if name in each.plain[FIELD]]
+        views = [row for part in parts for row in part["views"]]
+        far = [
+            max(FAR_M, FAR_PX * shape["gsd_m"])
+            for part, shape in zip(parts, shapes, strict=True)
+            for _ in part["views"]
+        ]
+        return cls(
+            numbers([error for error, _ in views], math.inf),
+            np.array(far),
+            numbers([evidence for _, evidence in views], -math.inf),
+            numbers([each for part in parts for each in part["mirrored"]], -math.inf),
+        )
+
+    @property
+    def right(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the views that are not wrong."""
+        return self.error_m <= self.far_m
+
+    def within(self, radius_m: float = ACCURACY_M) -> float:
+        """Share of all views."""
+        return float((self.error_m <= radius_m).mean())
+
+    def trusted(self) -> float:
+        """Largest share of the right views that a threshold accepts with no wrong one."""
+        wrong = np.concatenate([self.evidence[~self.right], self.mirrored, [-math.inf]])
+        right = self.evidence[self.right]
+        return float((right > wrong.max()).mean()) if right.size else math.nan
+
+    def accepted(self, threshold: float) -> tuple[float, int]:
+        """Share of the right views that a threshold accepts, and how many wrong ones."""
+        accepted = self.evidence >= threshold
+        right = float(accepted[self.right].mean()) if self.right.any() else math.nan
+        return right, int((accepted & ~self.right).sum() + (self.mirrored >= threshold).sum())
+
+    def median_m(self) -> float:
+        """Median error of the right views."""
+        return float(np.median(self.error_m[self.right])) if self.right.any() else math.nan
+
+
+def field(results: Sequence[Result]) -> list[Table]:
+    """Each method over all scenes, and scene by scene."""
+    rows = [each for each in results if FIELD in each.plain]
+    if not rows:
+        return []
+    names = list(dict.fromkeys(name for each in rows for name in each.plain[FIELD]))
+    flown = [Method(**plain) for each in rows for plain in each.plain["methods"]]
+    shown = {each.key: label(each) for each in flown}
+    return [_summary(rows, names, shown), _field_by_scene(rows, names, shown)]
+
+
+def _summary(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+    lines = []
+    for name in names:
+        placed = Placed.of(rows, name)
+        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+        own = placed.accepted(CONFIDENT) if name.endswith("registration") else None
+        lines.append(
+            [
+                shown.get(name, name),
+                percent(placed.within()),
+                percent(float(placed.right.mean())),
+                percent(placed.trusted()),
+                "-" if own is None else f"{percent(own[0])} / {own[1]}",
+                number(placed.median_m()),
+                number(max(part["cpu_s"] for part in parts)),
+                number(max(part["peak_mb"] for part in parts)),
+                number(sum(part["carried_mb"] for part in parts)),
+            ]
+        )
+    errors = rows[0].plain["errors"]
+    counts = Placed.of(rows, names[0])
+    header = (
+        *("method", "15 m", "35 m or 10 px", "accepted at no wrong"),
+        *("accepted / wrong", "median m", "CPU s per view", "peak MB", "carried MB"),
+    )
+    notes = (
+        f"scenes: {', '.join(each.scene for each in rows)}; "
+        f"{len(counts.error_m)} views anywhere, of the later date, and {len(counts.mirrored)} "
+        "mirrored; "
+        f"standard deviations of the reported heading, {errors['yaw_std_deg']:g} deg, the height, "
+        f"{errors['agl_std']:.0%}, and the prior, {errors['prior_std_px']:g} px: the same for all",
+        "views in %; accepted at no wrong: of those correct within 35 m or 10 px, the "
+        "largest fraction that one threshold over all scenes accepts without a wrong one; every "
+        "answer to a mirrored view is wrong; evidence: inliers, Lowe's ratio, or the confidence",
+        f"accepted / wrong: of the correct ones, and number of wrong ones, at a confidence of "
+        f"{CONFIDENT:g}, where a method states one",
+        "CPU s, peak MB: the largest of the scenes' medians and peaks, one core; carried: "
+        "keypoints (descriptors in 16 bits) or maps with their encoders, all scenes",
+    )
+    return Table("The field today: all scenes", header, lines, notes)
+
+
+def _field_by_scene(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+    lines = []
+    for name in names:
+        cells = [shown.get(name, name)]
+        for each in rows:
+            placed = Placed.of([each], name) if name in each.plain[FIELD] else None
+            far = None if placed is None else float(placed.right.mean())
+            cells.append("-" if placed is None else f"{percent(placed.within())}/{percent(far)}")
+        lines.append(cells)
+    guess = ["the prior itself"]
+    for each in rows:
+        away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
+        far_m = max(FAR_M, FAR_PX * each.plain["trajectory"]["gsd_m"])
+        shares = (float((away <= radius).mean()) for radius in (ACCURACY_M, far_m))
+        guess.append("/".join(map(percent, shares)))
+    header = ("method", *(each.scene for each in rows))
+    notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)
+    return Table("The field today, scene by scene", header, [*lines, guess], notes)
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "paper-results.md"
+FIGURES = ("canny", "learnt", "share_canny", "share_learnt")
+HEAD = """# Results of the paper's experiments
+
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
+experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
+1.
+"""
+
+
+def page(rows: Sequence[Result]) -> str:
+    """Text of the page: tables of each setting."""
+    text = [HEAD]
+    for name in SETTINGS:
+        found = [row for row in rows if row.plain["setting"]["name"] == name]
+        if found:
+            text.append(f"## The {name} setting\n")
+            text += [table.markdown() for table in tables(found)]
+    text.append(agreement().markdown())
+    return "\n".join(text)
+
+
+def agreement() -> Table:
+    """How the edges of two dates agree on landscapes that the network was not learnt from."""
+    found = json.loads(BETWEEN_DATES.with_suffix(".json").read_text(encoding="utf-8"))
+    rows = []
+    for gsd_m in sorted({each["gsd_m"] for each in found}):
+        pairs = [each for each in found if each["gsd_m"] == gsd_m]
+        mean = {name: sum(each[name] for each in pairs) / len(pairs) for name in FIGURES}
+        correlations = (f"{mean[name]:.2f}" for name in FIGURES[:2])
+        rows.append([f"{gsd_m:g}", *correlations, *(percent(mean[name]) for name in FIGURES[2:])])
+    notes = (
+        "correlation of the edges of two dates, smoothed by a Gaussian of 1 px, mean of three "
+        "pairs; density: pixels that are edges, in %; generated landscapes that were not learnt "
+        "from",
+        "made by `python -m experiments.paper.between_dates`",
+    )
+    header = ("m per pixel", "Canny", "learnt", "density Canny", "density learnt")
+    return Table("Edges between dates", header, rows, notes)

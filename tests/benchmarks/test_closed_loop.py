@@ -6,13 +6,13 @@ from benchmarks.closed_loop.loop import Scenario, fly, tilt_off_rad
 from benchmarks.closed_loop.physics import (
     STEP_S,
     VEHICLES,
+    Grade,
     Motion,
     Wind,
     increments,
     integrated,
 )
 from benchmarks.closed_loop.replays import plain
-from benchmarks.closed_loop.sensors import Grade
 
 PERFECT = Grade(*(0.0,) * 4, 90.0, *(0.0,) * 8)
 

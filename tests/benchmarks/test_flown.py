@@ -1,4 +1,4 @@
-"""Looped flights, the fake autopilot, and figures of the benchmarks of flying and installing."""
+"""Looped flights, the fake autopilot, and figures of flights."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from benchmarks.looped_flight import played, rest_of, views_of
 from benchmarks.pair import Arrivals, FakeAutopilot, Fly, Lines, free_port, on_core, sample
 from pymavlink.dialects.v20 import common as mavlink
 
-from benchmarks import growth, install, soak
+from benchmarks import soak
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame
 
@@ -121,7 +121,6 @@ def test_lines_of_a_killed_program_are_read(tmp_path):
     path.write_text("\n".join([*map(json.dumps, (health, *views, health)), '{"frame": "3", "ag']))
     lines = Lines.read(path)
     assert lines.ages_ms.tolist() == [40.0, 50.0]
-    assert lines.sent_ages_ms.tolist() == [50.0]
     assert lines.reasons == {"searching": 2}
     assert lines.health["counts"] == {"taken": 2}
     assert Lines.read(tmp_path / "none").health == {}
@@ -136,17 +135,3 @@ def test_the_slope_separates_growth_of_memory_from_steps():
     grown, spread = soak.slope(hours, 200 + filling + 12 * hours + rng.normal(0, 0.3, 1200))
     assert grown == pytest.approx(12, abs=1)
     assert spread < 0.5
-
-
-def test_sizes_of_required_packages_add_up():
-    names = install.closure(["orthonav[autopilot]"])
-    assert {"numpy", "scipy", "pymavlink", "mcap", "zstandard"} <= names
-    assert not names & {"torch", "rasterio", "pyproj"}
-    assert install.installed_mb(["numpy"]) > 5
-    assert install.installed_mb(["orthonav[autopilot]"]) > install.installed_mb(["numpy", "scipy"])
-
-
-def test_the_exponent_of_growth_is_that_of_a_power():
-    areas = [1.0, 4.0, 16.0, 100.0]
-    assert growth.slope_of(areas, [3 * area**0.5 for area in areas]) == pytest.approx(0.5)
-    assert math.isnan(growth.slope_of([1.0], [3.0]))

@@ -40,13 +40,6 @@ def test_lowe_ratio_by_hand(values, expected):
     assert lowe_ratio(scores(*values)) == expected
 
 
-@given(st.lists(st.floats(-1, 1, width=32), max_size=20))
-def test_lowe_ratio_is_bounded_and_leaves_scores_alone(values):
-    given_scores = scores(*values)
-    given_scores.flags.writeable = False
-    assert 1 <= lowe_ratio(given_scores) <= MAX_RATIO
-
-
 LINE_EN_M = np.array([[0, 0], [10, 0], [20, 0], [100, 0]], dtype=np.float32)
 
 
@@ -64,14 +57,6 @@ def test_peak_ratio_ignores_the_neighbour_that_lowes_ratio_sees():
     values = scores(1.0, 0.95, 0.8, 0.5)
     assert lowe_ratio(values) == pytest.approx(1 / 0.95)
     assert peak_ratio(1.0, rival_score(values, LINE_EN_M, 0, 30)) == pytest.approx(2)
-
-
-@pytest.mark.parametrize(
-    "best, rival, expected",
-    [(0.6, 0.3, 2), (0.6, -1, MAX_RATIO), (0.6, 0, MAX_RATIO), (-0.1, -1, 1)],
-)
-def test_peak_ratio_by_hand(best, rival, expected):
-    assert peak_ratio(best, rival) == pytest.approx(expected)
 
 
 TRUTH = LogisticConfidence(-6.0, (5.0, 12.0))
@@ -108,17 +93,6 @@ def test_it_is_right_as_often_as_it_says():
     assert fresh_right.mean() == pytest.approx(said.mean(), abs=0.02)
 
 
-def test_weights_count_like_repetition():
-    features, right = synthetic(500, seed=3)
-    weight = np.random.default_rng(4).integers(1, 4, 500)
-    weighted = fit_logistic(features, right, weight.astype(float))
-    repeated = np.repeat(features, weight, axis=0)
-    repeat = fit_logistic(repeated, np.repeat(right, weight), np.ones(weight.sum()))
-    np.testing.assert_allclose(
-        probabilities(weighted, features), probabilities(repeat, features), atol=0.005
-    )
-
-
 @pytest.mark.parametrize("flip", [(-1, 1), (1, -1), (-1, -1)])
 def test_weights_are_never_negative(flip):
     features, right = synthetic(3000, seed=5)
@@ -137,14 +111,6 @@ def test_one_sided_data_gives_a_finite_answer(right):
     assert (said > 0.9).all() if right else (said < 0.1).all()
 
 
-def test_separable_and_constant_evidence_give_finite_weights():
-    features = np.stack([np.linspace(0, 1, 100), np.full(100, 0.3)], axis=1)
-    found = fit_logistic(features, features[:, 0] > 0.5, np.ones(100))
-    assert all(map(math.isfinite, (found.bias, *found.weights)))
-    said = probabilities(found, features)
-    assert said[0] < 0.1 and said[-1] > 0.9
-
-
 @pytest.mark.parametrize("usual", [USUAL_TILES, None])
 def test_few_trials_move_the_usual_confidence_and_without_any_nothing_is_confident(usual):
     evidence = {"score": 0.6, "margin": 0.2}
@@ -154,18 +120,6 @@ def test_few_trials_move_the_usual_confidence_and_without_any_nothing_is_confide
     few = fit_few(features, np.arange(20) < 8, weight, usual)
     assert wrong(evidence) < few(evidence)
     assert none({"score": 1.0, "margin": 1.0}) < 0.2
-
-
-def test_the_same_data_give_the_same_weights():
-    features, right = synthetic(1000, seed=7)
-    assert fit_logistic(features, right, np.ones(1000)) == fit_logistic(
-        features.copy(), right.copy(), np.ones(1000)
-    )
-
-
-@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
-def test_probability_stays_in_0_to_1(score, margin):
-    assert 0 < TRUTH({"score": score, "margin": margin}) <= 1
 
 
 @given(st.floats(-50, 50), st.tuples(st.floats(0, 50), st.floats(0, 50)))
@@ -193,3 +147,11 @@ def test_plain_round_trip(bias, weights):
 def test_what_is_no_confidence_is_refused(plain):
     with pytest.raises(VariantError, match="confidence"):
         LogisticConfidence.from_plain(plain)
+
+
+def test_separable_and_constant_evidence_give_finite_weights():
+    features = np.stack([np.linspace(0, 1, 100), np.full(100, 0.3)], axis=1)
+    found = fit_logistic(features, features[:, 0] > 0.5, np.ones(100))
+    assert all(map(math.isfinite, (found.bias, *found.weights)))
+    said = probabilities(found, features)
+    assert said[0] < 0.1 and said[-1] > 0.9

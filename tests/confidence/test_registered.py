@@ -13,7 +13,6 @@ from orthonav.core.localize.confidence import (
     CHANCES,
     FEATURES,
     STAND_IN,
-    USUAL_DETAIL,
     Chances,
     RegisteredConfidence,
     features_of,
@@ -59,12 +58,6 @@ def test_features_by_hand():
     assert len(features) == len(FEATURES)
 
 
-def test_a_view_of_one_level_is_compared_with_the_chance_of_one_level():
-    features = features_of(evidence(30.0, 0.0, 30.0, 20.0, detail_ratio=math.nan), CHANCE)
-    np.testing.assert_allclose(np.exp(features[:2]), [30 / 15, 1 / STAND_IN * 30 / 15])
-    assert features[3] == math.log(USUAL_DETAIL)
-
-
 def test_a_place_that_fits_as_well_a_little_aside_is_not_believed():
     """A lattice: strong, without a rival far away."""
     usual = RegisteredConfidence.usual(CHANCE)
@@ -96,11 +89,6 @@ def test_the_finer_level_counts_where_it_was_looked_at():
         assert np.exp(features_of(plain, CHANCE))[1] == pytest.approx(50 / 45)
 
 
-@given(evidences)
-def test_it_is_a_probability(plain):
-    assert 0 <= MODEL(plain) <= 1
-
-
 @pytest.mark.parametrize("value", [0.0, -30.0, 1e-300, 1e300])
 def test_absurd_evidence_gives_a_probability(value):
     for name in ("strength", "rival", "look", "look_rival"):
@@ -112,22 +100,6 @@ def test_better_evidence_never_lowers_it(plain, gain):
     for name in ("strength", "look", "fine", "local_phase", "local_gradients", "detail_ratio"):
         if math.isfinite(plain[name]):
             assert MODEL({**plain, name: gain * plain[name]}) >= MODEL(plain) - 1e-12
-
-
-@given(evidences, st.floats(1.0, 4.0))
-def test_a_better_rival_never_raises_it(plain, gain):
-    for name in ("rival", "look_rival", "fine_rival"):
-        if math.isfinite(plain[name]):
-            assert MODEL({**plain, name: gain * plain[name]}) <= MODEL(plain) + 1e-12
-
-
-def test_strength_and_ratios_each_raise_it():
-    middle = MODEL(evidence(40.0, 30.0, 25.0, 20.0))
-    assert 0.05 < middle < 0.95
-    assert MODEL(evidence(44.0, 33.0, 25.0, 20.0)) > middle  # stronger, the same ratio
-    assert MODEL(evidence(40.0, 27.0, 25.0, 20.0)) > middle
-    assert MODEL(evidence(40.0, 30.0, 25.0, 18.0)) > middle
-    assert MODEL(evidence(40.0, 40.0, 25.0, 25.0)) < 0.15
 
 
 @given(
@@ -175,12 +147,6 @@ NUMBERS += [("chances", name) for name in CHANCES]
 def test_a_bad_number_is_refused(path, value):
     with pytest.raises(VariantError, match=r"confidence|chance"):
         RegisteredConfidence.from_plain(changed(PLAIN, value, *path))
-
-
-@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
-def test_a_missing_number_is_refused(path):
-    with pytest.raises(VariantError, match="confidence"):
-        RegisteredConfidence.from_plain(without(PLAIN, *path))
 
 
 @pytest.mark.parametrize("plain", [None, [], {}, "text", 3, {"weights": [1, 2, 3]}], ids=str)
@@ -242,7 +208,7 @@ def test_one_sided_views_give_a_finite_answer(all_right):
     assert min(moved) > 0 if all_right else max(moved) < 0
 
 
-def test_the_same_views_give_the_same_confidence():
-    views, right = synthetic(100, seed=4)
-    first, second = (fit_registered(views, right, CHANCE) for _ in range(2))
-    assert first == second
+@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
+def test_a_missing_number_is_refused(path):
+    with pytest.raises(VariantError, match="confidence"):
+        RegisteredConfidence.from_plain(without(PLAIN, *path))

@@ -5,11 +5,9 @@ from dataclasses import asdict
 
 from experiments.paper import results
 from experiments.paper.__main__ import main
-from experiments.paper.comparison import above_default
-from experiments.paper.methods import methods
-from experiments.paper.page import PAGE, page
+from experiments.paper.methods import REDUCED, TABLE_1, methods
 from experiments.paper.results import Result, compact, stored
-from experiments.paper.trajectories import REDUCED, TABLE_1
+from experiments.paper.tables import PAGE, above_default, page
 
 TILES = 940
 
@@ -53,7 +51,7 @@ def test_a_page_names_commit_and_date_of_every_row():
 
 def test_results_are_kept_and_the_page_follows(tmp_path, monkeypatch):
     shown = tmp_path / "page.md"
-    monkeypatch.setattr("experiments.paper.page.PAGE", shown)
+    monkeypatch.setattr("experiments.paper.tables.PAGE", shown)
     monkeypatch.setattr(results, "ROWS", tmp_path / "rows")
     folder = tmp_path / "results" / "reduced"
     folder.mkdir(parents=True)

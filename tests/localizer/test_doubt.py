@@ -116,10 +116,6 @@ def test_without_a_finer_level_more_candidates_are_finished_at_the_finest():
     assert searched([0.5, 0.5], final=0)[1] == [(3, False), (48, False)]
 
 
-def test_views_judged_at_the_level_they_are_finished_at_have_no_further_pass():
-    assert searched([0.5], final=JUDGED)[1] == [(3, False)]
-
-
 def test_a_budget_leaves_it_out():
     _, finished, found = searched([0.5], budget_ms=1e-9)
     assert finished == [(3, False)] and "cut_short" in found
@@ -189,11 +185,6 @@ def test_a_trial_that_there_is_no_time_for_does_not_cut_a_search_short(monkeypat
     assert steps == [20.0] and "cut_short" in found
 
 
-def test_a_place_that_does_not_stand_out_is_not_compared_one_level_finer():
-    _, finished, _ = searched([0.999, 0.999], costs_ms=(50.0, 300.0), ratio=1.2, from_tiles=True)
-    assert finished == [(3, False)] * 2
-
-
 def test_a_place_that_stands_out_ends_the_search_unless_few_places_were_compared():
     costs_ms = 50.0, 10.0
     ran, *_ = searched([0.5] * 6, costs_ms=costs_ms, ratio=3.0, level=JUDGED + 1)
@@ -203,20 +194,10 @@ def test_a_place_that_stands_out_ends_the_search_unless_few_places_were_compared
         assert ran == list(costs_ms[:number])
 
 
-def test_before_a_cheap_search_there_is_no_trial():
-    ran, finished, _ = searched([0.995], costs_ms=(50.0, 10.0))
-    assert (ran, finished) == ([50.0, 10.0], [(3, False)])
-
-
 @pytest.mark.parametrize("changes", [{"final": JUDGED}, {"learnt": False}])
 def test_where_nothing_is_finished_or_no_confidence_is_known_there_is_no_trial(changes):
     ran, finished, _ = searched([0.999] * 3, costs_ms=(50.0, 300.0), **changes)
     assert ran == [50.0, 300.0] and finished[0] == (3, False)
-
-
-def test_a_trial_without_a_finer_level_finishes_the_best_candidates():
-    ran, finished, found = searched([0.999], costs_ms=(50.0, 300.0), final=0)
-    assert (ran, finished, found["confidence"]) == ([50.0], [(3, False)], 0.999)
 
 
 def test_other_places_are_less_confident_than_the_one_that_won_in_detail():

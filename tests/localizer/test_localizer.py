@@ -1,7 +1,6 @@
 """The tile localizer: views found, limited by the prior, or refused with a reason."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -13,8 +12,6 @@ from hypothesis import strategies as st
 from orthonav.core.errors import CameraError
 from orthonav.core.flight import read_image
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize import Localizer
-from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
@@ -133,27 +130,6 @@ def same(one, other):
     return values[0] == values[1] and (one.cov_en_m2 == other.cov_en_m2).all()
 
 
-def test_the_same_view_gives_the_same_fix(fixes, views, flight, localizer, map_path):
-    fresh = Localizer(open_map(map_path), registration=False)
-    for name in list(fixes)[:6]:
-        grey, telemetry = views[name]
-        kept = grey.copy()
-        assert same(localizer.locate(View(grey, flight.camera, telemetry)), fixes[name])
-        assert same(fresh.locate(View(grey, flight.camera, telemetry)), fixes[name])
-        np.testing.assert_array_equal(grey, kept)
-
-
-def test_threads_may_share_a_localizer(fixes, views, flight, map_path):
-    fresh = Localizer(
-        open_map(map_path), registration=False
-    )  # cold, so that the caches are filled by both at once
-    with ThreadPoolExecutor(4) as pool:
-        found = pool.map(
-            lambda item: fresh.locate(View(item[0], flight.camera, item[1])), views.values()
-        )
-        assert all(same(one, fix) for one, fix in zip(found, fixes.values(), strict=True))
-
-
 def test_a_prior_outside_the_map(views, flight, localizer, good):
     grey, telemetry = views[good]
     for place in ([50_000.0, 0.0], [0.0, -3000.0]):
@@ -161,19 +137,6 @@ def test_a_prior_outside_the_map(views, flight, localizer, good):
             View(grey, flight.camera, telemetry), prior=prior_at(localizer, place, 100.0)
         )
         assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
-
-
-def test_a_prior_near_the_truth_changes_nothing(views, fixes, flight, localizer, good, truth_en_m):
-    grey, telemetry = views[good]
-    for std_m in (50.0, 150.0, 1e5):
-        prior = prior_at(localizer, truth_en_m[good], std_m)
-        fix = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
-        assert place_en_m(localizer, fix) == pytest.approx(
-            place_en_m(localizer, fixes[good]), abs=1e-6
-        )
-        assert fix.evidence["score"] == pytest.approx(fixes[good].evidence["score"], abs=1e-6)
-        searched = fix.evidence["tiles_searched"]
-        assert (searched < localizer.sheet.tiles) == (std_m < 1e5) and searched > 0
 
 
 def test_tiles_beyond_the_prior_are_not_searched(views, flight, localizer, good, truth_en_m):
@@ -215,39 +178,6 @@ def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(views, flight,
     assert (gated.lat_deg, gated.lon_deg) == (free.lat_deg, free.lon_deg)
 
 
-def test_a_prior_helps(views, flight, localizer, fixes, truth_en_m):
-    def right(found):
-        errors = [error_m(localizer, fix, truth_en_m[name]) for name, fix in found.items()]
-        return sum(error <= localizer.grid.stride_m for error in errors)
-
-    gated = {
-        name: localizer.locate(
-            View(grey, flight.camera, telemetry), prior=prior_at(localizer, truth_en_m[name], 60.0)
-        )
-        for name, (grey, telemetry) in views.items()
-    }
-    assert right(gated) >= right(fixes) and right(gated) >= 28
-
-
-@pytest.mark.parametrize("std_m", [0.0, -5.0])
-def test_a_prior_without_width_still_reaches_a_stride(
-    views, flight, localizer, good, truth_en_m, std_m
-):
-    grey, telemetry = views[good]
-    prior = prior_at(localizer, truth_en_m[good], std_m)
-    fix = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
-    assert isinstance(fix, Fix) and 1 <= fix.evidence["tiles_searched"] <= 5
-
-
-@pytest.mark.parametrize(
-    "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.0, 3.0, math.nan)]
-)
-def test_a_nan_prior_is_outside_the_map(views, flight, localizer, good, prior):
-    grey, telemetry = views[good]
-    outcome = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
-    assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
-
-
 def test_unknown_heading(ground, localizer):
     places = [(-150.0, 40.0), (60.0, -30.0), (170.0, 100.0), (0.0, 0.0), (-60.0, -90.0)]
     found = 0
@@ -265,33 +195,6 @@ def test_unknown_heading(ground, localizer):
     assert found >= 4
 
 
-def test_headings_are_searched_as_far_as_their_deviation(ground, localizer):
-    place = (60.0, -30.0)
-    grey, telemetry = ground.view(*place, yaw_deg=40.0)
-    off = replace(telemetry, yaw_deg=65.0)
-    narrow = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=1.0)))
-    wide = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=20.0)))
-    assert narrow.heading_deg == pytest.approx(65.0, abs=6.1)
-    assert wide.heading_deg == pytest.approx(40.0, abs=6.1)
-    assert error_m(localizer, wide, np.array(place)) <= localizer.grid.stride_m
-
-
-@pytest.mark.parametrize("std_deg", [math.nan, math.inf, -3.0, 0.0, 1e9])
-def test_invalid_heading_deviations_are_tolerated(ground, localizer, std_deg):
-    grey, telemetry = ground.view(60.0, -30.0, yaw_deg=40.0)
-    fix = localizer.locate(View(grey, ground.camera, replace(telemetry, yaw_std_deg=std_deg)))
-    assert error_m(localizer, fix, np.array([60.0, -30.0])) <= localizer.grid.stride_m
-
-
-@pytest.mark.parametrize("yaw_deg", [-360.0, 360.0, 3600.0])
-def test_a_full_turn_changes_nothing(ground, localizer, yaw_deg):
-    grey, telemetry = ground.view(-60.0, 20.0, yaw_deg=30.0)
-    turned = replace(telemetry, yaw_deg=30.0 + yaw_deg)
-    one, other = (localizer.locate(View(grey, ground.camera, t)) for t in (telemetry, turned))
-    assert place_en_m(localizer, one) == pytest.approx(place_en_m(localizer, other), abs=0.5)
-    assert one.heading_deg == pytest.approx(other.heading_deg, abs=1e-6)
-
-
 @pytest.mark.parametrize("attitude", [(0, 15, -10), (75, 15, -10), (200, -12, 14), (0, 0, 25)])
 def test_tilt_is_compensated(ground, localizer, attitude):
     place = np.array([40.0, -10.0])
@@ -305,15 +208,6 @@ def test_tilt_is_compensated(ground, localizer, attitude):
 def args_of(ground, place, attitude):
     grey, telemetry = ground.view(*place, *map(float, attitude))
     return grey, ground.camera, telemetry
-
-
-def test_lens_distortion_is_corrected(ground, localizer):
-    lens = replace(ground.camera, distortion=(-0.3, 0.08, 0.001, -0.001))
-    grey, telemetry = ground.view(40.0, -10.0, camera=lens)
-    fix = localizer.locate(View(grey, lens, telemetry))
-    assert error_m(localizer, fix, np.array([40.0, -10.0])) <= localizer.grid.stride_m
-    plain = localizer.locate(View(ground.view(40.0, -10.0)[0], ground.camera, telemetry))
-    assert fix.evidence["score"] == pytest.approx(plain.evidence["score"], abs=0.02)
 
 
 def test_a_fine_picture_of_the_same_ground(ground, localizer):
@@ -365,14 +259,6 @@ def test_pictures_that_make_no_fix(localizer, grey, reason):
     camera = Camera(width, height, 250.0, 250.0, width / 2, height / 2)
     outcome = localizer.locate(View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0)))
     assert isinstance(outcome, NoFix) and outcome.reason == reason
-
-
-def test_a_picture_with_detail_only_where_it_is_not_compared(localizer):
-    grey = np.full((240, 960), 128, np.uint8)
-    grey[:, :200] = np.random.default_rng(0).integers(0, 255, (240, 200))
-    camera = Camera(960, 240, 250.0, 250.0, 480.0, 120.0)
-    outcome = localizer.locate(View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0)))
-    assert isinstance(outcome, NoFix) and outcome.reason == "blank"
 
 
 @pytest.mark.parametrize("shape", [(240, 300), (320, 240), (480, 320)])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from blots import CAMERA, GROUND, as_grey
 
-from orthonav.core.geo.ground import bilinear
 from orthonav.core.localize.rectify import (
     Orientation,
     hidden,
@@ -118,11 +117,3 @@ def test_unknown_heights_and_ground_not_seen_are_not_valid(grey):
     assert not valid[140:176, 120:156].any() and not valid[:20].any()
     assert (found[~valid] == 0).all()
     assert valid[160, 175] and valid[160, 100] and 0.2 < valid.mean() < 0.3
-
-
-def test_the_rasters_of_the_test_are_bilinear():
-    heights = relief(0.3)
-    at = np.random.default_rng(0).uniform(100, SIDE_M - 100, (2, 50))
-    col, row = at[0] / POSTING_M - 0.5, (SIDE_M - at[1]) / POSTING_M - 0.5
-    exact = bilinear(heights.values.astype(float), col, row)
-    np.testing.assert_allclose(heights.at(*at), exact, atol=0.6)

@@ -36,11 +36,3 @@ def test_at_the_rim_of_what_was_tried_it_is_the_pose_tried():
     poses = np.array([(0.0, 0.0), (STEP_RAD, 0.0)])
     assert not peak_poses(poses, np.float32([[1.0, 0.9]]), np.ones(2, np.float32)).any()
     assert not peak_poses(poses[:1], np.float32([[0.5]]), np.ones(1, np.float32)).any()
-
-
-def test_the_telemetry_decides_between_poses_that_are_about_as_similar():
-    poses = np.array([(turn * STEP_RAD, 0.0) for turn in (-2, -1, 0, 1, 2)])
-    scores = np.float32([[0.70, 0.72, 0.60, 0.71, 0.65]])
-    weights = np.float32([0.6, 0.8, 1.0, 0.95, 0.8])
-    assert peak_poses(poses, scores, np.ones(5, np.float32))[0, 0] < 0
-    assert peak_poses(poses, scores, weights)[0, 0] > 0.5 * STEP_RAD

@@ -158,31 +158,12 @@ def test_valid_is_what_the_camera_saw(attitude, lens):
         assert not view.valid[near & (inside < -0.1)].any()
 
 
-@pytest.mark.parametrize("attitude", ATTITUDES, ids=str)
-def test_offset_is_where_the_optical_axis_meets_the_ground(attitude):
-    grey = np.zeros((240, 320), np.uint8)
-    offset = tilted_and_prepared(grey, PLAIN, attitude).offset_en_m
-    east, north, up = enu(attitude, np.array([0.0, 0, 1]))
-    assert offset == pytest.approx([east / -up * AGL_M, north / -up * AGL_M], abs=1e-9)
-    yaw, pitch, roll = attitude
-    if roll == 0:  # ahead, by the tangent of the pitch
-        reach = AGL_M * math.tan(math.radians(pitch))
-        expected = [reach * math.sin(math.radians(yaw)), reach * math.cos(math.radians(yaw))]
-        assert offset == pytest.approx(expected, abs=1e-9)
-
-
 def test_valid_pixels_hold_no_black_from_beyond_the_border():
     for camera in LENSES.values():
         grey = np.full((camera.height_px, camera.width_px), 200, np.uint8)
         view = tilted_and_prepared(grey, camera, (37, 8, -6), gsd_m=2.0)
         assert not view.valid.all() and (view.grey[view.valid] == 200).all()
         assert not view.grey[~view.valid].any()
-
-
-def test_a_picture_beyond_the_horizon_is_not_valid():
-    view = tilted_and_prepared(rendered(Ground(), PLAIN, (0, 44, 0)), PLAIN, (0, 44, 0), gsd_m=8.0)
-    east, north = window_en_m(view.offset_en_m, gsd_m=8.0)
-    assert not view.valid[np.broadcast_to(north, east.shape) < -AGL_M / math.tan(0.767)].any()
 
 
 @pytest.mark.long
@@ -205,38 +186,6 @@ def test_fine_views_are_thinned_without_aliasing_or_shift(lens, size):
     assert np.abs(shift_px(view.grey, expected, inner)).max() < 0.05
 
 
-@pytest.mark.parametrize(
-    "agl_m, gsd_m, expected",
-    [
-        (100, 0.5, (320, 240)),
-        (100, 0.42, (320, 240)),
-        (100, 0.84, (160, 120)),
-        (100, 1.3, (106, 80)),
-        (100, 12.0, (11, 8)),
-        (100, 100.0, (320, 240)),
-    ],
-)
-def test_thinning_is_by_whole_numbers(agl_m, gsd_m, expected):
-    """A pixel covers 0.417 m; a view is never thinned below 8 px."""
-    grey = np.zeros((240, 320), np.uint8)
-    view = downsampled(View(grey, PLAIN, Telemetry(0, 0.0, 0.0, 0.0, agl_m)), gsd_m)
-    assert view.grey.shape[::-1] == expected
-    assert (view.camera.width_px, view.camera.height_px) == expected
-    factor = 1 if expected == (320, 240) else int(gsd_m / PLAIN.gsd_m(agl_m))
-    assert view.camera.fx_px == pytest.approx(PLAIN.fx_px / factor)
-    assert view.camera.cy_px == pytest.approx(PLAIN.cy_px / factor)
-
-
-def test_the_view_given_is_not_changed():
-    grey = rendered(Ground(), PLAIN, (0, 0, 0))
-    grey.flags.writeable = False
-    kept = grey.copy()
-    tilted_and_prepared(grey, PLAIN, (37, 8, -6), gsd_m=2.0)
-    view = View(grey, PLAIN, Telemetry(0, 5.0, 0.0, 0.0, AGL_M))
-    first, second = (rectify(view, gsd_m=1.0, size_px=64) for _ in range(2))
-    assert np.array_equal(first.grey, second.grey) and np.array_equal(grey, kept)
-
-
 @pytest.mark.parametrize("lens", ["barrel", "all", "fisheye"])
 @pytest.mark.parametrize("attitude", [(30.0, 0.0, 0.0), (200.0, 8.0, -5.0), (0.0, 50.0, 10.0)])
 def test_a_lens_at_some_pixels_is_as_good_as_at_all(monkeypatch, lens, attitude):
@@ -253,3 +202,9 @@ def test_a_lens_at_some_pixels_is_as_good_as_at_all(monkeypatch, lens, attitude)
     both = quick.valid & exact.valid
     off = np.abs(quick.grey.astype(int) - exact.grey)[both]
     assert both.any() and off.max() <= 3 and off.mean() < 0.2
+
+
+def test_a_picture_beyond_the_horizon_is_not_valid():
+    view = tilted_and_prepared(rendered(Ground(), PLAIN, (0, 44, 0)), PLAIN, (0, 44, 0), gsd_m=8.0)
+    east, north = window_en_m(view.offset_en_m, gsd_m=8.0)
+    assert not view.valid[np.broadcast_to(north, east.shape) < -AGL_M / math.tan(0.767)].any()

@@ -175,20 +175,6 @@ def test_the_scale_is_known_place_by_place(opened, grey):
         assert fix.agl_m == pytest.approx(agl_m, rel=0.01)
 
 
-@pytest.mark.parametrize("pitch_deg", [50.0, 60.0])
-def test_views_far_off_nadir_over_level_ground(opened, pitch_deg):
-    attitude = (20.0, pitch_deg, 4.0)
-    place = np.array([-60.0, -150.0])
-    picture = rendered(GROUND, place, attitude, 100.0)
-    localizer = Localizer(opened)
-    fix = localizer.locate(View(picture, CAMERA, telemetry((22.0, *attitude[1:]), 102.0)))
-    assert error_m(localizer, fix, place) < 2.0 and fix.confidence > 0.9
-    assert fix.agl_m == pytest.approx(100.0, rel=0.02)
-    assert "terrain_gain" not in fix.evidence
-    seen = localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg) - place
-    assert np.hypot(*seen) == pytest.approx(100 * math.tan(math.radians(pitch_deg)), rel=0.05)
-
-
 def test_level_ground_is_as_without_a_terrain(opened):
     """Views of a map whose terrain is level are placed as on a map without one."""
     picture = rendered(GROUND, PLACE, ATTITUDE)

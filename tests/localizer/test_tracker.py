@@ -293,40 +293,10 @@ def test_a_reported_start_needs_no_search(localizer):
     assert all(each.parent == -1 for each in unused.mixture.hypotheses)
 
 
-@pytest.mark.long
-def test_a_start_that_was_reported_wrongly_is_left(localizer):
-    tracker, seen = Tracker(localizer), list(views(19))
-    lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, 30.0))  # 150 m from the true place
-    grey, telemetry, place = seen[0]
-    seen[0] = grey, replace(telemetry, prior=Prior(float(lat), float(lon), 15.0)), place
-    rows = followed(tracker, localizer, seen)
-    assert rows[0][0] > 100
-    assert all(row[0] < 10 for row in rows if row[2] == "tracking" or row[1] > 0.8)
-    assert rows[-1][2] == "tracking"
-
-
-@pytest.mark.parametrize("dark", [False, True], ids=["first view", "after a dark view"])
-def test_an_uncertain_focal_length_widens_the_scale(localizer, dark):
-    tracker, (grey, telemetry, _) = Tracker(localizer), next(iter(views(1)))
-    usual = tracker.model.log_scale
-    if dark:
-        tracker.passed(telemetry, NoFix("too_dark", "no picture"))
-        telemetry = replace(telemetry, time_ns=telemetry.time_ns + 10**9)
-    tracker.locate(View(grey, replace(WIDE, focal_std=0.2), telemetry))
-    assert tracker.model.log_scale == tracker.mixture.model.log_scale
-    assert tracker.model.log_scale == pytest.approx(math.hypot(usual, 0.2))
-
-
 def test_unknown_heading_is_tracked(localizer):
     seen = [(g, replace(t, yaw_deg=math.nan), p) for g, t, p in views(8)]
     rows = followed(Tracker(localizer, heading_known=False), localizer, seen)
     assert max(row[0] for row in rows[3:]) < 10
-
-
-def test_a_wrong_camera_is_refused(localizer):
-    grey, telemetry, _ = next(iter(views(1)))
-    with pytest.raises(CameraError, match="320 x 240"):
-        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640), telemetry))
 
 
 def test_a_map_without_a_layer_is_refused(map_path):
@@ -377,17 +347,6 @@ def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
     assert len(again) == 9 and all(isinstance(each.outcome, Fix | NoFix) for each in again)
 
 
-def test_the_pose_of_a_camera_is_the_inverse(localizer):
-    registration = localizer.registration
-    telemetry = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
-    grey = rendered(GROUND, (20.0, -35.0), (33.0, 4.0, -7.0), AGL_M, WIDE)
-    search = registration.search(View(grey, WIDE, telemetry))
-    view, pose = search.view, search.run().pose
-    place = registration.camera_en_m(view, pose)
-    again = registration.pose_of(view, np.array([*place, pose.turn_rad, pose.log_scale]))
-    assert again.x_px == pytest.approx(pose.x_px) and again.y_px == pytest.approx(pose.y_px)
-
-
 @pytest.mark.parametrize("expected", [None, (0.0, 0.0), (-29.0, 27.0), (300.0, 0.0)])
 @pytest.mark.parametrize("moved", [(18.0, 0.0), (-30.0, 25.0), (0.0, -70.0)])
 def test_odometry_measures_the_displacement(moved, expected):
@@ -405,27 +364,6 @@ def test_odometry_measures_the_displacement(moved, expected):
     seen = displacement(*footprints, 0.0, heading_scale_noise, expected)
     assert seen.displacement.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
-
-
-def test_odometry_uses_the_same_biases_for_both_views():
-    """A tilt learnt between two views, and the noise of the last heading, are no displacement."""
-    moved, tilt = (18.0, -12.0), np.radians([5.0, -4.0])
-    telemetry = [Telemetry(n * 10**9, yaw, 0.0, 0.0, AGL_M) for n, yaw in enumerate((350.0, 147.0))]
-    first, second = (
-        rendered(GROUND, place, (heading, *np.degrees(tilt)), AGL_M, WIDE)
-        for place, heading in (((0.0, 0.0), 0.0), (moved, 150.0))
-    )
-    known = np.array([math.radians(11.0), 0.0, *tilt])
-    before = OdometryView.of(View(first, WIDE, telemetry[0]), None)
-    now = OdometryView.of(View(second, WIDE, telemetry[1]), before.pixel_m, known)
-    noise = np.array([math.radians(5.0) ** 2, 1e-4])
-    seen = displacement(before.corrected(known), now, 0.0, noise)
-    turn = math.radians(10.0)  # the error of the first heading rotates the displacement
-    bent = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ moved
-    assert seen.displacement.moved_en_m == pytest.approx(bent, abs=1.5)
-    assert math.degrees(seen.displacement.turned_rad) == pytest.approx(-7.0, abs=1.0)
-    apart = displacement(before, now, 0.0, noise)
-    assert apart is None or np.hypot(*(apart.displacement.moved_en_m - bent)) > 8
 
 
 def test_odometry_refuses_views_without_common_ground():
@@ -480,24 +418,6 @@ def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
     assert rows[2][3].pitch_deg == pytest.approx(5.0, abs=2.0)
 
 
-def test_the_radius_grows_with_the_height(localizer):
-    high = Camera(320, 240, 200 * 2000 / AGL_M, 200 * 2000 / AGL_M, 160.0, 120.0)
-    grey, telemetry, _ = next(iter(views(1)))
-    found = Tracker(localizer).locate(View(grey, high, replace(telemetry, agl_m=2000.0)))
-    assert found.radius_m == pytest.approx(50.0, rel=0.1)
-    low = Tracker(localizer).locate(View(grey, WIDE, telemetry))
-    assert low.radius_m == localizer.registration.radius_m
-
-
-@pytest.mark.long
-def test_a_reversed_heading_confirms_no_track(localizer):
-    """Ground looks alike when rotated by 180 deg: single views fit somewhere, no track follows."""
-    tracker = Tracker(localizer)
-    rows = followed(tracker, localizer, views(7, heading_off=180.0))
-    assert not any(row[1] > 0.8 and row[0] > 35 for row in rows)
-    assert all(row[2] == "searching" for row in rows)
-
-
 @pytest.mark.long
 def test_a_wrong_place_found_after_a_loss_does_not_bias_the_search(localizer):
     """Heading and height of a wrong place must not keep the true one from being found."""
@@ -538,3 +458,21 @@ def test_exact_dead_reckoning_of_a_confirmed_track_is_confirmed_around_it(
     whole, around = (tracker._search_area(expected, whole_map=each) for each in (True, False))
     assert whole == (None, True)
     assert around.circle is not None and around.confirms is confirms
+
+
+@pytest.mark.long
+def test_a_start_that_was_reported_wrongly_is_left(localizer):
+    tracker, seen = Tracker(localizer), list(views(19))
+    lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, 30.0))  # 150 m from the true place
+    grey, telemetry, place = seen[0]
+    seen[0] = grey, replace(telemetry, prior=Prior(float(lat), float(lon), 15.0)), place
+    rows = followed(tracker, localizer, seen)
+    assert rows[0][0] > 100
+    assert all(row[0] < 10 for row in rows if row[2] == "tracking" or row[1] > 0.8)
+    assert rows[-1][2] == "tracking"
+
+
+def test_a_wrong_camera_is_refused(localizer):
+    grey, telemetry, _ = next(iter(views(1)))
+    with pytest.raises(CameraError, match="320 x 240"):
+        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640), telemetry))

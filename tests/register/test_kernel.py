@@ -10,7 +10,6 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.register import blocks, refine, search, sharpness, template
-from orthonav.core.register.channels import FINE
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
@@ -73,33 +72,6 @@ def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
         assert one.correlations == pytest.approx(other.correlations, abs=5e-3)
         assert one.overlap == pytest.approx(other.overlap, abs=5e-3)
         assert one.covariance == pytest.approx(other.covariance, rel=0.1, abs=1e-4)
-
-
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_kernel), False])
-def test_views_that_touch_the_map_with_a_few_pixels_are_placed(reference, monkeypatch, compiled):
-    if not compiled:
-        for module in (refine, sharpness, template):
-            monkeypatch.setattr(module, "KERNEL", None)
-    rng = np.random.default_rng(8)
-    made = templates_of(GROUND, Pose(160, 128, 0, 0)).at(0)
-    for _ in range(60):
-        inside_px = rng.uniform(0, 3)
-        pose = Pose(SHAPE[1] + 64 - inside_px, rng.uniform(0, SHAPE[0]), rng.normal(0, 0.02), 0.0)
-        placed = Refiner(made, reference).place(pose, with_covariance=True)
-        assert math.isfinite(placed.score) and math.isfinite(placed.pose.x_px)
-
-
-@needs_kernel
-def test_curvatures_are_the_same(monkeypatch):
-    made, _ = next(views(1, 3, 0))
-
-    def work():
-        fresh = template.Template(made.level, made.planes, made.weights, made.recipe)
-        return fresh.block_hessians, fresh.hessians, fresh.self_slopes
-
-    compiled, plain = both(monkeypatch, work)
-    for one, other in zip(compiled, plain, strict=True):
-        assert one == pytest.approx(other, rel=1e-4, abs=1e-6 * np.abs(other).max())
 
 
 @needs_kernel
@@ -206,26 +178,6 @@ def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole
             assert np.unravel_index(mine.argmax(), mine.shape) == np.unravel_index(
                 plain.argmax(), plain.shape
             )
-
-
-@needs_kernel
-@pytest.mark.parametrize("of_map", [True, False])
-@pytest.mark.parametrize("channel", range(3))
-def test_a_channel_that_shows_nothing_adds_nothing_aside(monkeypatch, channel, of_map):
-    rng = np.random.default_rng(6)
-    window = MapWindow(np.ones((60, 70, 4), np.float32), 0, 0, 1.0, (46, 58))
-    values = np.ones((30, 42, 4), np.float32)
-    for evidence, unit in ((window.made, 1.0), (values, 0.02)):
-        evidence[..., :3] = rng.normal(0, unit, (*evidence.shape[:2], 3))
-    (window.made if of_map else values)[..., channel] = 0
-    monkeypatch.setattr(MapWindow, "of", lambda *_: window)
-    planes = np.ascontiguousarray(np.moveaxis(values, -1, 0))
-    made = template.Template(0, planes, (1.0, 0.6), FINE)
-    one, other = both(
-        monkeypatch, lambda: sharpness._moved_scores(made, None, Pose(35.0, 30.0, 0.0, 0.0))
-    )
-    for mine, plain in zip(one, other, strict=True):
-        assert mine == pytest.approx(plain, abs=1e-3 * float(np.abs(plain).max()) + 1e-7)
 
 
 @needs_kernel
@@ -338,43 +290,6 @@ def test_windows_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("missing", range(5))
-def test_an_array_that_is_missing_is_refused(missing):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    spectra, poses = np.zeros((3, 3, 45, 16), np.float32), np.zeros((1, 4))
-    best, numbers = np.zeros((3, 40, 16), np.float32), np.zeros((3, 40, 16), np.int32)
-    given = [spectra, made.values, poses, best, numbers]
-    given[missing] = None
-    spectra, values, poses, best, numbers = given
-    with pytest.raises(TypeError):
-        KERNEL.search(spectra, values, made.weights, poses, 0, best, numbers, None)
-    with pytest.raises(TypeError):
-        KERNEL.near(None, made.values, made.weights, np.zeros((1, 4)), 2, np.zeros((1, 3)))
-
-
-@needs_kernel
-@pytest.mark.parametrize("missing", range(3))
-def test_moves_of_an_array_that_is_missing_are_refused(missing):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    given = [np.zeros((20, 30, 4), np.float32), made.values, np.zeros((3, 7, 9), np.float32)]
-    given[missing] = None
-    window, values, out = given
-    with pytest.raises(TypeError):
-        KERNEL.moved(window, values, made.weights, (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, out)
-
-
-@needs_kernel
-@pytest.mark.parametrize("missing", range(5))
-def test_sums_of_an_array_that_is_missing_are_refused(missing):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    window, out = np.zeros((20, 30, 4), np.float32), np.zeros(2 * 16 + 36 * refine.BLOCK_SUMS)
-    given = [window, made.values, made.slopes, made.numbers, out]
-    given[missing] = None
-    with pytest.raises(TypeError):
-        KERNEL.spread(*given[:4], (0,) * 4, (0,) * 9, given[4])
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("reach_px", [2, 7])
@@ -413,15 +328,25 @@ def test_blocks_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("missing", range(3))
-def test_blocks_of_an_array_that_is_missing_are_refused(missing):
-    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).values
-    rows, cols = view.shape[:2]
-    given = [
-        view,
-        np.ones((rows + 4, cols + 4, 4), np.float32),
-        np.zeros((36, 5, 5, 4), np.float32),
-    ]
-    given[missing] = None
-    with pytest.raises(TypeError):
-        KERNEL.blocks(given[0], given[1], 2, given[2])
+@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks"])
+def test_an_array_that_is_missing_is_refused(name):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    values, weights, (rows, cols) = made.values, made.weights, made.mask.shape
+
+    def zeros(*shape, of=np.float32):
+        return np.zeros(shape, of)
+
+    window, best, numbers = zeros(20, 30, 4), zeros(3, 40, 16), zeros(3, 40, 16, of=np.int32)
+    spectra, poses, sums = zeros(3, 3, 45, 16), np.zeros((1, 4)), np.zeros(2 * 16 + 36 * 7)
+    moved = (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, zeros(3, 7, 9)
+    given = {
+        "search": (spectra, values, weights, poses, 0, best, numbers, None),
+        "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
+        "moved": (window, values, weights, *moved),
+        "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
+        "blocks": (values, zeros(rows + 4, cols + 4, 4), 2, zeros(36, 5, 5, 4)),
+    }[name]
+    for at, each in enumerate(given):
+        if isinstance(each, np.ndarray):
+            with pytest.raises(TypeError):
+                getattr(KERNEL, name)(*given[:at], None, *given[at + 1 :])

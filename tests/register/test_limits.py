@@ -38,22 +38,6 @@ def test_errors_on_a_part_of_the_map_are_as_large_as_the_covariance_says(hole, l
     assert 1.0 < squares.mean() < 3.5
 
 
-@pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
-@pytest.mark.parametrize("turn_deg", [0.0, 35.0])
-def test_a_part_of_the_map_is_converged_upon_as_fast_and_known_less_exactly(hole, turn_deg):
-    valid = np.ones(SHAPE, bool)
-    valid[hole] = False
-    pose = Pose(222.0, 181.0, math.radians(turn_deg), 0.0)
-    template = noisy(GROUND, pose, np.random.default_rng(1), noise=10.0).at(0)
-    start = moved(pose, 1.5, 2.0, 2.0, 1.02)
-    part, whole = (
-        Refiner(template, reference_of(GROUND, SHAPE, v)).place(start, with_covariance=True)
-        for v in (valid, None)
-    )
-    assert np.hypot(*errors(part, pose)[:2]) < 0.12
-    assert np.trace(part.covariance[:2, :2]) > np.trace(whole.covariance[:2, :2])
-
-
 @pytest.mark.parametrize("log_scale", [2.0, 7.0, 700.0])
 def test_an_absurd_scale_takes_no_memory(log_scale, monkeypatch):
     """As computed from a bank at a low height: a window of 129 GiB was asked for."""

@@ -35,13 +35,6 @@ def test_the_top_of_the_window_points_to_the_heading(heading_deg, top_xy, right_
     np.testing.assert_allclose(seen, expected, atol=1e-9)
 
 
-@given(poses)
-def test_linear_is_a_rotation_and_a_scale(pose):
-    scale = math.exp(pose.log_scale)
-    np.testing.assert_allclose(pose.linear @ pose.linear.T, np.eye(2) * scale**2, atol=1e-9)
-    assert np.linalg.det(pose.linear) == pytest.approx(scale**2)
-
-
 @given(poses, steps)
 def test_a_step_is_undone_by_the_inverse_of_its_similarity(pose, step):
     """To first order: what the window would show after a step is where it was before."""
@@ -51,11 +44,6 @@ def test_a_step_is_undone_by_the_inverse_of_its_similarity(pose, step):
     stepped = point + small[:2] + turn * np.array([-point[1], point[0]]) + grow * point
     back = pose.stepped(small).map_px(stepped)
     np.testing.assert_allclose(back, pose.map_px(point), atol=1e-4)
-
-
-def test_no_step_changes_nothing():
-    pose = Pose(1.5, -2.5, 0.3, 0.1)
-    assert pose.stepped(np.zeros(4)) == pose
 
 
 def test_a_step_of_a_bank_is_as_likely_as_the_likeliest_within_it():

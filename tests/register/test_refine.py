@@ -1,21 +1,17 @@
 """Refinement finds the very place, says how well it fits and how exactly it is known."""
 
 import math
-from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from scenes import (
     Ground,
-    Sheet,
     apart_px,
     as_grey,
     pixel_centres,
     random_poses,
     reference_of,
     seen,
-    sheet_of,
     templates_of,
     turned_rad,
 )
@@ -24,7 +20,6 @@ from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.refine import STEPS, Refiner
 from orthonav.core.register.template import ViewTemplates
-from orthonav.core.register.window import Reference
 
 SHAPE = (384, 448)
 VIEW = (96, 128)
@@ -107,101 +102,6 @@ def test_noise_and_clutter_move_it_little(reference, level):
         assert 0.5 < placed.weighted < 0.9
 
 
-@pytest.mark.parametrize(
-    "step",
-    [
-        (0.8, 0, 0, 0),
-        (-0.8, 0, 0, 0),
-        (0, 0.8, 0, 0),
-        (0, -0.8, 0, 0),
-        (0, 0, 0.015, 0),
-        (0, 0, -0.015, 0),
-        (0, 0, 0, 0.015),
-        (0, 0, 0, -0.015),
-    ],
-)
-def test_one_step_goes_most_of_the_way(reference, step):
-    """In the right direction on each axis, whatever the heading."""
-    step = np.array(step, dtype=float)
-    for pose in random_poses(6, SHAPE, REACH_PX, seed=4, log_scale=0.1):
-        start = Pose(*(np.array([pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale]) + step))
-        placed = Refiner(templates_of(GROUND, pose).at(0), reference).place(start, 1)
-        unit = np.array([1, 1, 50, 50])  # half a view's side brings all to pixels
-        left = np.linalg.norm(errors(placed, pose) * unit)
-        assert left < 0.55 * np.linalg.norm(step * unit)
-
-
-@pytest.mark.parametrize("level", [0, 1])
-@pytest.mark.parametrize("size", [(96, 128), (64, 64), (90, 122)])
-def test_a_cut_of_the_map_lies_where_it_was_cut(level, size):
-    """Whole pixels, no resampling: the convention of half pixels is exact."""
-    sheet = sheet_of(GROUND, SHAPE)
-    row, col = 120, 76
-    grey = sheet.read(0, row, col, *size)[0]
-    pose = Pose(col + size[1] / 2, row + size[0] / 2, 0.0, 0.0)
-    template = ViewTemplates(grey, np.ones(size, bool), 0).at(level)
-    refiner = Refiner(template, Reference(sheet))
-    assert refiner.place(pose, 0).weighted > 0.9  # only what the view's borders reach differs
-    placed = refiner.place(pose, with_covariance=True)
-    assert np.abs(errors(placed, pose)[:2]).max() / 2**level < 0.05
-    for x, y in ((0.5, 0), (0, 0.5)):
-        beside = [
-            refiner.place(Pose(pose.x_px + s * x, pose.y_px + s * y, 0.0, 0.0), 0).weighted
-            for s in (-1, 1)
-        ]
-        assert beside[0] == pytest.approx(beside[1], abs=0.02) and beside[0] < 0.99
-
-
-def test_the_best_seen_is_kept(reference):
-    """However the steps go, more of them never make it worse."""
-    for number, pose in enumerate(random_poses(10, SHAPE, REACH_PX, seed=5, log_scale=0.1)):
-        start = moved(pose, 6.0, number, 7.0, 1.12)  # far enough for steps to go astray
-        refiner = Refiner(templates_of(GROUND, pose).at(0), reference)
-        scores = [refiner.place(start, steps).score for steps in range(8)]
-        assert all(later >= earlier for earlier, later in pairwise(scores))
-        assert scores[-1] > scores[0]
-
-
-def test_without_steps_a_pose_is_judged_where_it_is(reference):
-    pose = Pose(200.0, 180.0, 0.4, 0.0)
-    start = moved(pose, 1.0)
-    refiner = Refiner(templates_of(GROUND, pose).at(0), reference)
-    placed = refiner.place(start, 0)
-    assert placed.pose == start and not placed.converged
-    assert math.isnan(placed.agreement) and placed.covariance is None
-    there = refiner.place(pose, 0)
-    assert there.score > placed.score
-    # The score is the weighted sum of correlations times the root of the pixels.
-    total = there.correlations[0] + FINE.grey_share * there.correlations[1]
-    assert there.score == pytest.approx(total * math.sqrt(96 * 128), rel=1e-3)
-    assert there.weighted == pytest.approx(total / (1 + FINE.grey_share))
-    assert all(0 < each <= 1.0001 for each in there.correlations)
-
-
-def test_a_reversed_contrast_is_recognized_by_grey_only(reference):
-    pose = Pose(200.0, 180.0, 0.4, 0.0)
-    grey = 255 - as_grey(seen(GROUND, pose, VIEW))
-    view = ViewTemplates(grey, np.ones(VIEW, bool), 0)
-    placed = Refiner(view.at(0), reference).place(moved(pose, 1.0), with_covariance=True)
-    assert placed.correlations[0] > 0.9 and placed.correlations[1] < -0.9
-    assert apart_px(placed.pose, pose) < 0.1 and np.isfinite(placed.covariance).all()
-
-
-def test_the_same_again_and_inputs_untouched(reference):
-    pose = Pose(200.0, 180.0, 0.4, 0.0)
-    template = templates_of(GROUND, pose).at(0)
-    kept = template.channels.copy(), template.mask.copy(), reference.whole(0).copy()
-    start = moved(pose, 2.0, 1.0, 3.0, 1.03)
-    first, second = (
-        Refiner(template, reference).place(start, with_covariance=True) for _ in range(2)
-    )
-    assert replace(first, covariance=None).pose == second.pose and first.score == second.score
-    assert first.covariance.tobytes() == second.covariance.tobytes()
-    np.testing.assert_array_equal(template.channels, kept[0])
-    np.testing.assert_array_equal(template.mask, kept[1])
-    np.testing.assert_array_equal(reference.whole(0), kept[2])
-
-
 def test_windows_made_alone_give_the_same(reference, monkeypatch):
     monkeypatch.setattr("orthonav.core.register.window.WHOLE_LEVEL_PX", 0)
     piecewise = reference_of(GROUND, SHAPE)
@@ -274,28 +174,6 @@ def test_a_blank_view_says_nothing(reference, grey):
     assert math.isfinite(placed.pose.x_px + placed.pose.turn_rad + placed.pose.log_scale)
 
 
-@pytest.mark.parametrize("shape", [(2, 2), (7, 12), (16, 16)])
-def test_tiny_views_are_no_crash(reference, shape):
-    pose = Pose(200.0, 180.0, 0.3, 0.0)
-    view = templates_of(GROUND, pose, shape)
-    for recipe in (FINE, COARSE):
-        placed = Refiner(view.at(0, recipe), reference).place(pose, with_covariance=True)
-        assert math.isfinite(placed.score) and np.isfinite(placed.covariance).all()
-
-
-def test_agreement_tells_right_from_wrong(reference):
-    pose = Pose(200.0, 180.0, 0.3, 0.0)
-    refiner = Refiner(templates_of(GROUND, pose).at(0), reference)
-    assert refiner.place(pose, with_covariance=True).agreement == 1.0
-    wrong = [
-        refiner.place(each, with_covariance=True)
-        for each in random_poses(12, SHAPE, REACH_PX, seed=8)
-        if apart_px(each, pose) > 40
-    ]
-    assert len(wrong) > 6 and np.mean([each.agreement for each in wrong]) < 0.75
-    assert max(each.weighted for each in wrong) < 0.35
-
-
 def test_half_of_a_view_that_changed_disagrees(reference):
     pose = Pose(200.0, 180.0, 0.3, 0.0)
     values = seen(GROUND, pose, VIEW)
@@ -335,28 +213,6 @@ def test_errors_are_as_large_as_the_covariance_says(reference, level, view):
         assert 0.4 < ratio < 4.0
 
 
-def test_covariances_are_symmetric_and_positive(reference):
-    _, covariances = many_placed(reference, 0, 20, 20, noise=10.0, clutter=10.0)
-    np.testing.assert_allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-6)
-    assert np.linalg.eigvalsh(covariances).min() > 0
-
-
-@pytest.mark.parametrize("level", [0, 1])
-def test_worse_views_are_known_less_exactly(reference, level):
-    spreads = [
-        np.median(
-            np.trace(many_placed(reference, level, 12, 30, **view)[1][:, :2, :2], axis1=1, axis2=2)
-        )
-        for view in (
-            {"noise": 2.0},
-            {"noise": 20.0},
-            {"noise": 20.0, "clutter": 20.0},
-            {"noise": 20.0, "clutter": 45.0},
-        )
-    ]
-    assert all(later > 1.5 * earlier for earlier, later in pairwise(spreads))
-
-
 @pytest.mark.parametrize("turn_deg", [0.0, 40.0, 110.0])
 def test_what_runs_in_one_direction_is_known_across_it_only(turn_deg):
     """Furrows from north to south: how far north is hardly known, under any heading."""
@@ -378,8 +234,10 @@ def test_a_coarser_level_gives_the_covariance_in_the_same_unit(reference):
     assert 1.2 < deviations[1] / deviations[0] < 5
 
 
-def test_sheets_of_one_level_will_do():
-    reference = Reference(Sheet(as_grey(GROUND(*pixel_centres((200, 200)))), levels=1))
-    pose = Pose(100.0, 96.0, 0.2, 0.0)
-    placed = Refiner(templates_of(GROUND, pose).at(0), reference).place(moved(pose, 2.0))
-    assert apart_px(placed.pose, pose) < 0.05
+@pytest.mark.parametrize("shape", [(2, 2), (7, 12), (16, 16)])
+def test_tiny_views_are_no_crash(reference, shape):
+    pose = Pose(200.0, 180.0, 0.3, 0.0)
+    view = templates_of(GROUND, pose, shape)
+    for recipe in (FINE, COARSE):
+        placed = Refiner(view.at(0, recipe), reference).place(pose, with_covariance=True)
+        assert math.isfinite(placed.score) and np.isfinite(placed.covariance).all()

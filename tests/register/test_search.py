@@ -15,16 +15,14 @@ from scenes import (
     turned_rad,
 )
 
-from orthonav.core.register.channels import COARSE, FINE
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import (
     MAX_KEPT_WINDOWS,
     SearchWindow,
     SearchWindows,
-    _best_of,
     bank,
     best_near,
-    largest_half_px,
     search,
 )
 from orthonav.core.register.template import Template
@@ -107,30 +105,6 @@ def test_views_of_which_a_part_is_seen(window, kind):
         assert apart_px(best.pose, pose) / 2**LEVEL < (2.6 if kind == "half" else 1.0)
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
-def test_any_level(reference, level):
-    window = SearchWindow(reference.whole(level), level, 0, 0, 110 >> level)
-    for pose in random_poses(4, SHAPE, 90, seed=6):
-        template = templates_of(GROUND, pose).at(level)
-        best = search(template, window, near(pose), 1)[0]
-        assert apart_px(best.pose, pose) / 2**level < 0.25
-
-
-@pytest.mark.parametrize("margin_px", [0, 27])
-@pytest.mark.parametrize("moved_px", [(0, 0), (-40, 31), (25, -60)])
-def test_part_of_the_sheet(reference, margin_px, moved_px):
-    """A window that begins anywhere, also beyond the sheet, gives the place on the sheet."""
-    pose = Pose(170.0 + moved_px[0], 150.0 + moved_px[1], 1.1, 0.05)
-    row, col = int(pose.y_px) // 2 - 71, int(pose.x_px) // 2 - 93
-    made = reference.window(LEVEL, row, col, 130, 140)
-    window = SearchWindow(made, LEVEL, row, col, 55, margin_px)
-    found = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 5)
-    assert apart_px(found[0].pose, pose) / 2**LEVEL < 0.25
-    for each in found:
-        x, y = each.pose.x_px / 2**LEVEL - col, each.pose.y_px / 2**LEVEL - row
-        assert margin_px - 0.5 <= x <= 140 - margin_px and margin_px - 0.5 <= y <= 130 - margin_px
-
-
 def test_the_best_place_near_by_is_that_of_a_whole_search(window):
     for pose in random_poses(12, SHAPE, 90, seed=8, log_scale=0.1):
         template = templates_of(GROUND, pose).at(LEVEL)
@@ -144,17 +118,6 @@ def test_the_best_place_near_by_is_that_of_a_whole_search(window):
         assert apart_px(missed.pose, guess) <= math.hypot(10.0, 10.0)
 
 
-def test_near_the_border_of_a_window_beyond_it_is_nothing(reference):
-    made = reference.window(LEVEL, 60, 70, 80, 80)
-    part = SearchWindow(made, LEVEL, 60, 70, 55)
-    pose = Pose(2 * (70 + 12.0), 2 * (60 + 40.0), 0.4, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    outside = Pose(2 * (70 - 200.0), 2 * (60 + 40.0), 0.4, 0.0)
-    inside, beyond = best_near(template, part, [pose, outside], 12.0)
-    assert apart_px(inside.pose, pose) < 1.0 and beyond.score == 0.0
-    assert best_near(template, part, [], 12.0) == []
-
-
 def test_no_middle_is_sought_in_the_margin(reference):
     """A view whose middle lies there is not found, one just inside is."""
     made = reference.window(LEVEL, 20, 30, 120, 120)
@@ -163,28 +126,6 @@ def test_no_middle_is_sought_in_the_margin(reference):
         pose = Pose(x_px, 2 * (20 + 60.0), 0.4, 0.0)
         best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]
         assert (apart_px(best.pose, pose) / 2**LEVEL < 0.25) == inside
-
-
-@pytest.mark.parametrize("by_kernel", [True, False])
-def test_a_window_as_small_as_a_view_allows_gives_the_same(monkeypatch, reference, by_kernel):
-    """No middle sought sees across the border, however its view is turned and scaled."""
-    if not by_kernel:
-        monkeypatch.setattr("orthonav.core.register.search.KERNEL", None)
-    made, margin_px, poses = reference.window(LEVEL, 20, 30, 90, 84), 27, ALL_TURNS[::3]
-    poses += [(turn, 0.2) for turn, _ in poses]
-    template = templates_of(GROUND, Pose(150.0, 130.0, 0.4, 0.1)).at(LEVEL)
-    half_px = largest_half_px(template, poses)
-    assert half_px > margin_px
-    small = SearchWindow(made, LEVEL, 20, 30, 55, margin_px, half_px)
-    large = SearchWindow(made, LEVEL, 20, 30, 55, margin_px, 200)
-    assert max(small.size) < 90 + 55 and min(large.size) >= 400
-    inner = slice(margin_px, -margin_px), slice(margin_px, -margin_px)
-    for number in range(len(poses)):
-        one, other = (
-            _best_of(template, window, poses, range(number, number + 1), None)[0][inner]
-            for window in (small, large)
-        )
-        np.testing.assert_allclose(one, other, atol=1e-3)
 
 
 def test_a_view_over_the_border_of_the_sheet(window):
@@ -208,23 +149,6 @@ def test_candidates_are_counted_sorted_and_apart(window):
             assert max(x, y) >= apart  # less half a pixel on either side
     few = search(template, window, ALL_TURNS[::4], 7)
     assert few == many[:7]
-
-
-def test_the_same_search_gives_the_same(reference, window):
-    pose = Pose(200.0, 200.0, 0.5, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    fresh = SearchWindow(reference.whole(LEVEL).copy(), LEVEL, 0, 0, 55)
-    first = search(template, window, ALL_TURNS[::5], 10)
-    assert search(template, window, ALL_TURNS[::5], 10) == first
-    assert search(template, fresh, ALL_TURNS[::5], 10) == first
-
-
-def test_more_poses_never_lower_a_score(window):
-    pose = Pose(200.0, 200.0, 0.5, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    one = search(template, window, near(pose), 1)[0]
-    more = search(template, window, [*ALL_TURNS[::6], *near(pose)], 1)[0]
-    assert more.score >= one.score - 1e-4 and apart_px(one.pose, more.pose) < 1e-3
 
 
 def test_a_view_of_elsewhere_stands_out_nowhere(window):
@@ -307,27 +231,11 @@ def windows(reference):
     return SearchWindows(reference)
 
 
-def test_views_of_like_size_share_a_window(windows):
-    one = windows.whole(1, FINE, 110.0)
-    assert windows.whole(1, FINE, 112.0) is one
-    assert windows.whole(1, COARSE, 110.0) is not one
-    assert windows.whole(1, FINE, 250.0) is not one
-    assert (one.height, one.width, one.row, one.col, one.margin_px) == (192, 224, 0, 0, 0)
-
-
 def test_no_more_windows_are_kept_than_a_few():
     windows = SearchWindows(reference_of(GROUND, (128, 128)))
     for view_px in np.geomspace(20, 400, 25):
         windows.whole(1, FINE, float(view_px))
     assert len(windows._windows) == MAX_KEPT_WINDOWS
-
-
-def test_the_window_that_was_used_last_is_kept():
-    windows = SearchWindows(reference_of(GROUND, (128, 128)))
-    used = windows.whole(1, FINE, 20.0)
-    for view_px in np.geomspace(40, 400, 25):
-        windows.whole(1, FINE, float(view_px))
-        assert windows.whole(1, FINE, 20.0) is used
 
 
 @pytest.mark.parametrize("level", [1, 2])

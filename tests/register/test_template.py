@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import Ground, as_grey, reference_of, seen, templates_of
 
-from orthonav.core.register.channels import COARSE, FINE, GROUPS, channels_of
+from orthonav.core.register.channels import COARSE, FINE, GROUPS
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import posed_channels, posed_half_px
 from orthonav.core.register.template import (
@@ -41,20 +41,6 @@ def ragged(shape=(96, 128)):
     return (np.abs(x - shape[1] / 2) < (0.25 + 0.25 * y / shape[0]) * shape[1]) & (
         np.hypot(x - 60, y - 40) > 9
     )
-
-
-@pytest.mark.parametrize("valid", [None, ragged()], ids=["whole", "ragged"])
-def test_each_kind_of_evidence_has_the_energy_of_its_weight(valid):
-    template = templates_of(GROUND, PLACE, valid=valid).at(0)
-    assert template.weights == (1.0, FINE.grey_share) and template.channels.shape == (3, 96, 128)
-    for group, weight in zip(GROUPS, template.weights, strict=True):
-        assert energy_of(template.channels[group]) == pytest.approx(weight, rel=1e-4)
-    assert template.whole == (valid is None)
-    assert (
-        template.pixels == template.mask.sum()
-        and not template.channels[:, template.mask == 0].any()
-    )
-    np.testing.assert_array_equal(np.moveaxis(template.interleaved, -1, 0), template.channels)
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (6, 40), (16, 16)])
@@ -109,29 +95,6 @@ def test_what_blocks_add_up_to_is_the_whole(shape):
     assert blocks[0, 1, 1, 1] == pytest.approx(float(rows @ rows), rel=1e-4)
 
 
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_planes_turn_with_their_picture(quarters):
-    """Clockwise: `rot90` turns a picture counter-clockwise, y being to the south."""
-    grey = as_grey(seen(GROUND, PLACE, (60, 80)))
-    plain = channels_of(grey, np.ones(grey.shape, bool))
-    picture = np.ascontiguousarray(np.rot90(grey, -quarters))
-    turned = channels_of(picture, np.ones(picture.shape, bool))
-    planes = turned_planes(np.ascontiguousarray(np.rot90(plain, -quarters)), quarters * math.pi / 2)
-    np.testing.assert_allclose(np.moveaxis(planes, 0, -1), turned, atol=2e-3)
-
-
-def test_planes_turned_back_are_the_same():
-    made = channels_of(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
-    kept = made.copy()
-    there = turned_planes(made, 0.7)
-    np.testing.assert_allclose(
-        np.hypot(*there[:2]), np.hypot(made[..., 0], made[..., 1]), atol=1e-5
-    )
-    back = turned_planes(np.ascontiguousarray(np.moveaxis(there, 0, -1)), -0.7)
-    np.testing.assert_allclose(back, np.moveaxis(made, -1, 0), atol=1e-5)
-    np.testing.assert_array_equal(made, kept)
-
-
 @pytest.mark.parametrize("number, size", [(0, 0.7), (1, 0.7), (2, 0.02), (3, 0.02)])
 def test_derivatives_tell_how_the_view_changes_with_the_window(number, size):
     """Against views really moved, turned and scaled: directions are turned back by the pose."""
@@ -152,23 +115,6 @@ def test_derivatives_tell_how_the_view_changes_with_the_window(number, size):
         assert 0.6 < float((one * other).sum() / (one**2).sum()) < 1.1
 
 
-def test_hessians_are_the_products_of_the_derivatives():
-    template = templates_of(GROUND, PLACE, valid=ragged()).at(0)
-    for group, hessian in zip(GROUPS, template.hessians, strict=True):
-        rows = template.jacobian[group].astype(np.float64)
-        np.testing.assert_allclose(hessian, np.einsum("cphw,cqhw->pq", rows, rows), rtol=1e-3)
-        assert np.linalg.eigvalsh(hessian).min() > 0
-    assert not template.jacobian[:, :, template.mask == 0].any()
-
-
-@pytest.mark.parametrize("shape", [(96, 128), (50, 34), (7, 9)])
-def test_blocks_cut_the_whole_window(shape):
-    template = Template.of(np.zeros(shape, np.uint8), np.ones(shape, bool), 0, FINE)
-    for starts, side in zip(template.block_starts, shape, strict=True):
-        assert len(starts) == BLOCKS and starts[0] == 0 and (np.diff(starts) > 0).all()
-        assert side - starts[-1] <= side / BLOCKS + 1
-
-
 def test_coarser_templates_show_the_same_window():
     """Halved about the same middle: a level down, the pixels cover four of the one above."""
     views = templates_of(GROUND, PLACE, (96, 128))
@@ -182,13 +128,6 @@ def test_coarser_templates_show_the_same_window():
     np.testing.assert_allclose(views.at(1).channels, expected.channels, atol=2e-3)
 
 
-def test_levels_count_from_the_finest():
-    grey = as_grey(seen(GROUND, PLACE, (64, 64)))
-    views = ViewTemplates(grey, np.ones(grey.shape, bool), 2)
-    assert views.at(2).level == 2 and views.at(2).mask.shape == (64, 64)
-    assert views.at(4).mask.shape == (16, 16)
-
-
 def test_halving_keeps_only_pixels_that_are_valid_all_over():
     grey = as_grey(seen(GROUND, PLACE, (40, 60)))
     valid = ragged((40, 60))
@@ -200,11 +139,6 @@ def test_halving_keeps_only_pixels_that_are_valid_all_over():
     assert smaller.dtype == np.uint8 and inside.dtype == bool
     np.testing.assert_array_equal(grey, kept[0])
     np.testing.assert_array_equal(valid, kept[1])
-
-
-def test_halving_a_whole_view_keeps_it_whole():
-    smaller, inside = halved(np.full((8, 12), 7, np.uint8), np.ones((8, 12), bool))
-    assert smaller.shape == inside.shape == (4, 6) and inside.all() and (smaller == 7).all()
 
 
 def test_masks_do_not_shift_what_is_seen():

@@ -185,28 +185,6 @@ def test_a_displacement_by_a_changing_horizon_is_explained_by_it(horizon_deg, co
     assert np.abs(by_camera(expected, blind)[0].mean[HORIZON]).max() == 0
 
 
-def test_the_horizon_before_is_learnt_with_the_opposite_sign():
-    """A horizon that was wrong and no longer is displaces the other way."""
-    seconds, horizon = 60.0, np.radians([2.0, -1.0])
-    known = np.zeros((STATE, STATE))
-    tilts = [1e-3, 1e-3, HORIZON_RAD, HORIZON_RAD]
-    known[range(STATE), range(STATE)] = np.square([1.0] * 2 + [0.05] * 2 + [1e-4] * 2 + tilts)
-    mean = np.concatenate([np.zeros(2), SPEED, np.zeros(6)])
-    noise = np.square([1e-4, 1e-4, 1e-3])  # by now it is right
-    camera = CameraDisplacement(
-        SPEED * seconds - LEVER_M @ horizon,
-        np.eye(2) * 0.25,
-        2000.0,
-        turned_std_rad=1e-4,
-        scaled_std=1e-4,
-        levers_m=np.stack([LEVER_M, LEVER_M]),
-    )
-    velocity = ReportedVelocity(SPEED, SPEED, 0.01)
-    expected = predicted(MODEL, mean, known, seconds, velocity, noise, camera)
-    after, _ = by_camera(expected, camera)
-    assert np.degrees(after.mean_before[HORIZON]) == pytest.approx([2.0, -1.0], abs=0.6)
-
-
 @pytest.mark.parametrize("shown_deg", [0.01, 0.1, 0.5, 2.0])
 @pytest.mark.parametrize("horizon_deg", [1.5, 3.0])
 def test_views_that_overlap_confirm_a_track_however_well_they_show_their_tilt(

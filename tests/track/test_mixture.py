@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.confidence import within
 from orthonav.core.track import (
     CameraDisplacement,
     Mixture,
@@ -19,7 +18,7 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
-from orthonav.core.track.model import SEEN, STATE, WHITE_SHARE
+from orthonav.core.track.model import STATE, WHITE_SHARE
 from orthonav.core.track.smooth import History
 
 AREA_M2 = 4e6
@@ -29,7 +28,6 @@ RADIUS_M = 35.0
 MODEL = Model()
 SPEED = np.array([12.0, 5.0])
 BIAS = np.array([math.radians(5.0), 0.04, math.radians(-2.0), math.radians(1.5)])
-HEIGHT_M = 120.0
 
 
 class Flight:
@@ -110,14 +108,6 @@ def test_a_flight_is_found_and_followed(seed):
     assert np.median([row[2] for row in rows[10:]]) > 0.99
 
 
-def test_telemetry_biases_are_estimated():
-    """The tilt as a whole: within a minute its mount and horizon are hardly told apart. It may
-    change within seconds, so that a single estimate is off by more than their mean."""
-    found = [(SEEN @ row[3].mean)[2:] for seed in range(3) for row in known(seed)[1][15:]]
-    learnt = np.array(found)
-    assert (np.abs(learnt.mean(axis=0) - BIAS) < [0.01, 0.01, 0.012, 0.012]).all()
-
-
 @pytest.mark.slow
 def test_normalized_errors_are_those_of_its_covariance():
     """Chi-square of two: mean 2. 95 % bounds of the mean over independent flights."""
@@ -128,12 +118,6 @@ def test_normalized_errors_are_those_of_its_covariance():
         error = estimate.mean[:2] - flight.place
         values.append(error @ np.linalg.solve(estimate.covariance[:2, :2], error))
     assert 1.48 < np.mean(values) < 2.55
-
-
-def test_a_view_without_any_place_leaves_the_track_searching():
-    mixture = Mixture(MODEL, EXTENT)
-    mixture.update(ReportedAttitude(0.0, 0.0, 0.0), [])
-    assert mixture.hypotheses == [] and mixture.estimate(RADIUS_M) is None
 
 
 def test_one_lucky_view_is_no_track():
@@ -261,26 +245,6 @@ def test_history_of_a_long_flight_stays_small():
     assert len(set(rows)) == len(rows) and max(rows) < 256  # those of dropped ones are used again
 
 
-def test_history_in_many_blocks_gives_the_same(monkeypatch):
-    """What was smoothed before does not change by later views."""
-    whole, blocks = History(), History()
-    _flown(7, views=20, history=whole)
-    expected = whole.smoothed()
-    monkeypatch.setattr("orthonav.core.track.smooth.ROWS_OF_BLOCK", 3)
-    mixture = _flown(7, views=20, history=blocks)[1]
-    smoothed = blocks.smoothed()
-    copies = [(each.mean.copy(), each.covariance.copy()) for each in smoothed]
-    for one, other in zip(smoothed, expected, strict=True):
-        np.testing.assert_array_equal(one.mean, other.mean)
-        np.testing.assert_array_equal(one.covariance, other.covariance)
-    for _ in range(5):
-        mixture.predict(1.0)
-        blocks.record(mixture)
-    for each, (mean, covariance) in zip(smoothed, copies, strict=True):
-        np.testing.assert_array_equal(each.mean, mean)
-        np.testing.assert_array_equal(each.covariance, covariance)
-
-
 def test_far_hypotheses_and_gaps_stay_finite():
     flight, mixture, _ = flown(8, views=10)
     for seconds in (0.0, 1e-3, 600.0, 1e5):
@@ -304,17 +268,6 @@ def test_unknown_heading_is_followed():
         turned = sighting.mean + np.array([0, 0, 2.2, 0, 0, 0])
         mixture.update(ReportedAttitude(None, 0.0, 0.0), [replace(sighting, mean=turned)])
     assert off_m(mixture, flight) < 25
-
-
-def test_within_is_the_share_of_a_round_gaussian():
-    rng = np.random.default_rng(0)
-    covariance = np.eye(STATE) * 100.0
-    drawn = rng.normal(0, 10, (200_000, 2))
-    for middle, tolerance in (((0.0, 0.0), 0.003), ((8.0, 0.0), 0.08)):
-        share = (np.hypot(*(drawn - middle).T) <= 15).mean()
-        reported = within(np.zeros(STATE), covariance, 15.0, np.array(middle))
-        assert reported == pytest.approx(share, abs=tolerance)
-    assert within(np.zeros(STATE), covariance, 15.0, np.array([500.0, 0.0])) == 0
 
 
 def test_odometry_outliers_are_rejected():
@@ -343,36 +296,6 @@ def test_a_sudden_turn_is_followed_without_reported_velocity():
     assert off_m(mixture, flight) < 10
 
 
-def test_a_turn_that_nobody_saw_is_thought_of():
-    """Else its effect would be attributed to a bias jump."""
-    _, mixture, _ = flown(6)
-    speeds_mps = [math.sqrt(each.covariance[2, 2]) for each in mixture.hypotheses]
-    assert max(speeds_mps) < 5
-    mixture.predict(2.4)
-    wide = [each for each in mixture.hypotheses if each.covariance[2, 2] > 25.0**2]
-    assert 0.02 < sum(each.share for each in wide) < 0.1
-    for _ in range(60):
-        mixture.predict(0.2)
-    assert len(mixture.hypotheses) < 200
-
-
-def test_the_bias_of_a_reported_velocity_is_estimated():
-    """Dead reckoning through 30 s without a view: the reported wind is wrong by 1.8 m/s."""
-    flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None
-    reported = SPEED + np.array([1.5, -1.0])
-    for second in range(90):
-        moved = flight.moved()
-        seen = second < 60
-        mixture.predict(1.0, ReportedVelocity(reported, before, 1.5), moved if seen else None)
-        before = reported
-        if seen:
-            mixture.update(flight.reported(), [flight.sighting(4.0)])
-    estimate = mixture.estimate(RADIUS_M)
-    error = estimate.mean[:2] - flight.place
-    assert np.hypot(*error) < 20 < 30 * 1.8
-    assert error @ np.linalg.solve(estimate.covariance[:2, :2], error) < 14
-
-
 def test_a_place_that_is_known_well_is_not_merged_into_a_wide_guess():
     flight, mixture, _ = flown(8)
     mixture.predict(60.0)
@@ -391,19 +314,6 @@ def test_a_mount_is_good_unless_views_say_otherwise(tilt_deg, found):
         mixture.update(flight.reported(), [flight.sighting(5.0)])
     tilt = math.degrees(mixture.estimate(RADIUS_M).mean[6])
     assert tilt == pytest.approx(found, abs=1.0)
-
-
-def test_how_a_view_tilts_is_no_evidence_for_its_place():
-    """Views of elsewhere that tilt as expected are not believed for that."""
-    flight, mixture = Flight(10), Mixture(MODEL, EXTENT)
-    false = flight.place + np.array([300.0, 0.0])
-    for view in range(8):
-        if view:
-            moved = flight.moved()
-            mixture.predict(1.0, camera=moved)
-            false = false + SPEED
-        mixture.update(flight.reported(), [flight.sighting(-6.0, false)], 0.15)
-    assert mixture.estimate(RADIUS_M).confidence < 0.5
 
 
 def test_after_a_while_without_views_one_is_no_track():
@@ -443,19 +353,6 @@ def test_measured_positions_calibrate_the_mount():
     assert math.degrees(math.sqrt(estimate.covariance[6, 6])) < 1.0
 
 
-def test_a_measured_position_starts_a_new_hypothesis():
-    """Views of places that no aircraft flies between, each with its GNSS."""
-    mixture = Mixture(MODEL, EXTENT)
-    for place in ([-700.0, 300.0], [650.0, 500.0], [100.0, -800.0]):
-        mixture.predict(1.0)
-        mixture.measure_position(np.array(place), 3.0)
-        found = mixture.estimate(RADIUS_M)
-        assert np.hypot(*(found.mean[:2] - place)) < 5 and found.confidence > 0.5
-        assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(
-            1
-        )
-
-
 def test_a_track_coasts_while_views_do_not_show_the_map():
     flight, mixture, _ = flown(3, false_share=0.0)
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
@@ -473,16 +370,6 @@ def test_a_track_coasts_while_views_do_not_show_the_map():
     assert std_m[9] == pytest.approx(MODEL.coasting_walk * math.sqrt(9**3 / 3), rel=0.2)
 
 
-def test_one_view_that_shows_nothing_interrupts_a_track_for_that_view_only():
-    flight, mixture, _ = flown(3, false_share=0.0)
-    states = []
-    for view in range(6):
-        mixture.predict(1.0, camera=flight.moved())
-        mixture.update(flight.reported(), [] if view == 2 else [flight.sighting(2.0)])
-        states.append(mixture.estimate(RADIUS_M).state)
-    assert states == [State.TRACKING] * 2 + [State.COASTING] + [State.TRACKING] * 3
-
-
 def test_after_many_such_views_a_track_must_be_confirmed_again():
     flight, mixture, _ = flown(3, false_share=0.0)
     for _ in range(3):
@@ -497,26 +384,6 @@ def test_after_many_such_views_a_track_must_be_confirmed_again():
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
 
 
-def test_places_near_the_prediction_do_not_keep_a_track_confirmed():
-    """Such places are found in any picture; views that do not show the map count all the same."""
-    flight, mixture, _ = flown(3, false_share=0.0)
-    for _ in range(3):
-        mixture.predict(1.0, camera=flight.moved())
-        mixture.update(flight.reported(), [replace(flight.sighting(-5.0), alone=0.005)])
-    mixture.predict(1.0, camera=flight.moved())
-    mixture.update(flight.reported(), [flight.sighting(2.0)], newness=0.15)
-    assert mixture.estimate(RADIUS_M).state is State.COASTING
-
-
-@pytest.mark.parametrize(("alone", "state"), [(0.005, State.COASTING), (0.9, State.TRACKING)])
-def test_a_view_counts_by_what_it_shows_itself(alone, state):
-    """However well a place agrees with the track: there is always one near the prediction."""
-    flight, mixture, _ = flown(3, false_share=0.0)
-    mixture.predict(1.0, camera=flight.moved())
-    mixture.update(flight.reported(), [replace(flight.sighting(2.0), alone=alone)])
-    assert mixture.estimate(RADIUS_M).state is state
-
-
 @pytest.mark.parametrize(("confirms", "state"), [(False, State.SEARCHING), (True, State.TRACKING)])
 def test_only_places_that_competed_with_all_others_confirm_a_track(confirms, state):
     flight, mixture = Flight(5), Mixture(MODEL, EXTENT)
@@ -528,19 +395,6 @@ def test_only_places_that_competed_with_all_others_confirm_a_track(confirms, sta
     estimate = mixture.estimate(RADIUS_M)
     assert estimate.belief > 0.9 and np.hypot(*(estimate.mean[:2] - flight.place)) < 10
     assert (estimate.state, estimate.followed) == (state, state is State.TRACKING)
-
-
-@pytest.mark.parametrize("confirms", [False, True])
-def test_a_place_counts_from_the_first_view_that_competed(confirms):
-    flight, mixture = Flight(5), Mixture(MODEL, EXTENT)
-    states = []
-    for view in range(3):
-        if view:
-            mixture.predict(1.0, camera=flight.moved())
-        mixture.update(flight.reported(), [flight.sighting(4.0)], confirms=confirms or view > 0)
-        states.append(mixture.estimate(RADIUS_M).state)
-    first = State.TRACKING if confirms else State.SEARCHING
-    assert states == [State.SEARCHING, first, State.TRACKING]
 
 
 @pytest.mark.parametrize(
@@ -634,3 +488,33 @@ def test_a_place_that_was_never_confirmed_is_no_dead_reckoning(followed, state):
     mixture.hypotheses = [found, replace(track, share=0.2)]
     mixture.elsewhere = 0.0
     assert mixture.estimate(RADIUS_M).state is state
+
+
+def test_the_bias_of_a_reported_velocity_is_estimated():
+    """Dead reckoning through 30 s without a view: the reported wind is wrong by 1.8 m/s."""
+    flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None
+    reported = SPEED + np.array([1.5, -1.0])
+    for second in range(90):
+        moved = flight.moved()
+        seen = second < 60
+        mixture.predict(1.0, ReportedVelocity(reported, before, 1.5), moved if seen else None)
+        before = reported
+        if seen:
+            mixture.update(flight.reported(), [flight.sighting(4.0)])
+    estimate = mixture.estimate(RADIUS_M)
+    error = estimate.mean[:2] - flight.place
+    assert np.hypot(*error) < 20 < 30 * 1.8
+    assert error @ np.linalg.solve(estimate.covariance[:2, :2], error) < 14
+
+
+def test_a_measured_position_starts_a_new_hypothesis():
+    """Views of places that no aircraft flies between, each with its GNSS."""
+    mixture = Mixture(MODEL, EXTENT)
+    for place in ([-700.0, 300.0], [650.0, 500.0], [100.0, -800.0]):
+        mixture.predict(1.0)
+        mixture.measure_position(np.array(place), 3.0)
+        found = mixture.estimate(RADIUS_M)
+        assert np.hypot(*(found.mean[:2] - place)) < 5 and found.confidence > 0.5
+        assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(
+            1
+        )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
-from benchmarks.view_page import write_long_run
 from browsing import LAPTOP, TABLET, Visit, painted
+from long_run import write_long_run
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
@@ -97,7 +97,7 @@ def test_the_run_is_drawn_where_it_is(page, columns):
     assert page.locator("#legend").inner_text().split("\n") == [
         "●confident",
         "●tracking",
-        "—truth",
+        "—ground truth",
         "◯false fix",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")

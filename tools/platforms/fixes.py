@@ -49,10 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.make:
         make(STORED)
     against = options.against or (None if options.map else STORED / "fixes.json")
-    made = {
-        "machine": machine(),
-        "runs": _localized(options),
-    }
+    made = {"machine": machine(), "runs": _localized(options)}
     if options.out:
         write_text(options.out, json.dumps(made, indent=1) + "\n")
     if options.make:

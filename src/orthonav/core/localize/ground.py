@@ -1,10 +1,11 @@
-"""The ground of a sheet, level or not, and a view over it: from a pose to the camera and its sight.
+"""A sheet with its ground, level or not, and a view over it: from a pose to what the camera sees.
 
 The pose of a candidate says where the middle of the view's window lies, its heading, and that the
 camera is `agl_m * exp(log_scale)` above the mean ground of that window.
 """
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Protocol
 
@@ -15,11 +16,18 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.camera import enu_from_camera, undistort
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import sight_on_ground
+from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
 from orthonav.core.localize.rectify import Orientation, node_px, orthorectified
+from orthonav.core.localize.tiles import TileProposer
 from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
+from orthonav.core.mapfile.manifest import SheetInfo
+from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
 from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap
+from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import GreyPyramid, Reference
 
 MAP_NODES = 256
 """Nodes across the map of expected scales, at most."""
@@ -131,6 +139,45 @@ MIN_KNOWN = 0.5
 """Windows of which less is known are registered on level ground."""
 LEVEL_PX = 0.2
 """Relief that displaces no ground of a window by more (pixels of the final level) is left out."""
+
+
+class SearchedSheet:
+    """A sheet and its imagery, made ready for all views. Safe to share between threads."""
+
+    def __init__(
+        self,
+        sheet: SheetInfo,
+        layer: GreyPyramid,
+        *,
+        confidence: RegisteredConfidence | None,
+        radius_m: float,
+        floor_px: float,
+        propose: TileProposer | None = None,
+        plan: SearchPlan = DEFAULT_PLAN,
+        terrain: TerrainLayer | None = None,
+    ) -> None:
+        """`confidence`: None before it is learnt; no place is proven then. `radius_m`: the error
+        that it is about. `floor_px`: standard deviation with which maps of two dates agree, in
+        pixels of level 0. Without `propose`, candidates come from searches by FFT only; without
+        `terrain` the ground is level.
+        """
+        self.sheet, self.grid = sheet, sheet.grid
+        self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
+        self.reference = Reference(layer)
+        self.windows = SearchWindows(self.reference)
+        self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
+        self.propose, self.plan = propose, plan
+        self.relief = Relief(terrain or LevelTerrain(), self.grid)
+
+    @property
+    def pyramid(self) -> GreyPyramid:
+        """The grey levels of the sheet at all its resolutions."""
+        return self.reference.pyramid
+
+    def px_of(self, place_en_m: Array) -> tuple[float, float]:
+        """Pixels of level 0, x and y, of a place (2,): the inverse of `Relief.en_m`."""
+        (east, north), grid = place_en_m, self.grid
+        return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
 
 
 class ViewOverGround:

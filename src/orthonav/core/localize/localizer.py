@@ -13,10 +13,11 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.camera import CameraFound, tilt_std_deg
 from orthonav.core.localize.confidence import RegisteredConfidence, within
+from orthonav.core.localize.ground import SearchedSheet
 from orthonav.core.localize.place import Place
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
 from orthonav.core.localize.rectify import off_nadir_deg
-from orthonav.core.localize.search import Search, SearchedSheet, grid_px
+from orthonav.core.localize.search import Search
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
 from orthonav.core.localize.view import PreparedView, check_view, prepare
 from orthonav.core.mapfile.layer import GreyLayer
@@ -319,7 +320,7 @@ class RegistrationLocalizer(SearchedSheet):
 
     def pose_of(self, view: PreparedView, seen_from: NDArray[np.float64]) -> Pose:
         """Where a view's window lies if the camera is at (4,): the inverse of `seen_from`."""
-        x, y = grid_px(self.grid, seen_from[:2])
+        x, y = self.px_of(seen_from[:2])
         turn, log_scale = seen_from[2:].tolist()
         moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
         return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)

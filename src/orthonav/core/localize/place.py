@@ -57,7 +57,7 @@ AGAIN_PX = 1.0
 """A window that moved by more (pixels of the level, at its rim) is orthorectified again."""
 ROUNDS = 3
 """At most so many times at the final level."""
-SETTLED = 6
+AROUND = 6
 """Places whose surroundings are searched on the terrain, where no place stands out."""
 NEAR_REACH = 0.2
 """They are searched so far, as a share of the view's side,"""
@@ -73,7 +73,7 @@ class Place:
 
     - `judged`: its fit at the judged level. `level_score`: the score there on level ground, where
       `judged` is on the terrain; `terrain`: the view orthorectified there.
-    - `twin`: the same place on the terrain, `settled`: the best place around it there; None where
+    - `twin`: the same place on the terrain, `around`: the best place around it there; None where
       it was not asked for or level ground is as good. `tried`, `searched`: whether they were.
     - `final`: its fit at the final level, by `templates`. With its covariance where it is the best.
     - `total`: its scores at both levels added up. `again`: that at the judged level once it was
@@ -90,7 +90,7 @@ class Place:
     level_score: float | None = None
     terrain: ViewTemplates | None = None
     twin: "Place | None" = None
-    settled: "Place | None" = None
+    around: "Place | None" = None
     tried: bool = False
     searched: bool = False
     final: Fit | None = None
@@ -136,9 +136,14 @@ class Placer:
         """`pool`: threads that share the candidates; `ground`: None for level ground and views that
         are not compared one level finer than the final one."""
         self.templates, self.levels, self.prior = templates, levels, prior
-        self.reference, self._pool, self._ground = reference, pool, ground
+        self.reference, self._pool, self._view_over_ground = reference, pool, ground
         self.is_level = ground is None or ground.relief.is_level
         self._best_on_terrain = 0.0
+
+    @property
+    def _ground(self) -> ViewOverGround:
+        assert self._view_over_ground is not None
+        return self._view_over_ground
 
     @property
     def _exclusion_px(self) -> float:
@@ -235,7 +240,7 @@ class Placer:
         """The best judged places that lie apart, at most `at_most`, on the terrain at the judged
         level where they are better there, and the others as they were.
 
-        The surroundings of the first `SETTLED` are searched: where relief displaces much, the right
+        The surroundings of the first `AROUND` are searched: where relief displaces much, the right
         one may be far down the list of those on level ground, and off by more than refinement
         follows.
         """
@@ -243,9 +248,9 @@ class Placer:
             return list(places)
         chosen = self._best_apart(places, at_most)
         moved = [self._twin(places[number]) or places[number] for number in chosen]
-        for number in self._best_apart(moved, SETTLED):
+        for number in self._best_apart(moved, AROUND):
             before = places[chosen[number]]
-            moved[number] = self._settled(before) or before
+            moved[number] = self._best_around(before) or before
         found = list(places)
         for number, after in zip(chosen, moved, strict=True):
             if after.judged.score > places[number].judged.score:
@@ -254,7 +259,6 @@ class Placer:
 
     def _best_apart(self, places: Sequence[Place], count: int) -> list[int]:
         """Numbers of the best judged places that lie apart."""
-        assert self._ground is not None
         order = sorted(range(len(places)), key=lambda number: -self._value(places[number].judged))
         ranked = [places[number].judged for number in order]
         apart_px = EXCLUSION_SHARE * self._ground.view.side_px
@@ -263,7 +267,6 @@ class Placer:
     def _twin(self, place: Place) -> Place | None:
         """A place refined on the terrain at the judged level, once; None where level ground is as
         good."""
-        assert self._ground is not None
         if not place.tried:
             place.tried, pose = True, place.judged.pose
             if not self._ground.is_level(pose):
@@ -276,13 +279,13 @@ class Placer:
         refiner = self.refiner(self.levels.judged, templates)
         return refiner.place(pose, FULL_STEPS, ROUGH_STEP_PX)
 
-    def _settled(self, place: Place) -> Place | None:
+    def _best_around(self, place: Place) -> Place | None:
         """`_twin`, or a better place by a search around it at the coarse level: far off nadir,
         relief displaces a view by more than refinement follows."""
         twin = self._twin(place)
         if twin is None or place.searched:
-            return place.settled
-        assert self._ground is not None and twin.terrain is not None
+            return place.around
+        assert twin.terrain is not None
         place.searched = True
         pose, level, side_px = place.judged.pose, self.levels.coarse, self._ground.view.side_px
         poses = [
@@ -299,10 +302,10 @@ class Placer:
         for near in search(template, window, poses, 1, self.prior.scale_map):
             found = self._rejudged(near.pose, twin.terrain)
             best = max(best, found, key=lambda each: each.score)
-        place.settled = twin
+        place.around = twin
         if best is not twin.judged:
-            place.settled = Place(best, place.judged.score, twin.terrain)
-        return place.settled
+            place.around = Place(best, place.judged.score, twin.terrain)
+        return place.around
 
     # Finishing
 
@@ -356,7 +359,7 @@ class Placer:
         first = None
         if not self.is_level:
             is_twin = place.level_score is not None
-            first = self._twin(place) if is_twin else self._settled(place)
+            first = self._twin(place) if is_twin else self._best_around(place)
         if first is None or first.judged.score < RIVAL_SHARE * self._best_on_terrain:
             self._finish_on_level(place)
         else:
@@ -376,7 +379,6 @@ class Placer:
 
     def _finish_on_terrain(self, place: Place, pose: Pose) -> None:
         """From a pose on the terrain."""
-        assert self._ground is not None
         levels = self.levels
         for _ in range(ROUNDS):
             made = self._ground.templates_at(pose, levels.final)
@@ -402,7 +404,6 @@ class Placer:
     def _finer_score(self, place: Place) -> float:
         """Score one level finer than the final one, made once."""
         if math.isnan(place.finer):
-            assert self._ground is not None
             level, made = self.levels.final - 1, None
             if place.gain is not None:
                 made = self._ground.templates_at(place.fit.pose, level)
@@ -412,7 +413,6 @@ class Placer:
 
     @cached_property
     def _finer_on_level(self) -> ViewTemplates:
-        assert self._ground is not None
         level = self.levels.final - 1
         made = self._ground.view.rectified_at(level)
         return ViewTemplates(made.grey, made.valid, level)
@@ -433,7 +433,6 @@ class Placer:
         camera."""
         for each in (best, *best.rivals):
             if each.gain is not None:
-                assert self._ground is not None
                 each.below_camera = self._ground.below_camera(each.fit.pose)
         return best
 

@@ -16,8 +16,8 @@ an ordinary view ends after the first stage. Where position, heading and scale a
 that the *final level*, one below, is cheap too, it comes last, unless a place is proven before:
 weak texture, such as that of bare ground, is only seen there.
 
-Values without another source were chosen on the scenes of `python -m benchmarks.real_imagery`
-(docs/benchmarks.md). `search` executes them.
+Reasons are in docs/decisions/registration.md; values without one there were chosen on the scenes of
+`python -m benchmarks.real_imagery`. `search` executes them.
 """
 
 import math
@@ -57,10 +57,9 @@ class SearchPolicy:
     """What a search tries, and when it ends."""
 
     coarse_steps: Steps = (math.radians(8.0), 0.13)
-    """At the coarse level and for tiles, whose candidates are refined there first;
-    docs/decisions/registration.md."""
+    """At the coarse level and for tiles, whose candidates are refined there first."""
     judged_steps: Steps = (math.radians(6.0), 0.09)
-    """At the judged level: 8 deg lose 2 to 6 points of views; docs/decisions/registration.md."""
+    """At the judged level: 8 deg lose 2 to 6 points of views."""
     final_steps: Steps = (math.radians(3.0), 0.045)
     """At the final level, half of those at the judged one."""
     bank_sigmas: float = 3.0
@@ -72,30 +71,27 @@ class SearchPolicy:
     """Bounds of the stages at the judged level, in nats: those within 0.4 nats first."""
     likely_nats: float = 1.0
     """With an unknown heading, those within so many nats come first at the coarse level and for
-    tiles: their scales are those of nine views in ten; docs/decisions/registration.md."""
+    tiles: their scales are those of nine views in ten."""
     candidates: int = 24
-    """Candidates of a search by FFT at the coarse level, and of one stage at the judged level;
-    docs/decisions/registration.md."""
+    """Candidates of a search by FFT at the coarse level, and of one stage at the judged level."""
     far_candidates: int = 400
-    """Candidates of a search by FFT one level above the coarse one;
-    docs/decisions/registration.md."""
+    """Candidates of a search by FFT one level above the coarse one."""
     far_reach_px: float = 1.5
     """Their place is sought within so many pixels of that level."""
     final_candidates: int = 2
     """Candidates of a search at the final level: each is finished."""
     tile_candidates: tuple[int, int] = (20, 400)
-    """Least and largest number of candidates from tiles; docs/decisions/registration.md."""
+    """Least and largest number of candidates from tiles."""
     tiles_per_candidate: int = 200
     """Between these, one candidate for so many tiles: the right one ranks lower among more."""
     tile_share_per_nat: float = 0.03
     """Share of its similarity that a tile loses with every nat by which the telemetry contradicts
-    its pose; docs/decisions/registration.md."""
+    its pose."""
     tile_reach_strides: float = 1.1
     """The place of a candidate from tiles is sought within so many strides of the tile grid."""
     nearby_log_scales: tuple[float, ...] = (-0.13, 0.0, 0.13)
     """Candidates from tiles and from above the coarse level are compared there under their log
-    scale plus each of these, the best of which counts: their scale is hardly known;
-    docs/decisions/registration.md."""
+    scale plus each of these, the best of which counts: their scale is hardly known."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Least and largest side of a view, in tiles, for which tiles are asked: below, most of a tile
     is missing; above, most of the view is unused."""
@@ -105,7 +101,7 @@ class SearchPolicy:
     """Weaker candidates than this share of the best are dropped."""
     clear: ClearMargin = CLEAR
     """The search ends with a place that stands out so far. Views of other places reach a ratio of
-    1.4, rarely 1.6; docs/decisions/registration.md."""
+    1.4, rarely 1.6."""
     clear_at_judged: ClearMargin = CLEAR_AT_JUDGED
     """The same once the judged level was searched, if only in part: it misses least. Also after
     tiles, where the place is confident as well: there can be more of them than places at the judged
@@ -117,15 +113,15 @@ class SearchPolicy:
     searched. Before the final level they were, and `doubt` counts."""
     trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
     """Where a trial compares only a part of all places, or only a few on the terrain, the place
-    must also stand out so far; docs/decisions/registration.md."""
+    must also stand out so far."""
     trials: int = 3
     """Before a search that costs more than a trial, so many of the best candidates are placed on
     the terrain and finished, and compared one level finer where that proves none. The search ends
-    if one is proven; docs/decisions/registration.md."""
+    if one is proven."""
     finer: tuple[tuple[int, float], ...] = ((3, 25.0), (48, 90.0))
     """Until a place is proven, so many candidates are finished and the best of them compared one
     level finer, with the estimated cost (ms): matches by chance lose more in detail, so that the
-    right place may be far down the list of the judged level; docs/decisions/registration.md."""
+    right place may be far down the list of the judged level."""
     terrain_candidates: int = 48
     """At most so many candidates are placed on the terrain, the best that lie apart."""
     cheap_ms: float = 14.0
@@ -135,7 +131,7 @@ class SearchPolicy:
     on a large area (README)."""
     last_stage_ms: float = 60.0
     """The last stage, poses that one view in seven has, is left out where it would cost more and
-    the coarse level has tried them; docs/decisions/registration.md."""
+    the coarse level has tried them."""
 
     def candidates_from(self, tiles: int) -> int:
         """Number of candidates to take from so many tiles."""

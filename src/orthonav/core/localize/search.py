@@ -1,4 +1,4 @@
-"""The search for the place of one view: steps that find candidates, until one place is settled.
+"""The search for the place of one view: steps that find candidates, and when they are enough.
 
 `policy` says what is tried and what it costs; each step finds candidates in its way, `place` judges
 them. A search ends as soon as the best place stands out or is proven by its confidence.
@@ -7,7 +7,6 @@ them. A search ends as soon as the best place stands out or is proven by its con
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -15,27 +14,21 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.camera import CameraFound, camera_found
-from orthonav.core.localize.confidence import USUAL_CHANCES, RegisteredConfidence
-from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
+from orthonav.core.localize.confidence import USUAL_CHANCES
+from orthonav.core.localize.ground import SearchedSheet, ViewOverGround
 from orthonav.core.localize.place import KEPT_TO_FINISH, Place, Placer
-from orthonav.core.localize.policy import DEFAULT_PLAN, Budget, ClearMargin, Direction, SearchPlan
-from orthonav.core.localize.tiles import TileProposer
+from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
-from orthonav.core.mapfile.manifest import SheetInfo
-from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior
 from orthonav.core.register.pose import rotation
 from orthonav.core.register.search import (
     PLACES_AT_ONCE,
     Peak,
-    SearchWindows,
     best_near,
     largest_half_px,
     search,
 )
-from orthonav.core.register.window import GreyPyramid, Reference
 from orthonav.core.tiles.exact import rows_within
 
 SAME_PLACE_SHARE = 1 / 8
@@ -43,40 +36,6 @@ SAME_PLACE_SHARE = 1 / 8
 WHOLE_WINDOW_PX = 8_000_000
 """Up to so many pixels of the coarse level their surroundings are cut out of one window of the
 whole sheet (12 bytes each); of larger sheets a window is made for each."""
-
-
-class SearchedSheet:
-    """A sheet and its imagery, made ready for all views. Safe to share between threads."""
-
-    def __init__(
-        self,
-        sheet: SheetInfo,
-        layer: GreyPyramid,
-        *,
-        confidence: RegisteredConfidence | None,
-        radius_m: float,
-        floor_px: float,
-        propose: TileProposer | None = None,
-        plan: SearchPlan = DEFAULT_PLAN,
-        terrain: TerrainLayer | None = None,
-    ) -> None:
-        """`confidence`: None before it is learnt; no place is proven then. `radius_m`: the error
-        that it is about. `floor_px`: standard deviation with which maps of two dates agree, in
-        pixels of level 0. Without `propose`, candidates come from searches by FFT only; without
-        `terrain` the ground is level.
-        """
-        self.sheet, self.grid = sheet, sheet.grid
-        self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
-        self.reference = Reference(layer)
-        self.windows = SearchWindows(self.reference)
-        self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
-        self.propose, self.plan = propose, plan
-        self.relief = Relief(terrain or LevelTerrain(), self.grid)
-
-    @property
-    def pyramid(self) -> GreyPyramid:
-        """The grey levels of the sheet at all its resolutions."""
-        return self.reference.pyramid
 
 
 @dataclass(frozen=True)
@@ -230,7 +189,7 @@ class Search:
     # What is tried
 
     def steps(self) -> Iterator[Step]:
-        """The steps for the view, to be run in this order until a place is settled."""
+        """The steps for the view, to be run in this order until the search ends."""
         policy, levels, prior = self.policy, self.levels, self.view.prior
         judged = policy.directions(prior, policy.judged_steps)
         judged_ms, tried_all = self.fft_ms(levels.judged, len(judged)), False
@@ -291,9 +250,9 @@ class Search:
     def middle_px(self) -> tuple[float, float]:
         """The middle of the view as the prior expects it, x and y at level 0."""
         assert self.prior is not None
-        grid, view = self.sheet.grid, self.view
+        view = self.view
         place = self.sheet.sheet.frame.en_from_latlon(self.prior.lat_deg, self.prior.lon_deg)
-        x, y = grid_px(grid, place)
+        x, y = self.sheet.px_of(place)
         if view.prior.turn_rad is None:
             return x, y
         moved = rotation(view.prior.turn_rad) @ view.camera_px
@@ -462,15 +421,15 @@ class Search:
         places = self.placer.on_terrain(self.places, policy.trials)
         compared_all = is_level and last.level == levels.judged and not last.from_tiles
         doubt = policy.doubt if at_final else policy.trial_doubt
-        found = self._finished(places, policy.trials)
-        stands_out = compared_all or self._is_clear(found, policy.trial_clear)
-        if stands_out and self._is_proven(found, doubt):
-            return found
-        if not stands_out or at_final or levels.final == 0:
-            return None
-        found = self._finished(places, policy.trials, finer=True)
-        stands_out = compared_all or self._is_clear(found, policy.trial_clear)
-        return found if stands_out and self._is_proven(found, doubt) else None
+        for finer in (False, True):
+            found = self._finished(places, policy.trials, finer=finer)
+            if not compared_all and not self._is_clear(found, policy.trial_clear):
+                return None
+            if self._is_proven(found, doubt):
+                return found
+            if at_final or levels.final == 0:
+                return None
+        return None
 
     def _concluded(self) -> Place:
         """The best place after all steps, none of which ended with one that stands out.
@@ -509,9 +468,3 @@ class Search:
         """Whether a place has a confidence above 1 - `doubt`."""
         confidence = self.sheet.confidence
         return confidence is not None and confidence(best.scores) > 1 - doubt
-
-
-def grid_px(grid: TileGrid, place_en_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Pixels of level 0, x and y, of a place (2,)."""
-    east, north = place_en_m
-    return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m

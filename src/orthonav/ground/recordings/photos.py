@@ -58,8 +58,6 @@ _TURNED_DEG = 5.0
 _OPPOSED_DEG = 135.0
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
-
-
 _EDITOR = re.compile(
     r"microsoft|windows|photo\s*(?:viewer|shop|gallery|scape)|lightroom|gimp|picasa|paint|irfan"
     r"|acdsee|xnview|magick|digikam|darktable|rawtherapee|affinity|capture one|snapseed|preview"

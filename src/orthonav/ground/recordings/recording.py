@@ -1,4 +1,4 @@
-"""A recorded flight that is read view by view."""
+"""A recorded flight that is read view by view, how it is read, and doubts about it."""
 
 import math
 from collections import Counter
@@ -22,9 +22,23 @@ from orthonav.core.records import Prior, Telemetry
 
 KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
-
-
 MAX_FOV_DEG = 150.0
+LEVEL_GROUND = (
+    "height above ground is taken from the height above take-off: level ground is assumed"
+)
+LEVEL_GROUND_IN_GAPS = (
+    "where no height above ground was measured, it is taken from the height above take-off: level "
+    "ground is assumed there"
+)
+Grey = NDArray[np.uint8]
+DECIMALS = 8
+_ROUNDED = (
+    *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
+    *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
+)
+JUMP_M, JUMP_MPS = 500.0, 150.0
+"""Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
+that this program is for flies slower, and logs round positions to some metres."""
 
 
 @dataclass(frozen=True)
@@ -87,17 +101,6 @@ class SourceOptions:
     def time_offset_ns(self) -> int:
         """The offset in nanoseconds."""
         return round(self.time_offset_s * 1e9)
-
-
-Grey = NDArray[np.uint8]
-DECIMALS = 8
-_ROUNDED = (
-    *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
-    *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
-)
-JUMP_M, JUMP_MPS = 500.0, 150.0
-"""Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
-that this program is for flies slower, and logs round positions to some metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,15 +230,6 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
         "order of their names, and a track over them is of little use, because it needs the time "
         "of each"
     ]
-
-
-LEVEL_GROUND = (
-    "height above ground is taken from the height above take-off: level ground is assumed"
-)
-LEVEL_GROUND_IN_GAPS = (
-    "where no height above ground was measured, it is taken from the height above take-off: level "
-    "ground is assumed there"
-)
 
 
 def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:

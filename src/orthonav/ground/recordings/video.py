@@ -32,6 +32,8 @@ from orthonav.ground.recordings.recording import (
 SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
 _SHORT_NS = 1_000_000_000
 _MISSING_FRAMES = 0.01
+SILENT = 0
+"""OpenCV's level of logging at which it writes nothing."""
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -124,10 +126,6 @@ def _grey(frame: NDArray[Any] | None, where: str) -> NDArray[np.uint8]:
 def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
     width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
     return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-
-
-SILENT = 0
-"""OpenCV's level of logging at which it writes nothing."""
 
 
 @contextmanager
