@@ -207,10 +207,6 @@ class SheetRegistrar:
         self._usable = set(atlas.sheets())
         self._sheet = functools.lru_cache(maxsize=MAX_OPEN)(self._opened)
 
-    def of_view(self, view: View, side_m: float) -> "ViewRegistrar":
-        """What registers a view `side_m` wide."""
-        return ViewRegistrar(self, view, side_m)
-
     def near(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
         """The usable sheets within reach of the middle of a view. Raises `StorageError` where a
         sheet cannot be fetched."""
