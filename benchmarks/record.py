@@ -61,7 +61,6 @@ class Section:
     failed: bool = False
 
     def markdown(self) -> str:
-        """Title and tables in Markdown."""
         return "\n".join([f"## {self.title}", "", *(table.markdown() for table in self.tables)])
 
 
@@ -74,7 +73,6 @@ def number(value: float) -> str:
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """A share as text."""
     return "-" if math.isnan(share) else f"{share:.{digits}%}"
 
 
@@ -85,7 +83,6 @@ def quantiles(values: Any, *percents: float) -> list[str]:
 
 
 def say(text: str) -> None:
-    """A line on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 

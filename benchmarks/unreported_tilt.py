@@ -120,7 +120,6 @@ def level_telemetry(true: Telemetry, rng: np.random.Generator) -> Telemetry:
 
 
 def compared(fix: Fix, each: Flown, frame: LocalFrame) -> Placed:
-    """A fix against the truth."""
     position = frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
     off = position - each.camera_en_m
     if fix.ground_latlon_deg is None:
