@@ -400,11 +400,6 @@ def test_conflicting_or_impossible_options_are_refused(
     assert done.code == 1 and why in done.err and not list(tmp_path.iterdir())
 
 
-def test_torchrun_is_refused(run, ortho, monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    assert "torchrun trains one map" in run("atlas", "build", "a", "--ortho", ortho).err
-
-
 def test_the_help_of_a_build_is_grouped(run):
     done = run("atlas", "build", "--help-all")
     for group in ("area", "sheets", "coarse tiles", "workers"):

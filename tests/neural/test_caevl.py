@@ -12,12 +12,11 @@ from orthonav.core.tiles.embed import TABLE, embedder_of
 from orthonav.core.tiles.represent import Canny
 from orthonav.core.variants import variant_recipe
 from orthonav.research import caevl
-from orthonav.research.augment import augmented
 from orthonav.research.autoencoder import AutoEncoder
+from orthonav.research.caevl import augmented, local_vicreg, vicreg
 from orthonav.research.caevl_recipe import CaevlRecipe
-from orthonav.research.means import Means
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.vicreg import local_vicreg, vicreg
+from orthonav.research.training import Means
 
 TILE_PX = 32
 QUICK = Means(save_every_s=1e6, workers=1, device="cpu", bf16=False)

@@ -20,7 +20,7 @@ from orthonav.core.records import Telemetry, View
 from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.research import sam, sam_weights
+from orthonav.research import sam
 from orthonav.research.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
 
 SIDE = 64
@@ -479,7 +479,7 @@ def test_original_checkpoints_are_read(weights, checkpoint):
         "prompt_encoder",
         "mask_decoder",
     }
-    model = sam_weights.original_model(checkpoint)
+    model = sam.original_model(checkpoint)
     expected = transformers.SamModel.from_pretrained(weights)
     assert model.state_dict().keys() == expected.state_dict().keys()
     for name, value in expected.state_dict().items():
@@ -495,7 +495,7 @@ def test_sizes_follow_from_the_shapes_of_the_weights(size):
     expected = transformers.SamConfig(vision_config=transformers.SamVisionConfig(**SIZES[size]))
     with torch.device("meta"):
         original = original_weights(transformers.SamModel(expected))
-    made = sam_weights._config(original)
+    made = sam._config(original)
     for part in ("vision_config", "prompt_encoder_config", "mask_decoder_config"):
         found, wanted = getattr(made, part).to_dict(), getattr(expected, part).to_dict()
         assert found.pop("global_attn_indexes", []) == list(wanted.pop("global_attn_indexes", []))
@@ -508,10 +508,10 @@ def test_incomplete_checkpoints_are_refused(checkpoint, tmp_path):
         path = tmp_path / "part.pth"
         torch.save({key: value for key, value in whole.items() if key != name}, path)
         with pytest.raises(VariantError, match="not Segment Anything"):
-            sam_weights.original_model(path)
+            sam.original_model(path)
     torch.save([1, 2], tmp_path / "list.pth")
     with pytest.raises(VariantError, match="not Segment Anything"):
-        sam_weights.original_model(tmp_path / "list.pth")
+        sam.original_model(tmp_path / "list.pth")
 
 
 class Evil:

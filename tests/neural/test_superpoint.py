@@ -11,7 +11,7 @@ import torch
 import transformers
 
 from orthonav.core.errors import MissingFileError, VariantError
-from orthonav.research.superpoint import SuperPoint
+from orthonav.research.pretrained import SuperPoint
 
 BORDER_PX = 4
 

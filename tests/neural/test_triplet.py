@@ -134,7 +134,7 @@ def test_a_batch_in_chunks_has_the_gradients_of_the_whole(similarity):
         one.model.eval()
         both, apart = (torch.from_numpy(values) for values in one.arrays(0, np.arange(6)))
         both[1::2] += 0.3 * torch.rand(both[1::2].shape, generator=torch.Generator().manual_seed(0))
-        loss = one.backward(one.model, both, apart, scale=torch.ones(()))
+        loss = one.backward(both, apart, scale=torch.ones(()))
         assert float(loss) > 0
         gradients.append([values.grad for values in one.model.parameters()])
     largest = max(float(values.abs().max()) for values in gradients[0])

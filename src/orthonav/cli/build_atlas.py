@@ -1,7 +1,6 @@
 """`orthonav atlas build`: build the sheets of an atlas, on one machine or many."""
 
 import argparse
-import os
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -84,12 +83,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Build, print a summary; returns 1 where a sheet failed."""
-    from orthonav.core.errors import AtlasError
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
     from orthonav.ground.planning.route import read_route
 
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise AtlasError("torchrun trains one map: use --cluster to build an atlas in parallel")
     request = AtlasRequest(
         url=options.atlas,
         orthos=options.ortho,

@@ -105,10 +105,10 @@ class Reconstruction:
         """Tiles (B, C, S, S)."""
         return (self.tiles.batch(indices),)
 
-    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
         """The L2 loss, after adding its gradients times `scale`."""
         (maps,) = tensors
-        loss = reconstruction_loss(maps, run(maps))
+        loss = reconstruction_loss(maps, self.model(maps))
         torch.autograd.backward(loss * scale)
         return loss.detach()
 

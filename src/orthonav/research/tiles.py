@@ -98,20 +98,15 @@ class SheetTiles:
         return slice(row, row + self.tile_px), slice(col, col + self.tile_px)
 
 
-def epoch_batches(
-    count: int, batch: int, seed: int, epoch: int, *, rank: int = 0, processes: int = 1
-) -> list[NDArray[np.intp]]:
-    """Share of this process of every batch of an epoch: indices below `count`, in random order.
+def epoch_batches(count: int, batch: int, seed: int, epoch: int) -> list[NDArray[np.intp]]:
+    """Batches of an epoch: indices below `count`, in random order.
 
-    Batches hold at most `batch` tiles, nearly the same number each. Every process gets the same
-    number, at least 2; to make that possible some tiles are left out or repeated.
+    Batches hold at most `batch` tiles, nearly the same number each, and at least 2; to make that
+    possible a tile may be repeated.
     """
     order = np.random.default_rng([seed, epoch]).permutation(count)
-    parts = []
-    for whole in np.array_split(order, math.ceil(count / batch)):
-        size = max(len(whole) // processes, min(2, batch))
-        parts.append(np.resize(whole, size * processes)[rank::processes])
-    return parts
+    parts = np.array_split(order, math.ceil(count / batch))
+    return [np.resize(part, max(len(part), min(2, batch))) for part in parts]
 
 
 def made_ahead(

@@ -1,4 +1,4 @@
-"""SuperPoint keypoints and descriptors (DeTone, Malisiewicz and Rabinovich, CVPRW 2018).
+"""Pretrained networks from Hugging Face folders, and SuperPoint (DeTone et al., CVPRW 2018).
 
 The network is that of the `transformers` library (Apache-2.0). Its weights are not part of
 orthonav and it never downloads them: their licence forbids commercial use. They are published as
