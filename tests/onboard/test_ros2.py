@@ -43,11 +43,10 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.lost import LostImages
-from orthonav.onboard.ros2.messages import Definitions
+from orthonav.onboard.ros2.graph import Definitions
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
-from orthonav.onboard.ros2.reader import Ros2Reader
+from orthonav.onboard.ros2.reader import LostImages, Ros2Reader
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
 
 S = 10**9

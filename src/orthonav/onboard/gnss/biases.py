@@ -1,22 +1,200 @@
-"""Tests of the difference between GNSS and map over a window, with correlated errors.
+"""The difference GNSS minus map: its constant biases, the tests of a change, and learning.
 
-The differences of the window are a Gaussian vector: the biases as far as they are known, and slowly
-varying errors of GNSS and map. A fault adds a step or a ramp. For each onset the change is
+The difference is linear in the biases: a displacement of the map is constant, an error of the mount
+turns with the heading and grows with the height, a latency acts along the velocity over ground. An
+error of the mount's yaw turns the view and does not displace it, so it is none of them.
+
+Tests: the differences of a window are a Gaussian vector of the biases as far as they are known, and
+slowly varying errors of GNSS and map. A fault adds a step or a ramp. For each onset the change is
 estimated by generalized least squares and compared with its standard deviation: the generalized
 likelihood ratio test of Willsky and Jones (1976, doi:10.1109/TAC.1976.1101146), over a window
 instead of a recursion.
+
+Learning: a Kalman filter whose state is the biases and the slowly varying errors. With these in the
+state the differences are correlated, and the covariance of the biases is honest. A combination of
+biases that a flight does not show stays as uncertain as before. A spoofed receiver must not move
+the map: only values in agreement count, each waits in quarantine, an alarm discards those that
+wait, an offset discards all that was learnt since the reference, outliers are left out, and the
+biases are bounded.
 """
 
+import copy
+import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import cholesky, solve_triangular
 
-from orthonav.onboard.gnss.biases import Biases, design
+from orthonav.core.records import MAP_STD_M
 from orthonav.onboard.gnss.records import Array, Fault
+
+NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
+"""Biases in the order of `Biases.mean`."""
+_MOUNT = slice(2, 4)
+LARGEST_M = 100.0
+"""Largest displacement; a larger difference is a fault."""
+LIMITS = np.array([LARGEST_M, LARGEST_M, math.radians(10), math.radians(10), 1.0])
+"""Largest magnitude of each bias."""
+_PRIOR_STD = np.array([30.0, 30.0, math.radians(1.5), math.radians(1.5), 0.2])
+"""Assumed of a map and a camera of which nothing was learnt: a displacement of 60 m, a mount that
+was aligned by eye to 3 deg and a latency of 0.4 s are 2 sigma."""
+_BETWEEN_STD = np.array([0.0, 0.0, math.radians(0.3), math.radians(0.3), 0.03])
+"""Change from flight to flight: a camera that was taken off, a latency that was measured again."""
+PLAUSIBLE_SIGMAS = 5.0
+"""A displacement beyond so many of the standard deviations that every fix includes for it
+(`MAP_STD_M`) is that of a wrong map, or of a spoofed receiver."""
+_LEAST_EIGENVALUE = 1e-12
+_MOST_VARIANCE = 4.0
+"""Of what is assumed where nothing was learnt: a larger variance is damage."""
+_MOST_AGREED_S = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Biases:
+    """Estimated biases of GNSS minus map.
+
+    `mean` (5,), `cov` (5, 5): in the order of `NAMES`. East and north are where the map should be,
+    from where it is. Pitch and roll are errors of the reported tilt, as `Mount` has them: pitch
+    positive ahead, roll positive to the left. The latency is that of the images less that of GNSS,
+    positive where the images are older than assumed.
+    `agreed_s`: time of agreement that they were learnt from.
+    `setup`: identifies camera, mount and stated latency, for which pitch, roll and latency hold.
+    """
+
+    mean: Array
+    cov: Array
+    agreed_s: float = 0.0
+    setup: str = ""
+
+    @property
+    def en_m(self) -> Array:
+        """Displacement of the map, east and north (2,)."""
+        return self.mean[:2]
+
+    @property
+    def stds(self) -> Array:
+        """Standard deviations (5,)."""
+        return np.sqrt(np.diag(self.cov))
+
+    @property
+    def std_m(self) -> float:
+        """Standard deviation of the displacement along its worst axis."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.cov[:2, :2])[-1]))
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the displacement may be that of a map as accurate as fixes state."""
+        largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
+        return float(np.hypot(*self.en_m)) <= largest_m
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether positions may be corrected by them: the displacement is plausible, and known at
+        least as well as every fix assumes it. Otherwise a constant error of a receiver could pass
+        for one of the mount."""
+        return self.is_plausible and self.std_m <= MAP_STD_M
+
+    def correction(self, design: Array) -> tuple[Array, Array]:
+        """Mean (2,) and covariance (2, 2) of GNSS minus map for the `design` (2, 5) of a view."""
+        return design @ self.mean, design @ self.cov @ design.T
+
+    def correction_at_any_heading(self, agl_m: float, vel_en_mps: Array) -> tuple[Array, Array]:
+        """The same where all headings are equally likely: the error of the mount, which turns with
+        the heading, is only part of the covariance."""
+        mean, cov = self.correction(design(0.0, 0.0, vel_en_mps))
+        tilt, spread = self.mean[_MOUNT], self.cov[_MOUNT, _MOUNT]
+        turning_m2 = agl_m**2 * (float(tilt @ tilt) + float(np.trace(spread)))
+        return mean, cov + turning_m2 / 2 * np.eye(2)
+
+    def without_displacement(self) -> "Biases":
+        """The same with no displacement, known exactly."""
+        mean, cov = self.mean.copy(), self.cov.copy()
+        mean[:2] = cov[:2] = cov[:, :2] = 0.0
+        return replace(self, mean=mean, cov=cov)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Values for strict JSON; the covariance as its lower triangle, row by row."""
+        return {
+            "mean": self.mean.tolist(),
+            "cov": self.cov[np.tril_indices(len(NAMES))].tolist(),
+            "agreed_s": self.agreed_s,
+            "setup": self.setup,
+        }
+
+
+def biases_from_plain(plain: Mapping[str, Any]) -> Biases:
+    """Inverse of `Biases.to_plain`.
+
+    Raises `ValueError`, `KeyError`, `TypeError` or `OverflowError` for values that are no estimate,
+    or beyond `LIMITS`.
+    """
+    count = len(NAMES)
+    mean = np.array([float(each) for each in plain["mean"]])
+    lower = np.array([float(each) for each in plain["cov"]])
+    agreed_s, setup = float(plain["agreed_s"]), plain["setup"]
+    if mean.shape != (count,) or lower.shape != (count * (count + 1) // 2,):
+        raise ValueError("wrong number of values")
+    if not (np.isfinite(lower).all() and (np.abs(mean) <= LIMITS).all()):
+        raise ValueError("value out of range")
+    if not (0 <= agreed_s <= _MOST_AGREED_S and isinstance(setup, str)):
+        raise ValueError("time of agreement or setup is invalid")
+    cov = np.zeros((count, count))
+    cov[np.tril_indices(count)] = lower
+    cov += np.tril(cov, -1).T
+    scaled = cov / np.multiply.outer(_PRIOR_STD, _PRIOR_STD)
+    if np.linalg.eigvalsh(scaled)[0] < _LEAST_EIGENVALUE or np.diag(scaled).max() > _MOST_VARIANCE:
+        raise ValueError("not a covariance")
+    return Biases(mean, cov, agreed_s, setup)
+
+
+def unknown(setup: str = "") -> Biases:
+    """The biases assumed where nothing was learnt."""
+    return Biases(np.zeros(len(NAMES)), np.diag(_PRIOR_STD**2), 0.0, setup)
+
+
+def at_start(known: Mapping[str, Biases], digest: str, setup: str) -> Biases:
+    """The biases known before a flight over the map `digest` with the camera of `setup`.
+
+    `known`: what was learnt of maps, by their digest, the latest last. The displacement belongs to
+    the map, the other biases to the setup: they are those of this map, or of the latest with the
+    same setup.
+    """
+    start, here = unknown(setup), known.get(digest)
+    same = [each for each in known.values() if each.setup == setup]
+    if here is not None and here.setup == setup:
+        start = here
+    else:
+        mean, cov, agreed_s = start.mean.copy(), start.cov.copy(), start.agreed_s
+        if here is not None:
+            mean[:2], cov[:2, :2], agreed_s = here.mean[:2], here.cov[:2, :2], here.agreed_s
+        if same:
+            mean[2:], cov[2:, 2:] = same[-1].mean[2:], same[-1].cov[2:, 2:]
+        start = Biases(mean, cov, agreed_s, setup)
+    cov = start.cov + np.diag(_BETWEEN_STD**2)
+    # no less certain than where nothing was learnt, however many flights did not show a bias
+    scale = np.minimum(_PRIOR_STD / np.sqrt(np.diag(cov)), 1.0)
+    return replace(start, cov=np.multiply.outer(scale, scale) * cov)
+
+
+def design(heading_rad: ArrayLike, agl_m: ArrayLike, vel_en_mps: Array) -> Array:
+    """Derivatives (..., 2, 5) of GNSS minus map, east and north, by the biases.
+
+    `heading_rad`, `agl_m` (...): of the view, clockwise from north, and above ground.
+    `vel_en_mps` (..., 2): velocity over ground.
+    """
+    sin, cos, height = np.sin(heading_rad), np.cos(heading_rad), np.asarray(agl_m)
+    made = np.zeros((*np.shape(sin), 2, len(NAMES)))
+    made[..., 0, 0] = made[..., 1, 1] = 1.0
+    made[..., 0, 2], made[..., 1, 2] = -height * sin, -height * cos  # the map's place is ahead
+    made[..., 0, 3], made[..., 1, 3] = height * cos, -height * sin  # the map's place is left
+    made[..., 4] = vel_en_mps
+    return made
+
 
 BIN_S = 1.0
 """Differences within this time are one value, their median."""
@@ -216,3 +394,201 @@ def _covariance(values: Sequence[Difference], model: DifferenceModel) -> Array:
     blocks[:, 0, :, 0] = blocks[:, 1, :, 1] = same + cos
     blocks[:, 0, :, 1], blocks[:, 1, :, 0] = sin, -sin
     return blocks.reshape(2 * len(times), -1)
+
+
+LARGEST_GAP_S = 2.0
+"""Values farther apart do not show how the aircraft turned between them."""
+LEAST_DEG_S2 = 3.0
+"""Change of the turn rate per second from which the aircraft rolls; less is noise of headings."""
+LATENCY_STD_S = 0.08
+"""Standard deviation of the latency of the images beyond the learnt one. With more, a step of GNSS
+in a turn is named after more than 5 s; with less, images that are 0.3 s late look like steps."""
+GRAVITY_MPS2 = 9.81
+
+
+class Rolling:
+    """Recognizes rolling by the change of the turn rate. Mutable; deterministic."""
+
+    def __init__(self) -> None:
+        self._before: deque[Difference] = deque(maxlen=2)
+
+    def std_m(self, value: Difference, known: Biases) -> float:
+        """Standard deviation of the error of a value, the next after those before; 0 without.
+
+        `known`: for the latency that it may be due to.
+        """
+        values = [*self._before, value]
+        self._before.append(value)
+        change = _change_of_rate(*values) if len(values) == 3 else 0.0
+        if change <= math.radians(LEAST_DEG_S2):
+            return 0.0
+        # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
+        bank_rate = float(np.hypot(*value.vel_en_mps)) * change / GRAVITY_MPS2
+        latency_s = math.hypot(known.mean[4], LATENCY_STD_S)
+        return latency_s * bank_rate * value.agl_m
+
+
+def _change_of_rate(first: Difference, middle: Difference, last: Difference) -> float:
+    """Magnitude of the change of the turn rate per second; 0 where it is not known."""
+    before_s, after_s = middle.time_s - first.time_s, last.time_s - middle.time_s
+    if not (0 < before_s <= LARGEST_GAP_S and 0 < after_s <= LARGEST_GAP_S):
+        return 0.0
+    before = math.remainder(middle.heading_rad - first.heading_rad, math.tau) / before_s
+    after = math.remainder(last.heading_rad - middle.heading_rad, math.tau) / after_s
+    return 2 * abs(after - before) / (before_s + after_s)
+
+
+QUARANTINE_S = 180.0
+"""Time that a value waits before it counts: longer than a drift of 0.25 m/s needs to be named."""
+SETTLED_S = 1800.0
+"""Time of agreement after which biases count as known."""
+OUTLIER = 13.8
+"""Squared Mahalanobis distance of an outlier: chi-square of two axes, 99.9 %."""
+LARGEST_STEP_S = 2.0
+"""Most time of agreement that one value counts."""
+_WALK = np.array([0.02, 0.02, math.radians(0.003), math.radians(0.003), 5e-4])
+"""Random walk of the biases, per root second, so that old values are forgotten over an hour: the
+displacement of a map is not the same everywhere, the track corrects part of the tilt."""
+_BIAS, _GNSS, _LOCAL, _BODY = slice(0, 5), slice(5, 7), slice(7, 9), slice(9, 11)
+_STATES = 11
+
+
+@dataclass(frozen=True, eq=False)
+class Resumed:
+    """What a flight had learnt before its process was restarted.
+
+    `learnt`, `reference`: see `BiasLearner`.
+    """
+
+    learnt: Biases
+    reference: Biases
+
+    def to_plain(self, before: Biases | None) -> dict[str, Any]:
+        """Values for strict JSON. `before`: what was known of the map before the flight, if it was
+        known at all."""
+        flight = {"reference": self.reference.to_plain()}
+        if before is not None:
+            flight["before"] = before.to_plain()
+        return {**self.learnt.to_plain(), "flight": flight}
+
+
+def before_flight(plain: Mapping[str, Any]) -> tuple[Biases | None, Resumed | None]:
+    """Inverse of `Resumed.to_plain`: what was known before the flight, and what it had learnt.
+
+    Values without a flight were known before it. Raises as `biases_from_plain`.
+    """
+    learnt, flight = biases_from_plain(plain), plain.get("flight")
+    if flight is None:
+        return learnt, None
+    before = biases_from_plain(flight["before"]) if "before" in flight else None
+    return before, Resumed(learnt, biases_from_plain(flight["reference"]))
+
+
+class BiasLearner:
+    """Learns the biases of one receiver over one map. Mutable; deterministic."""
+
+    def __init__(
+        self, start: Biases, model: DifferenceModel, resumed: Resumed | None = None
+    ) -> None:
+        """`start` is what is known before the flight; a `resumed` flight continues to learn with
+        the reference that it had."""
+        resumed = resumed or Resumed(start, start)
+        self._model, self._filter = model, _Filter(resumed.learnt, model)
+        self._reference = resumed.reference
+        self._waiting: deque[Difference] = deque()
+
+    @property
+    def learnt(self) -> Biases:
+        """Estimate from all values whose quarantine has ended."""
+        return self._filter.biases
+
+    @property
+    def reference(self) -> Biases:
+        """What a slow drag-off of this flight has not moved: the biases before the flight, or,
+        where they were not known, after the first `SETTLED_S` of agreement."""
+        return self._reference
+
+    def add(self, value: Difference) -> None:
+        """Add a value during agreement."""
+        self._waiting.append(value)
+        while self._waiting and self._waiting[0].time_s <= value.time_s - QUARANTINE_S:
+            self._filter.update(self._waiting.popleft())
+        if self._reference.agreed_s < SETTLED_S <= self.learnt.agreed_s:
+            self._reference = self.learnt
+
+    def widen(self, rolling_std_m: float) -> None:
+        """Give the newest value at least this error by rolling."""
+        if self._waiting:
+            self._waiting[-1] = self._waiting[-1].rolling(rolling_std_m)
+
+    def discard(self) -> None:
+        """Drop everything in quarantine, as at an alarm."""
+        self._waiting.clear()
+
+    def restore(self) -> None:
+        """Go back to the reference, if there is one: a drag-off may have been learnt since."""
+        self.discard()
+        if self._reference.agreed_s >= SETTLED_S:
+            self._filter = _Filter(self._reference, self._model)
+
+    def until(self, time_s: float) -> Biases:
+        """Estimate with the values before a time as well, though they are in quarantine."""
+        ahead = copy.copy(self._filter)
+        for value in self._waiting:
+            if value.time_s < time_s:
+                ahead.update(value)
+        return ahead.biases
+
+
+class _Filter:
+    """The filter; its arrays are replaced, never changed, so a shallow copy is independent."""
+
+    def __init__(self, start: Biases, model: DifferenceModel) -> None:
+        self.biases, self._model = start, model
+        self._taus = np.repeat([model.gnss_tau_s, model.map_tau_s, model.mount_tau_s], 2)
+        self._mean = np.concatenate([start.mean, np.zeros(_STATES - len(NAMES))])
+        self._cov = np.eye(_STATES)
+        self._cov[_BIAS, _BIAS] = start.cov
+        self._time_s: float | None = None
+
+    def update(self, value: Difference) -> None:
+        """Update with a value, unless it is an outlier."""
+        elapsed_s = 0.0 if self._time_s is None else value.time_s - self._time_s
+        mean, cov = self._predicted(elapsed_s)
+        shown = self._design(value)
+        noise_m2 = self._model.white_share * value.map_std_m**2 + value.rolling_std_m**2
+        spread = shown @ cov @ shown.T + noise_m2 * np.eye(2)
+        off = value.en_m - shown @ mean
+        gain = np.linalg.solve(spread, shown @ cov).T
+        self._mean, self._cov, self._time_s = mean, cov, value.time_s
+        if off @ np.linalg.solve(spread, off) <= OUTLIER:
+            self._mean, cov = mean + gain @ off, cov - gain @ spread @ gain.T
+            self._cov = (cov + cov.T) / 2
+            agreed_s = self.biases.agreed_s + min(max(elapsed_s, 0.0), LARGEST_STEP_S)
+            self.biases = replace(self.biases, agreed_s=agreed_s)
+        bounded = np.clip(self._mean[_BIAS], -LIMITS, LIMITS)
+        length = float(np.hypot(*bounded[:2]))
+        bounded[:2] *= min(1.0, LIMITS[0] / max(length, 1.0))
+        self._mean = np.concatenate([bounded, self._mean[len(NAMES) :]])
+        self.biases = replace(self.biases, mean=bounded, cov=self._cov[_BIAS, _BIAS])
+
+    def _predicted(self, elapsed_s: float) -> tuple[Array, Array]:
+        """State and covariance after a time; a clock that went back begins new slow errors."""
+        elapsed_s = elapsed_s if elapsed_s >= 0 else math.inf
+        kept = np.concatenate([np.ones(len(NAMES)), np.exp(-elapsed_s / self._taus)])
+        walked_s = elapsed_s if math.isfinite(elapsed_s) else 0.0
+        grown = np.concatenate([_WALK**2 * walked_s, 1 - kept[len(NAMES) :] ** 2])
+        return kept * self._mean, np.multiply.outer(kept, kept) * self._cov + np.diag(grown)
+
+    def _design(self, value: Difference) -> Array:
+        """Derivatives (2, 11) of a value by the state; slow errors have unit variance."""
+        model = self._model
+        made = np.zeros((2, _STATES))
+        made[:, _BIAS] = value.design
+        made[:, _GNSS] = max(value.gnss_std_m, model.gnss_std_m) * np.eye(2)
+        local_share = 1 - model.mount_share - model.white_share
+        made[:, _LOCAL] = math.sqrt(local_share) * value.map_std_m * np.eye(2)
+        sin, cos = math.sin(value.heading_rad), math.cos(value.heading_rad)
+        turned = np.array([[cos, sin], [-sin, cos]])
+        made[:, _BODY] = math.sqrt(model.mount_share) * value.map_std_m * turned
+        return made

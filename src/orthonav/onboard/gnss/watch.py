@@ -18,8 +18,7 @@ from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
-from orthonav.onboard.gnss.biases import Biases, at_start, design
-from orthonav.onboard.gnss.learner import SETTLED_S, Resumed
+from orthonav.onboard.gnss.biases import SETTLED_S, Biases, Resumed, at_start, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,

@@ -11,8 +11,7 @@ from typing import Any
 
 from orthonav.core.errors import OutputError
 from orthonav.onboard.ros2.arguments import RosArguments
-from orthonav.onboard.ros2.graph import Graph, Handler, Writer
-from orthonav.onboard.ros2.messages import Definitions
+from orthonav.onboard.ros2.graph import Definitions, Graph, Handler, Writer
 from orthonav.onboard.ros2.node import Node
 
 log = logging.getLogger(__name__)
