@@ -1,9 +1,9 @@
 """This checkout against another one: accuracy, confidence, time and memory of the same views.
 
 `python -m benchmarks.against OTHER [--views N] [--rounds N] [--only TEXT ..] [--work DIR]`. OTHER
-is a checkout of any commit that has `orthonav localize`. Both localize the same flight folders on
-the same maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes
-that they write. Imagery beside the checkout that is absent is left out.
+is a checkout of any commit that has `orthonav localize`. Both localize the same flights on the same
+maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes that
+they write. Imagery beside the checkout that is absent is left out.
 """
 
 import argparse
@@ -174,8 +174,8 @@ def measure(options: argparse.Namespace) -> Section:
         say(" | ".join(rows[-1]))
     commit = git("-C", str(options.other), "describe", "--always", "--dirty")
     notes = (
-        f"other: commit {commit}; CPU ms: processor time of `orthonav localize` a view, less that "
-        f"of a blank one, least of {options.rounds} rounds in turn; ms, p99: on the clock, by the "
+        f"other: commit {commit}; CPU ms: processor time of a view, less that of a blank one, "
+        f"least of {options.rounds} rounds in turn; ms, p99: on the clock, by the "
         "fixes; peak: of the process; height known to 10 %",
         f"correct: within 35 m or 10 px; accepted: of these, confidence of {CONFIDENT:g} or more",
     )

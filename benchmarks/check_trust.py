@@ -36,8 +36,7 @@ from benchmarks.scenes import (
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
-from orthonav.ground.changes.record import CellGrid
-from orthonav.ground.check.recalibrate import LEARNT, PLAIN, Recalibration, expit, logit
+from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
 from orthonav.ground.check.verdict import GO_LOW, NARROW_PX
@@ -163,7 +162,7 @@ def _measured(task: tuple[Pair, int, bool, int, argparse.Namespace]) -> dict[str
         recalibration=PLAIN,
     )
     cells = check_map(asked)[0].cells
-    grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, *cells.probability.shape)
+    grid = cells.grid
     found = Outcome(place_of(pair), pair.map, width_px, prior)
     off_m, expected_m, frame = [], [], localizer.sheet.frame
     alone = SingleViews(localizer)
@@ -204,7 +203,7 @@ def fitted(found: Sequence[Outcome]) -> Recalibration:
             chance = np.where(each.right, predicted, 1 - predicted)
             total -= float(np.log(np.clip(chance, 1e-6, 1.0)).sum()) / counts[each.scene]
         off = values - np.array(astuple(PLAIN)[:4])
-        return total / len(scenes) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
+        return total / max(len(scenes), 1) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
 
     values = minimize(loss, np.array(astuple(PLAIN)[:4]), method="Nelder-Mead").x
     by = _recalibration(np.round(values, 2))

@@ -1,8 +1,7 @@
 """Long flights followed over a map of another date: wind, drift, biases, clouds, kidnapping.
 
-`python -m benchmarks.long_flights [--flights 20] [--km 50] [--quick] [--only N ..] [--work DIR]`
-flies over a generated area and follows every flight with `Tracker` from no prior. Rerun to resume;
-with
+`python -m benchmarks.long_flights [--flights 20] [--km 50] [--quick] [--only N ..]` flies over a
+generated area and follows every flight with `Tracker` from no prior. Rerun to resume; with
 `orthonav localize MAP FLIGHT --track --prior none --out fixes.jsonl` a flight is replayed.
 """
 

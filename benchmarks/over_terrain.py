@@ -1,8 +1,7 @@
 """Views over hills, localized on level ground and on the terrain of the map, right or wrong.
 
 `python -m benchmarks.over_terrain [--part slopes wrong oblique] [--views 30] [--areas SEED ..]`
-drapes imagery of another date over generated hills, renders perspective views of it, and localizes
-them.
+drapes imagery of another date over generated hills, renders perspective views, and localizes them.
 `--mirrored` shows what views of no place of the map are taken for.
 """
 
@@ -55,9 +54,8 @@ Locate = Callable[[View], Fix | NoFix]
 class Row:
     """Imagery, views and terrain of a row.
 
-    `pair`: None for generated imagery. `tilt_deg`: angle off nadir, forwards. `measured`: the
-    height above ground is measured, else heights above sea and take-off are. `wrong`: one of
-    `WRONG`.
+    `pair`: None for generated imagery. `tilt_deg`: angle off nadir, forwards. `measured`: height
+    above ground is measured, else heights above sea and take-off are. `wrong`: one of `WRONG`.
     """
 
     part: str

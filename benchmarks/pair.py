@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
@@ -128,12 +127,7 @@ class FakeAutopilot:
     def __enter__(self) -> "FakeAutopilot":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
 
@@ -203,12 +197,7 @@ class Fly:
     def __enter__(self) -> "Fly":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             self.kill()
 
@@ -287,27 +276,23 @@ class Arrivals:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """What the program itself wrote: ages (ms) of all views and of those that were sent, its last
-    line of health, and for how many lines each reason of health was there."""
+    """What the program itself wrote: ages (ms) of all views, its last line of health, and for how
+    many lines each reason of health was there."""
 
     ages_ms: Array
-    sent_ages_ms: Array
     health: dict[str, Any]
     reasons: Counter[str]
 
     @classmethod
     def read(cls, path: Path) -> "Lines":
         """The file of `--jsonl`; a line that was cut off by a kill is left out."""
-        ages, sent, health = [], [], {}
-        reasons: Counter[str] = Counter()
+        ages, health, reasons = [], {}, Counter[str]()
         for text in path.read_text("ascii").splitlines() if path.is_file() else ():
             with contextlib.suppress(ValueError):
                 line = json.loads(text)
                 if "health" in line:
                     health = line
                     reasons.update(line["reasons"])
-                    continue
-                ages.append(line["age_ms"])
-                if line["sent"]:
-                    sent.append(line["age_ms"])
-        return cls(np.array(ages, np.float64), np.array(sent, np.float64), health, reasons)
+                else:
+                    ages.append(line["age_ms"])
+        return cls(np.array(ages, np.float64), health, reasons)

@@ -7,56 +7,42 @@
 import argparse
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, number, percent, quantiles, run, say
-from benchmarks.scenes import (
-    DATA,
-    FAR_M,
-    SCENES,
-    USUAL,
-    agl_of,
-    flight,
-    gsd_of,
-    is_there,
-    localizer_of,
-    ortho,
-)
+from benchmarks.scenes import DATA, FAR_M, SCENES, Pair, localizer_of, simulated_views
 from benchmarks.verdicts import Verdict, placed
 from orthonav.core.records import CONFIDENT
 from orthonav.onboard.run import SingleViews
 
 NAME = "real_imagery"
-NAIP = SCENES["naip"]
-NAIP_MAP = NAIP.file("20090818")
-NAIP_VIEWS = tuple(NAIP.file(date) for date in NAIP.dates[1:])
-SZADA = tuple(SCENES[f"szada_{n}"] for n in ("1", "5", "7", "mosaic"))
 GROUPS = ("naip", "airchange", "taichung", "arroio")
 HEADER = (
-    *("map", "views", "n", "near", "35 m", "median m", "correct and accepted"),
+    *("map > views", "n", "near", "35 m", "median m", "correct and accepted"),
     *("false of accepted", "ECE", "NEES", "ms", "p99 ms"),
 )
 
 
 @dataclass(frozen=True)
 class Row:
-    """A map and what flies over it: an orthophoto or a recorded flight, below `DATA`."""
+    """A map and what flies over it: an orthophoto of another date, or a recorded flight."""
 
     group: str
-    map: str
-    views: str
+    pair: Pair
     near_m: float = 15.0
     heading_known: bool = True
 
 
 def rows() -> list[Row]:
     """All rows, those of one map together."""
-    made = [Row("naip", NAIP_MAP, v, heading_known=k) for k in (True, False) for v in NAIP_VIEWS]
-    made += [Row("airchange", each.file(each.dates[0]), each.file(each.dates[1])) for each in SZADA]
-    made.append(Row("taichung", "taichung_drone/map.tif", "taichung_drone", 35))
+    naip, szada = SCENES["naip"], [SCENES[f"szada_{n}"] for n in ("1", "5", "7", "mosaic")]
+    pairs = [naip.pair(naip.dates[0], date) for date in naip.dates[1:]]
+    made = [Row("naip", pair, heading_known=known) for known in (True, False) for pair in pairs]
+    made += [Row("airchange", each.pair(*each.dates)) for each in szada]
+    taichung = Pair("taichung", "taichung_drone/map.tif", "taichung_drone", 0.2, 0.0)
     arroio = (f"arroio_maps/{month}.tif" for month in ("2014-01", "2014-03"))
-    return [*made, *(Row("arroio", name, "arroio_drone_1", 25) for name in arroio)]
+    flown = [Pair("arroio", name, "arroio_drone_1", 0.243, 0.0) for name in arroio]
+    return [*made, Row("taichung", taichung, 35.0), *(Row("arroio", each, 25.0) for each in flown)]
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -67,12 +53,15 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace) -> Section:
     section, cells = Section("Real imagery"), []
+    count = 6 if options.quick else options.views
     for row in rows():
-        if row.group in options.only and is_there(row.map, row.views):
-            localizer = localizer_of(row.map, options.work)
+        if row.group in options.only and row.pair.is_there:
+            localizer = localizer_of(row.pair.map, options.work)
             locator = SingleViews(localizer, use_prior=False, heading_known=row.heading_known)
-            folder = _flight(row.views, options)
-            verdict = placed(locator, views_in(folder), localizer.sheet.frame)
+            views = views_in(DATA / row.pair.views)
+            if row.pair.views.endswith(".tif"):
+                views = simulated_views(row.pair, options.work, views=count, seed=options.seed)
+            verdict = placed(locator, views, localizer.sheet.frame)
             cells.append(_cells(row, verdict))
             say("  ".join(cells[-1]))
     notes = (
@@ -87,21 +76,10 @@ def measure(options: argparse.Namespace) -> Section:
     return section
 
 
-def _flight(views: str, options: argparse.Namespace) -> Path:
-    """A recorded flight as it is, or one over an orthophoto."""
-    if not views.endswith(".tif"):
-        return DATA / views
-    path = ortho(views, options.work)
-    agl_m, count = agl_of(256, gsd_of(path)), 6 if options.quick else options.views
-    work = options.work
-    return flight(path, work, views=count, errors=USUAL, seed=options.seed, agl_m=agl_m)
-
-
 def _cells(row: Row, verdict: Verdict) -> list[str]:
     heading = "" if row.heading_known else ", heading unknown"
     return [
-        Path(row.map).stem if row.group != "taichung" else "taichung",
-        Path(row.views).stem + heading,
+        row.pair.name + heading,
         str(len(verdict.times_ms)),
         percent(float(verdict.within(row.near_m).mean()), 1),
         percent(float(verdict.within(FAR_M).mean()), 1),

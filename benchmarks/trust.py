@@ -7,20 +7,38 @@ all of these views. About an hour on two cores; rerun to resume.
 """
 
 import argparse
+import math
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import rasterio
 from numpy.typing import NDArray
+from rasterio.warp import transform_bounds
 from scipy.optimize import minimize
 from scipy.special import expit
 
+from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, percent, resumed, run, say
-from benchmarks.scenes import chosen, leave_one_out_pairs, map_of, ortho
-from benchmarks.trust_views import views_of
+from benchmarks.scenes import (
+    USUAL,
+    Pair,
+    agl_of,
+    chosen,
+    flight,
+    gsd_of,
+    leave_one_out_pairs,
+    map_of,
+    ortho,
+    place_of,
+)
+from benchmarks.scenes import far_m as far_m_of
+from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,
@@ -29,9 +47,212 @@ from orthonav.core.localize.confidence import (
     RegisteredConfidence,
     features_of,
 )
-from orthonav.core.records import CONFIDENT
+from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
 from orthonav.ground.build.fit import LEAST
 from orthonav.ground.evaluate.calibration import calibrate
+
+Task = tuple[Pair, Sequence[Pair], int, int, Path]
+"""Pair, all pairs, number of views, seed, and folder of work."""
+TRACK_YAW_STD_DEG, TRACK_AGL_STD = 2.0, 0.03
+"""Errors of heading and height, and what a track knows of them."""
+FAR_FROM_PRIOR_PX = 20.0
+"""A view with a prior is right within this: chance finds places within 35 m of it too. Maps and
+views of Tours are up to 17 px apart."""
+METRES_PER_DEG = 111_320.0
+BESIDE_SHARE = 0.9
+"""Views beside the map are farther from its border than this share of their width. One that reaches
+onto it all the same, and is placed where it was taken, is right."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Views of one kind.
+
+    - `kind`: `found`, or those that are not on the map or not there: `mirrored`, `other scene`,
+      `beside`, `other prior` (that of another view).
+    - `width_px`: shorter side of the view on the ground, pixels of the map.
+    - `share`: number of views, as a share of the requested one.
+    - `heading_known`: whether the reported heading is used; `prior_px`: standard deviation of a
+      prior position, pixels of the map, None without.
+    - `tracked`: heading and height are known as a track knows them.
+    """
+
+    kind: str
+    width_px: int
+    share: float
+    heading_known: bool = True
+    prior_px: float | None = None
+    tracked: bool = False
+
+
+CASES = (
+    Case("found", 256, 1.0),
+    Case("found", 128, 1.0),
+    Case("found", 180, 0.5),
+    Case("found", 360, 0.2),
+    Case("found", 256, 0.4, heading_known=False),
+    Case("found", 128, 0.3, heading_known=False),
+    Case("found", 128, 0.4, prior_px=40.0),
+    Case("found", 90, 0.3, prior_px=40.0),
+    Case("found", 64, 0.3, prior_px=40.0),
+    Case("mirrored", 256, 0.4),
+    Case("mirrored", 128, 0.4),
+    Case("other scene", 256, 0.4),
+    Case("other scene", 128, 0.4),
+    Case("beside", 256, 1.0),
+    Case("beside", 128, 1.0),
+    Case("mirrored", 128, 0.4, prior_px=40.0),
+    Case("mirrored", 64, 0.3, prior_px=40.0),
+    Case("other prior", 128, 0.4, prior_px=40.0),
+    Case("other prior", 64, 0.3, prior_px=40.0),
+    Case("found", 256, 0.4, prior_px=12.0, tracked=True),
+    Case("found", 128, 0.4, prior_px=12.0, tracked=True),
+    Case("mirrored", 256, 0.4, prior_px=12.0, tracked=True),
+    Case("mirrored", 128, 0.4, prior_px=12.0, tracked=True),
+    Case("other prior", 256, 0.4, prior_px=12.0, tracked=True),
+    Case("other prior", 128, 0.4, prior_px=12.0, tracked=True),
+)
+
+
+def views_of(task: Task) -> list[dict[str, Any]]:
+    """Rows of all views of a pair."""
+    cv2.setNumThreads(1)
+    return list(_rows(*task))
+
+
+def _rows(
+    pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
+) -> Iterator[dict[str, Any]]:
+    past, flown = ortho(pair.map, work), ortho(pair.views, work)
+    whole = _registration(map_of(past, work))
+    with rasterio.open(past) as source:
+        west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
+    middle = (west + east) / 2
+    half = _registration(map_of(past, work, (west, south, middle, north)))
+    other_scenes = [each for each in others if place_of(each) != place_of(pair)]
+    for number, case in enumerate(CASES):
+        count = max(1, round(case.share * views))
+        over, gsd_m = flown, None
+        if case.kind == "other scene":
+            over = ortho(other_scenes[(seed + number) % len(other_scenes)].views, work)
+            gsd_m = gsd_of(over)
+        folder = _flight(over, case, count, seed + number, work)
+        localizer = half if case.kind == "beside" else whole
+        for name, view, truth in _flown_for(case, folder, gsd_of(over), middle):
+            if gsd_m is not None:
+                scale = localizer.grid.gsd_m / gsd_m
+                view = replace(view, telemetry=_scaled(view.telemetry, scale))
+            row = _placed(localizer, case, view, truth)
+            if row is not None:
+                about = {"scene": place_of(pair), "pair": pair.name, **asdict(case), "frame": name}
+                if case.kind == "found" and not is_covered(localizer, truth, case.width_px):
+                    about["kind"] = "beside"
+                yield {**about, **row}
+
+
+def _flown_for(
+    case: Case, folder: Path, gsd_m: float, middle_deg: float
+) -> Iterator[tuple[str, View, tuple[float, float]]]:
+    """The views of a flight as a case needs them: mirrored, or some left out."""
+    flown = [(each.frame, each.view, each.truth_latlon_deg) for each in views_in(folder)]
+    if case.kind == "other prior":
+        yield from _with_other_priors(flown, case, gsd_m)
+        return
+    for name, view, truth in flown:
+        if case.kind == "beside":
+            span_deg = case.width_px * gsd_m / METRES_PER_DEG
+            if truth[1] < middle_deg + BESIDE_SHARE * span_deg / math.cos(math.radians(truth[0])):
+                continue
+        if case.kind == "mirrored":
+            yield name, replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1])), truth
+        else:
+            yield name, view, truth
+
+
+def _placed(
+    localizer: RegistrationLocalizer, case: Case, view: View, truth: tuple[float, float]
+) -> dict[str, Any] | None:
+    """Evidence, error and verdict of a view; None where it was refused."""
+    prior = None if case.prior_px is None else view.telemetry.prior
+    search = localizer.search(view, prior, case.heading_known)
+    found = search if isinstance(search, NoFix) else search.run()
+    if isinstance(search, NoFix) or isinstance(found, NoFix):
+        return None
+    gsd_m = localizer.grid.gsd_m
+    assert localizer.confidence is not None
+    fix, frame = localizer.fix(search, found, view.telemetry), localizer.sheet.frame
+    off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
+    error_m = float(np.hypot(*off_m))
+    far_m = far_m_of(gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
+    far_m = max(far_m, RADIUS_SHARE * fix.agl_m)
+    right = case.kind in ("found", "beside") and error_m <= far_m
+    return {
+        "evidence": found.scores,
+        "chances": asdict(localizer.confidence.chances),
+        "error_px": error_m / gsd_m,
+        "nees": float(off_m @ np.linalg.solve(fix.cov_en_m2, off_m)),
+        "right": right,
+    }
+
+
+def is_covered(
+    localizer: RegistrationLocalizer, truth: tuple[float, float], width_px: float
+) -> bool:
+    """Whether the map has imagery at the middle of a view and half way to its corners."""
+    grid = localizer.grid
+    east, north = localizer.sheet.frame.en_from_latlon(*truth)
+    col, row = (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
+    steps = np.array([-0.25, 0.0, 0.25]) * width_px
+    inside = [
+        localizer.pyramid.read(0, int(row + dy), int(col + dx), 1, 1)[1].all()
+        for dy in steps
+        for dx in steps
+    ]
+    return all(inside)
+
+
+def _with_other_priors(
+    views: Sequence[tuple[str, View, tuple[float, float]]], case: Case, gsd_m: float
+) -> Iterator[tuple[str, View, tuple[float, float]]]:
+    """Views with the prior of the view before, where that is far from their own place."""
+    assert case.prior_px is not None
+    least_m = (2 * PRIOR_SIGMAS * case.prior_px + case.width_px) * gsd_m
+    for number, (name, view, truth) in enumerate(views):
+        prior = views[number - 1][1].telemetry.prior
+        assert prior is not None
+        north_m = (prior.lat_deg - truth[0]) * METRES_PER_DEG
+        east_m = (prior.lon_deg - truth[1]) * METRES_PER_DEG * math.cos(math.radians(truth[0]))
+        if math.hypot(north_m, east_m) > least_m:
+            yield name, replace(view, telemetry=replace(view.telemetry, prior=prior)), truth
+
+
+def _scaled(telemetry: Telemetry, scale: float) -> Telemetry:
+    """Telemetry at a height so much greater, for imagery of another ground resolution."""
+    std_m = telemetry.agl_std_m
+    return replace(
+        telemetry,
+        agl_m=telemetry.agl_m * scale,
+        agl_std_m=None if std_m is None else std_m * scale,
+        prior=None,
+    )
+
+
+def _registration(map_path: Path) -> RegistrationLocalizer:
+    found = Localizer(open_map(map_path)).registration
+    assert found is not None
+    return found
+
+
+def _flight(path: Path, case: Case, count: int, seed: int, work: Path) -> Path:
+    gsd_m = gsd_of(path)
+    errors = replace(USUAL, prior_std_m=None if case.prior_px is None else case.prior_px * gsd_m)
+    if case.tracked:
+        errors = replace(errors, yaw_std_deg=TRACK_YAW_STD_DEG, agl_std=TRACK_AGL_STD)
+    agl_m = agl_of(case.width_px, gsd_m)
+    return flight(path, work, views=count, errors=errors, seed=seed, agl_m=agl_m)
+
 
 NAME = "trust"
 RIDGE = 1e-5
@@ -68,29 +289,23 @@ class Judged:
             ]
         )
 
-    def fitted(self, train: NDArray[np.bool_], without: int | None = None) -> RegisteredConfidence:
-        """Fitted to the rows `train`, with one of the features left out or none."""
-        used = [i for i in range(len(FEATURES)) if i != without]
-        return fit_judge(self.features[train], self.right[train], used)
+    def fitted(self, train: NDArray[np.bool_]) -> RegisteredConfidence:
+        """Fitted to the rows `train`."""
+        return fit_judge(self.features[train], self.right[train])
 
-    def left_out(self, without: int | None = None) -> Array:
+    def left_out(self) -> Array:
         """Confidence (N,) of each row by a fit to all other scenes."""
         scenes = np.array([each["scene"] for each in self.rows])
         found = np.zeros(len(self.rows))
         for scene in np.unique(scenes):
             inside = scenes == scene
-            judge = self.fitted(~inside, without)
+            judge = self.fitted(~inside)
             found[inside] = [judge.of(each) for each in self.features[inside]]
         return found
 
 
-def fit_judge(
-    features: Array, right: NDArray[np.bool_], used: Sequence[int]
-) -> RegisteredConfidence:
-    """Biases and weights, none negative, under which the outcome of views (N, F) is likeliest.
-
-    Features that are not among `used` have no weight.
-    """
+def fit_judge(features: Array, right: NDArray[np.bool_]) -> RegisteredConfidence:
+    """Biases and weights, none negative, under which the outcome of views (N, F) is likeliest."""
     mean, std = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
     scaled, count = (features - mean) / std, len(FEATURES)
 
@@ -110,9 +325,7 @@ def fit_judge(
         return float(value + RIDGE * (weights**2).sum()), gradient
 
     start = np.full(2 + count, 0.3)
-    start[2:][[i for i in range(count) if i not in used]] = 0.0
-    most = [None if i in used else 0.0 for i in range(count)]
-    bounds = [(None, None)] * 2 + [(0.0, each) for each in most]
+    bounds: Any = [(None, None)] * 2 + [(0.0, None)] * count
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[2:] / std
     biases = (
@@ -147,7 +360,7 @@ def measure(options: argparse.Namespace) -> Section:
         judge = judged.fitted(np.ones(len(rows), np.bool_))
         print("USUAL_BIASES =", tuple(round(each, 2) for each in judge.biases))
         print("USUAL_WEIGHTS =", tuple(round(each, 2) for each in judge.weights))
-    tables = [_scenes_table(judged), _features_table(judged), _cases_table(judged)]
+    tables = [_scenes_table(judged), _cases_table(judged)]
     return Section(f"Trust: {len(rows)} views, seed {options.seed}", tables)
 
 
@@ -201,23 +414,6 @@ def _scenes_table(judged: Judged) -> Table:
         "these scenes",
     )
     return Table("Confidence on scenes left out", header, rows, notes)
-
-
-def _features_table(judged: Judged) -> Table:
-    """What each kind of evidence brings: all but one, on scenes left out."""
-    rows = []
-    for without in (None, *range(len(FEATURES))):
-        name = "all" if without is None else f"without {FEATURES[without]}"
-        confidence = judged.left_out(without)
-        clipped = np.clip(confidence, 1e-9, 1 - 1e-9)
-        loss = -np.mean(np.log(np.where(judged.right, clipped, 1 - clipped)))
-        everything = np.ones(len(judged.rows), np.bool_)
-        rows.append([name, *_verdict(judged, confidence, everything), f"{loss:.4f}"])
-    header = (
-        *("evidence", "accepted of correct", "wrong of accepted", "calibration error"),
-        "log loss",
-    )
-    return Table("What each kind of evidence brings", header, rows)
 
 
 def _cases_table(judged: Judged) -> Table:

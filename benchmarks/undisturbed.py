@@ -1,9 +1,9 @@
 """How many views of undisturbed flights become messages, over real imagery of two dates.
 
 `python -m benchmarks.undisturbed [--seeds N] [--jobs N] [--seconds S]` flies as the fault suite
-does, without a fault, over the scenes beside the checkout whose ground resolution is 1 to 2 m. A
-view over ground that has changed shows the map no more, and must not become a message: so every
-view is also compared with the map at its true pose.
+does, without a fault, over real scenes whose ground resolution is 1 to 2 m. A view over
+ground that has changed shows the map no more, and must not become a message: so every view is also
+compared with the map at its true pose.
 """
 
 import argparse
@@ -86,8 +86,7 @@ def _is_shown(flight: FaultFlight, at_s: float, rng: np.random.Generator) -> boo
     levels = prepared.levels
     template = prepared.templates.at(levels.final, levels.recipe(levels.final))
     placed = Refiner(template, registration.reference).place(pose, 2)
-    found = sharpness(template, registration.reference, placed.pose)
-    return bool(found.ratio >= SHOWN_RATIO)
+    return bool(sharpness(template, registration.reference, placed.pose).ratio >= SHOWN_RATIO)
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -30,7 +30,7 @@ from benchmarks.scenes import (
     ortho,
     root_agl_of,
 )
-from benchmarks.trust_views import is_covered
+from benchmarks.trust import is_covered
 from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer

@@ -18,7 +18,13 @@ from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
 from orthonav.core.register.channels import FINE, channels_of
-from orthonav.ground.check.ageing import MODEL, PATCH_PX, PersistenceModel, features, terms
+from orthonav.ground.check.ageing import (
+    MODEL,
+    PATCH_PX,
+    PersistenceModel,
+    features,
+    terms,
+)
 
 Array = NDArray[Any]
 SEEDS = (901, 902, 903, 904)

@@ -91,8 +91,8 @@ def shorten(flight, views):
 def undrawn(monkeypatch):
     """Reports have no pictures, which take longest."""
     nothing = Drawing(b"", "", (1.0, 1.0))
-    for name in ("plots.draw_axes", "calibration_plots.draw_axes", "calibration_plots.draw_figure"):
-        monkeypatch.setattr(f"orthonav.ground.evaluate.{name}", lambda *_: nothing)
+    for name in ("draw_axes", "draw_figure"):
+        monkeypatch.setattr(f"orthonav.ground.evaluate.plots.{name}", lambda *_: nothing)
 
 
 @pytest.fixture(scope="module")

@@ -9,29 +9,12 @@ from orthonav.core.errors import FlightError, RouteError
 from orthonav.core.flight import folder as folders
 from orthonav.core.flight.fixes import MAX_LINE_BYTES, read_results
 from orthonav.core.flight.folder import read_truth
-from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows, bounded_lines
+from orthonav.core.tables import TableError, TableRows
 from orthonav.ground.planning.route import read_route
 from orthonav.ground.recordings.logs import read_table
 
 TRUTH = "frame,lat_deg,lon_deg\n"
 TABLE = "time_s,pitch_deg,roll_deg\n"
-
-
-def test_rows_are_those_of_a_csv():
-    rows = TableRows(io.StringIO('a, b\n1, 2\n\n"x\ny",3,4\n5\n'))
-    assert rows.columns == ["a", "b"]
-    assert [(row["a"], row["b"], rows.line) for row in rows] == [
-        ("1", "2", 2),
-        ("x\ny", "3", 5),
-        ("5", None, 6),
-    ]
-
-
-def test_lines_are_bounded_exactly():
-    longest = "x" * (MAX_LINE_CHARS - 1) + "\n"
-    assert list(bounded_lines(io.StringIO(longest * 2))) == [longest] * 2
-    with pytest.raises(TableError, match="line 2 is longer than 65,536 characters"):
-        list(bounded_lines(io.StringIO(longest + "x" + longest)))
 
 
 def test_rows_are_bounded():

@@ -105,8 +105,3 @@ def test_a_recipe_survives_json(variant):
 def test_a_recipe_that_does_not_fit_is_refused(recipe):
     with pytest.raises(VariantError):
         variant_from_recipe(TABLE, recipe)
-
-
-def test_what_is_not_in_the_table_has_no_recipe():
-    with pytest.raises(VariantError, match="not in the table"):
-        variant_recipe({}, Knobs())

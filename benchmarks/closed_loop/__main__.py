@@ -3,14 +3,14 @@
 import argparse
 import sys
 
-from benchmarks.closed_loop import replays, report
+from benchmarks.closed_loop import loop, replays
 from benchmarks.closed_loop.inertial import FILTERS
 from benchmarks.closed_loop.physics import VEHICLES
 from benchmarks.record import Section, run
 
 
 def measure(options: argparse.Namespace) -> Section:
-    parts = {"replays": replays.measure, "fly": report.measure}
+    parts = {"replays": replays.measure, "fly": loop.measure}
     section = parts[options.part](options)
     if not section.tables:
         print("the recorded flights beside the checkout (closed_loop) are absent", file=sys.stderr)
@@ -26,12 +26,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     again.add_argument("--methods", nargs="+", default=replays.METHODS, choices=replays.METHODS)
     again.add_argument("--views", type=int, help="only the first so many views without GNSS")
     again.add_argument("--undisturbed", action="store_true", help="end before any disturbance")
-    loop = parser.add_argument_group("fly: simulated flights on what is sent")
-    loop.add_argument("--vehicle", choices=VEHICLES, default="plane")
-    loop.add_argument("--filter", choices=FILTERS, default="px4", help="instruments and tuning")
-    loop.add_argument("--send", choices=("position", "position+velocity"), default="position")
-    loop.add_argument("--minutes", type=float, default=10.0, help="without GNSS (default 10)")
-    loop.add_argument("--seed", type=int, nargs="+", default=[1], help="one flight each")
+    flown = parser.add_argument_group("fly: simulated flights on what is sent")
+    flown.add_argument("--vehicle", choices=VEHICLES, default="plane")
+    flown.add_argument("--filter", choices=FILTERS, default="px4", help="instruments and tuning")
+    flown.add_argument("--send", choices=("position", "position+velocity"), default="position")
+    flown.add_argument("--minutes", type=float, default=10.0, help="without GNSS (default 10)")
+    flown.add_argument("--seed", type=int, nargs="+", default=[1], help="one flight each")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """A flight in the loop: true motion, instruments, filter, guidance, camera, orthonav, and back."""
 
+import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,8 +24,9 @@ from benchmarks.closed_loop.physics import (
     euler_rad,
     increments,
 )
-from benchmarks.closed_loop.recorded import CAMERA, Demo, Grey
-from benchmarks.closed_loop.replays import Rule, is_wrong
+from benchmarks.closed_loop.replays import CAMERA, Demo, Grey, Rule, is_wrong, plain, stated
+from benchmarks.fault_flights import FAR_M, FAR_STD
+from benchmarks.record import Section, Table, number, quantiles, say
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
@@ -274,16 +276,16 @@ def fly(
     if scenario.send is not None and demo is not None:
         sight = Sight(demo, scenario, partial(rule, autopilot), seed)
     flown, route = Flown(scenario), Route()
-    for number in range(round(scenario.seconds / STEP_S)):
-        time_s = number * STEP_S
+    for step in range(round(scenario.seconds / STEP_S)):
+        time_s = step * STEP_S
         gnss = time_s < scenario.gnss_s
-        if number % 2 == 0:
+        if step % 2 == 0:
             estimate = estimator.output()
             carrot_ne = route.carrot_ne(estimate.position[:2])
             if estimator.is_alone and not aircraft.has_airspeed:
                 carrot_ne = None  # the failsafe of a vehicle that does not know its velocity
             aircraft.steer(estimate, carrot_ne, AGL_M)
-        if number % VIEW_STEPS == 0:
+        if step % VIEW_STEPS == 0:
             truth = aircraft.motion
             claimed_m = math.sqrt(float(np.diag(estimator.covariance)[6:8].mean()))
             flown.samples.append(Sample(time_s, truth, estimate, claimed_m))
@@ -292,7 +294,7 @@ def fly(
                 flown.views.append(located)
                 if sent is not None and not gnss:
                     _give(estimator, sight.frame, sent, scenario.send == "position+velocity")
-        _sense(number, estimator, instruments, aircraft, wind, gnss=gnss)
+        _sense(step, estimator, instruments, aircraft, wind, gnss=gnss)
         before = aircraft.motion
         aircraft.step(wind.next())
         estimator.feel(instruments.imu(increments(before, aircraft.motion)))
@@ -353,7 +355,7 @@ def _give(
 
 
 def _sense(
-    number: int,
+    step: int,
     estimator: Filter,
     instruments: Instruments,
     aircraft: Vehicle,
@@ -362,7 +364,7 @@ def _sense(
     gnss: bool,
 ) -> None:
     """Measure what is due, at 10 Hz and GNSS at 5 Hz."""
-    if number % 5:
+    if step % 5:
         return
     motion = aircraft.motion
     height_m, heading = instruments.height_m(motion, 5 * STEP_S), instruments.heading_rad(motion)
@@ -372,7 +374,7 @@ def _sense(
     if aircraft.has_airspeed:
         airspeed_mps = instruments.airspeed_mps(motion, wind)
         estimator.measure(lambda: estimator.fuse_air(airspeed_mps))
-    if gnss and number % 10 == 0:
+    if gnss and step % 10 == 0:
         place, velocity = instruments.gnss(motion)
         tuning = estimator.tuning
         estimator.measure(lambda: estimator.fuse_position(place, tuning.gnss_m))
@@ -386,3 +388,96 @@ def spans(flown: Flown) -> tuple[Sequence[Sample], Sequence[Located]]:
     begin_s = 30.0 if gnss_s >= seconds else gnss_s + SETTLING_S[gnss_s > 0]
     samples = [each for each in flown.samples if each.time_s >= begin_s]
     return samples, [each for each in flown.views if each.time_s >= begin_s]
+
+
+GNSS_S, BEFORE_S, AFTER_S = 60.0, 60.0, 60.0
+"""With GNSS, then without it before a disturbance, and after it."""
+SCENARIOS = ("gnss", "nothing", "fixes", "start", "shifted", "mirrored", "frozen")
+LASTS_S = {"shifted": 40.0, "mirrored": 40.0, "frozen": 10.0}
+HEADER = (
+    *("scenario", "position median m", "95 %", "max", "position NEES", "velocity m/s", "95 %"),
+    *("tilt deg", "fixes median m", "95 %", "NEES", "tilt correlation", "slope", "sent", "false"),
+)
+
+
+def scenario(name: str, minutes: float, send: str) -> Scenario:
+    """A scenario of `SCENARIOS`; `minutes` without GNSS, unless it has a disturbance."""
+    alone_s = 60 * minutes
+    whole = Scenario(name, GNSS_S + alone_s, GNSS_S, send)
+    if name == "gnss":
+        return replace(whole, gnss_s=whole.seconds, send=None)
+    if name == "nothing":
+        return replace(whole, send=None)
+    if name == "start":
+        return replace(whole, seconds=min(alone_s, 240.0), gnss_s=0.0)
+    if name == "fixes":
+        return whole
+    lasts_s = LASTS_S[name]
+    begin_s = GNSS_S + BEFORE_S
+    return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, send, name, begin_s, lasts_s)
+
+
+def by_tilt(views: Sequence[Located]) -> list[str]:
+    """Correlations, ahead and right, of the errors of fixes with those that the error of the
+    stated tilt makes, and the slopes."""
+    if len(views) < 10:
+        return ["-", "-"]
+    errors = np.array([view.error_m for view in views]).T
+    tilts = np.array([view.tilt_off_m for view in views]).T
+    spreads = [np.cov(tilt, error) for tilt, error in zip(tilts, errors, strict=True)]
+    alike = [each[0, 1] / math.sqrt(each[0, 0] * each[1, 1]) for each in spreads]
+    slopes = [each[0, 1] / each[0, 0] for each in spreads]
+    return [", ".join(f"{value:.2f}" for value in values) for values in (alike, slopes)]
+
+
+def cells(flown: Flown) -> list[str]:
+    samples, views = spans(flown)
+    off = np.array([each.estimate.position - each.truth.position for each in samples])
+    far_m = np.hypot(*off[:, :2].T)
+    claimed = np.array([each.claimed_m for each in samples])
+    mps = [np.hypot(*(each.estimate.velocity - each.truth.velocity)[:2]) for each in samples]
+    tilts = np.degrees([tilt_off_rad(each.truth, each.estimate) for each in samples])
+    sent = [view for view in views if view.sent]
+    errors = np.array([np.hypot(*view.error_m) for view in sent])
+    return [
+        flown.scenario.name,
+        *quantiles(far_m, 50, 95),
+        number(float(far_m.max())),
+        number(float(np.mean((far_m / claimed) ** 2))),
+        *quantiles(mps, 50, 95),
+        number(math.sqrt(float((tilts**2).sum(1).mean()))),
+        *quantiles(errors, 50, 95),
+        number(float(np.mean([view.nees for view in sent]))) if sent else "-",
+        *by_tilt(sent),
+        f"{len(sent) / len(views):.0%}" if views else "-",
+        str(sum(view.is_wrong for view in sent)) if views else "-",
+    ]
+
+
+def measure(options: argparse.Namespace) -> Section:
+    """All scenarios of a vehicle with a filter, or only some, each with each seed."""
+    demo, rows = Demo.made(options.work), []
+    for seed in options.seed:
+        for name in options.only or SCENARIOS:
+            flown = fly(
+                scenario(name, options.minutes, options.send),
+                demo,
+                vehicle=options.vehicle,
+                autopilot=options.filter,
+                seed=seed,
+                rule=plain if options.plain else stated,
+            )
+            rows.append(cells(flown))
+            if len(options.seed) > 1:
+                rows[-1][0] += f", seed {seed}"
+            say(f"{' | '.join(rows[-1])} {flown.withheld}")
+    notes = (
+        f"{options.minutes:g} minutes without GNSS after {GNSS_S:g} s with it; disturbances begin "
+        f"{BEFORE_S:g} s later; judged from 5 s after GNSS was cut on; nothing: no fixes",
+        "position, velocity, tilt: errors of the autopilot, tilt as RMS; NEES: mean, 2 is right; "
+        "fixes: those sent; tilt correlation, slope: of the errors of fixes with height times the "
+        "tangent of the autopilot's error of tilt, ahead and right; false: sent, and more than "
+        f"{FAR_M:g} m and {FAR_STD:g} stated deviations off",
+    )
+    title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"
+    return Section("Flights in the loop", [Table(title, HEADER, rows, notes)])

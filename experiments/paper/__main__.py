@@ -9,13 +9,9 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import active_children, get_context
+from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
@@ -26,7 +22,6 @@ from experiments.paper.methods import (
     GPU_SCENES,
     SETTINGS,
     TABLE_1,
-    Method,
     Setting,
     dry,
     flown,
@@ -40,7 +35,6 @@ from orthonav.core.tiles.learned import VARIABLE
 
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
-Task = tuple[runs.Workplace, Scene, Method]
 
 
 def main(arguments: list[str]) -> int:
@@ -81,13 +75,13 @@ def _run(options: argparse.Namespace, command: str) -> int:
     tasks = _tasks(options, place, wanted)
     # Those that learn longest first, so that no core is idle at the end.
     tasks.sort(key=lambda task: ORDER.index(task[2].family))
-    jobs = options.jobs or (_cores() if options.setting == "reduced" else 1)
+    jobs = options.jobs or (runs.cores() if options.setting == "reduced" else 1)
     flown_over = {task[1].name: task[1] for task in tasks}.values()
     for scene in flown_over:
         scenes.render(scene)
         say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
-    for (_, scene, method), minutes in side_by_side(tasks, jobs):
+    for (_, scene, method), minutes in runs.side_by_side(tasks, jobs):
         if not options.keep_checkpoints:  # `run` has removed the last one; CAEVL has an earlier one
             for left in place.work(scene, method.key).glob("*/checkpoint.pt"):
                 left.unlink()
@@ -104,43 +98,6 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return failed
 
 
-def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float | Exception]]:
-    """Each task with its minutes or what went wrong with it, as they end.
-
-    Raises `BrokenProcessPool` where a process died: memory has run out, or somebody ended it.
-    """
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
-        waiting = {pool.submit(runs.run, *task): task for task in tasks}
-        try:
-            for done in as_completed(waiting):
-                error = done.exception()
-                if isinstance(error, BrokenProcessPool) or not isinstance(error, Exception | None):
-                    raise error
-                yield waiting[done], done.result()["minutes"] if error is None else error
-        except BaseException:  # interrupted: hours of work are not waited for, checkpoints stay
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
-def _prepare(jobs: int) -> None:
-    """Give a process its part of the cores; training says epoch, loss and time left."""
-    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
-    logging.getLogger("orthonav.ground.build.encoders").setLevel(logging.INFO)
-    cv2.setNumThreads(1)
-    cv2.setRNGSeed(0)
-    try:
-        import torch
-    except ImportError:
-        return
-    torch.set_num_threads(max(1, _cores() // jobs))
-
-
 def _has_matchers(options: argparse.Namespace) -> bool:
     """Whether local features can be run; raises `MissingExtraError` where they were asked for."""
     try:
@@ -153,9 +110,9 @@ def _has_matchers(options: argparse.Namespace) -> bool:
     return True
 
 
-def _tasks(options: argparse.Namespace, place: runs.Workplace, wanted: set[str]) -> list[Task]:
+def _tasks(options: argparse.Namespace, place: runs.Workplace, wanted: set[str]) -> list[runs.Task]:
     """All rows of the chosen parts: workplace, scene and method."""
-    tasks: list[Task] = []
+    tasks: list[runs.Task] = []
     for scene in _scenes(options, place.setting, wanted):
         tiles = scene.trajectory.tiles
         rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)

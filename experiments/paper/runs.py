@@ -1,17 +1,21 @@
-"""One method on one trajectory: build the map, locate the views, write the results; and the paper's
-related work, methods that carry the reference images on board.
+"""One method on one trajectory: build the map, locate the views, write the results.
 
 Everything the tables need is in the file that a run leaves; a run that has its file is not run
-again.
+again. Baselines are the paper's related work: methods that carry the reference images on board.
 """
 
 import hashlib
 import json
+import logging
+import os
 import re
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +77,9 @@ class Workplace:
         return self.out / "work" / self.setting.folder / f"{scene.name}-{key}"
 
 
+Task = tuple[Workplace, Scene, Method]
+
+
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     """Result of a run, after building, locating and writing; one of the same recipe is reused."""
     out = place.result(scene, method.key)
@@ -100,6 +107,43 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     if not place.keep_checkpoints:
         (work / "checkpoint.pt").unlink(missing_ok=True)
     return written
+
+
+def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float | Exception]]:
+    """Each task with its minutes or what went wrong with it, as they end.
+
+    Raises `BrokenProcessPool` where a process died: memory has run out, or somebody ended it.
+    """
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
+        waiting = {pool.submit(run, *task): task for task in tasks}
+        try:
+            for done in as_completed(waiting):
+                error = done.exception()
+                if isinstance(error, BrokenProcessPool) or not isinstance(error, Exception | None):
+                    raise error
+                yield waiting[done], done.result()["minutes"] if error is None else error
+        except BaseException:  # interrupted: hours of work are not waited for, checkpoints stay
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+
+
+def cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _prepare(jobs: int) -> None:
+    """Give a process its part of the cores; training says epoch, loss and time left."""
+    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    logging.getLogger("orthonav.ground.build.encoders").setLevel(logging.INFO)
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    try:
+        import torch
+    except ImportError:
+        return
+    torch.set_num_threads(max(1, cores() // jobs))
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:

@@ -1,5 +1,4 @@
-"""Tables 2 and 3 and further tables from result files alone, beside the paper's own figures, and
-the page `docs/paper-results.md` of the rows in the repository."""
+"""Tables 2 and 3 and further tables from result files alone, and `docs/paper-results.md`."""
 
 import json
 import math

@@ -61,7 +61,7 @@ def flown(area, made_once):
             seed=3,
         )
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
+            patch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)
             simulate_flight(request)
 
     return made_once("searched-flight", make) / "flight"

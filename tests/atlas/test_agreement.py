@@ -30,13 +30,6 @@ def flown(*views, every_s=20.0, chance=CHANCE):
     return agreement
 
 
-def test_nothing_is_known_at_first():
-    agreement = Agreement()
-    assert agreement.best is None
-    assert agreement.probability == 0.0
-    assert not agreement.agreed
-
-
 def test_one_view_alone_is_never_a_fix():
     agreement = flown([seen(0, 0, 50.0)])
     assert not agreement.agreed
@@ -50,28 +43,17 @@ def test_two_consistent_views_of_new_ground_agree():
     assert agreement.best.views >= MIN_VIEWS
 
 
-def test_two_consistent_weak_views_are_stronger_than_each():
-    apart = flown([seen(0, 0, -1.0)], [seen(50_000, 0, -1.0)])
-    together = flown([seen(0, 0, -1.0)], [seen(900, 0, -1.0)])
-    assert together.probability > apart.probability + 0.2
-    assert not apart.agreed
-
-
 @pytest.mark.parametrize(
-    "second",
+    "second, every_s",
     [
-        seen(20_000, 0, 4.0),  # faster than anything flies
-        seen(900, 0, 4.0, log_scale=1.0),  # another height altogether
+        (seen(20_000, 0, 4.0), 20.0),  # faster than anything flies
+        (seen(900, 0, 4.0, log_scale=1.0), 20.0),  # another height altogether
+        (seen(50, 0, 4.0, turn_deg=270.0), 1.0),  # turned too far
     ],
-    ids=["too far", "other scale"],
+    ids=["too far", "other scale", "turned"],
 )
-def test_places_that_cannot_be_reached_do_not_agree(second):
-    assert not flown([seen(0, 0, 4.0)], [second]).agreed
-
-
-def test_a_heading_that_cannot_have_turned_so_far_does_not_agree():
-    agreement = flown([seen(0, 0, 4.0)], [seen(50, 0, 4.0, turn_deg=270.0)], every_s=1.0)
-    assert not agreement.agreed
+def test_places_that_cannot_be_reached_do_not_agree(second, every_s):
+    assert not flown([seen(0, 0, 4.0)], [second], every_s=every_s).agreed
 
 
 def test_hovering_is_no_evidence():
@@ -112,31 +94,12 @@ def test_no_gap_is_bridged_blindly(time_s):
     assert agreement.best.views == 1.0
 
 
-def test_views_at_the_same_time_do_not_make_a_velocity():
-    agreement = flown([seen(0, 0, 3.0)], [seen(40, 0, 3.0)], every_s=1e-9)
-    assert all(each.velocity_en_mps is None for each in agreement.chains)
-
-
 def test_an_aircraft_that_turned_back_is_found_again_two_views_later():
     agreement = flown([seen(0, 0, 5.0)], [seen(600, 0, 5.0)], every_s=20.0)
     agreement.add_view([seen(300, 600, 5.0, turn_deg=270.0)], round(40e9), SIDE_M, CHANCE)
     agreement.add_view([seen(-300, 600, 5.0, turn_deg=270.0)], round(60e9), SIDE_M, CHANCE)
     agreement.add_view([seen(-900, 600, 5.0, turn_deg=270.0)], round(80e9), SIDE_M, CHANCE)
     assert agreement.agreed
-
-
-def test_places_found_by_chance_do_not_add_up():
-    alone = flown([seen(0, 0, -2.0)])
-    again = flown([seen(0, 0, -2.0)], [seen(900, 0, -2.0)], chance=1.0)
-    assert again.probability < alone.probability + 0.05
-
-
-def test_a_view_of_another_place_costs_the_chain_and_is_no_fix():
-    before = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)])
-    after = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)], [seen(40_000, 9_000, 3.0)])
-    assert before.agreed
-    assert not after.agreed
-    assert after.probability < before.probability
 
 
 def test_a_view_without_a_match_is_no_fix_and_keeps_the_chains():
@@ -154,16 +117,3 @@ def test_a_long_chain_is_given_up_after_some_views():
     there = FRAME.en_from_latlon(agreement.best.last.lat_deg, agreement.best.last.lon_deg)
     assert np.hypot(*(there - [60_000 + 800 * 7, 30_000])) < 10
     assert max(each.log_odds for each in agreement.chains) <= MAX_CHAIN_LOG_ODDS + 1e-9
-
-
-def test_the_next_place_is_expected_from_the_velocity():
-    agreement = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)])
-    lat, lon = agreement.best.expected(round(40e9))
-    assert FRAME.en_from_latlon(lat, lon) == pytest.approx([1800, 0], abs=2)
-    assert agreement.best.reach_m(round(40e9)) < 720
-
-
-def test_the_number_of_chains_is_bounded():
-    rng = np.random.default_rng(1)
-    crowd = [[seen(*rng.uniform(-40_000, 40_000, 2), -2.0, key) for key in range(40)]] * 3
-    assert len(flown(*crowd).chains) <= 12

@@ -13,14 +13,12 @@ import pytest
 from orthonav.core.errors import AreaError, AtlasError, StorageError, WorkerError
 from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas import build as building
-from orthonav.ground.atlas import build as tasks
 from orthonav.ground.atlas.build import (
     AtlasRequest,
     Imagery,
     build_atlas,
     build_sheet,
     plan_sheets,
-    request_digest,
     versions,
 )
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe
@@ -85,6 +83,7 @@ def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
     )
     mosaic = Mosaic.open([ortho])
     atlas = Atlas.open(place)
+    assert atlas.recipe == RECIPE, "the default resolution is that of the imagery"
     for name, sheet in sheets.items():
         opened = open_map(atlas.path(sheet))
         west, south, east, north = RECIPE.sheets.bounds_deg(name)
@@ -339,24 +338,6 @@ def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
     assert {task.orthos for task in both} == {(near,), (far,)}
 
 
-def test_a_digest_is_of_recipe_versions_and_imagery_but_not_of_folders(ortho, tmp_path):
-    def digest_of(*paths, recipe=RECIPE, made_by=None):
-        return request_digest(recipe, Mosaic.open(list(paths)), made_by or versions())
-
-    copy = Path(shutil.copy2(ortho, tmp_path / ortho.name))
-    other = Path(shutil.copy2(ortho, tmp_path / "other.tif"))
-    assert digest_of(copy) == digest_of(ortho)
-    different = {
-        digest_of(ortho),
-        digest_of(other),
-        digest_of(ortho, other),
-        digest_of(other, ortho),
-        digest_of(ortho, recipe=replace(RECIPE, seed=1)),
-        digest_of(ortho, made_by={**versions(), "opencv": "3"}),
-    }
-    assert len(different) == 6
-
-
 def test_imagery_across_the_antimeridian_has_sheets_on_both_sides(ortho):
     source = Mosaic.open([ortho]).sources[0]
     lat = np.array([10.0, 10.0, 10.001, 10.001])
@@ -400,23 +381,6 @@ def test_conflicting_or_impossible_options_are_refused(
     assert done.code == 1 and why in done.err and not list(tmp_path.iterdir())
 
 
-def test_the_help_of_a_build_is_grouped(run):
-    done = run("atlas", "build", "--help-all")
-    for group in ("area", "sheets", "coarse tiles", "workers"):
-        assert f"\n{group}" in done.out
-
-
-@pytest.mark.parametrize(
-    ("action", "everyday", "other"),
-    [("build", "--sheet-km", "--coarse-gsd-m"), ("cut", "--band-m", "--allow-holes")],
-)
-def test_the_help_shows_everyday_options_first(run, action, everyday, other):
-    short, long = (run("atlas", action, how).out for how in ("--help", "--help-all"))
-    assert everyday in short and other not in short
-    assert f"more options: orthonav atlas {action} --help-all" in " ".join(short.split())
-    assert everyday in long and other in long
-
-
 def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypatch):
     def interrupted(task):
         raise KeyboardInterrupt
@@ -424,9 +388,3 @@ def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypat
     monkeypatch.setattr(building, "build_sheet", interrupted)
     done = run("atlas", "build", tmp_path / "atlas", "--ortho", ortho, "--tile-px", "64")
     assert done.code == 1 and "rerun to resume" in done.err
-
-
-def test_the_default_resolution_is_that_of_the_imagery(ortho, tmp_path):
-    request = AtlasRequest(str(tmp_path / "atlas"), [ortho])
-    assert building.recipe_for(request, Mosaic.open([ortho])) == AtlasRecipe(gsd_m=1.0)
-    assert tasks.margin_m(AtlasRecipe(gsd_m=1.0, coarse=None)) == 320.0

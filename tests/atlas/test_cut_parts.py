@@ -29,11 +29,6 @@ def test_one_sheet_keeps_its_confidence():
     assert alike.weights == pytest.approx(TILES[0].weights)
 
 
-def test_no_confidence_without_sheets():
-    assert pooled_tiles([], [], 1.0) is None
-    assert pooled_registered([]) is None
-
-
 def test_the_confidence_of_tiles_never_exceeds_the_mean_of_the_sheets():
     pooled = pooled_tiles(TILES, SHARES, 1.0)
     for score in np.linspace(0.1, 1, 10):
@@ -49,11 +44,6 @@ def test_more_tiles_lower_the_odds():
     same, more = (pooled_tiles(TILES, SHARES, times) for times in (1.0, 4.0))
     assert same.bias - more.bias == pytest.approx(math.log(4))
     assert pooled_tiles(TILES, SHARES, 0.25) == same
-
-
-def test_the_chance_of_a_cut_map_is_the_highest_of_its_sheets():
-    pooled = pooled_registered(REGISTERED)
-    assert pooled == RegisteredConfidence.usual(Chances(49.0, 18.0, 60.0))
 
 
 @pytest.mark.parametrize("angle_deg", [-3.0, 0.5, 10.0])

@@ -61,14 +61,6 @@ def test_the_track_follows_from_one_map_to_the_next(atlas, views, places, monkey
 
 
 @pytest.mark.long
-def test_a_focal_length_of_a_specification_is_uncertain(atlas, views, places):
-    cameras = [replace(view, camera=replace(view.camera, focal_std=0.06)) for view in views]
-    track = LocalTrack(atlas, found(cameras, places), heading_known=False)
-    usual = locate.MODEL.log_scale
-    assert track._tracker.model.log_scale == pytest.approx(math.hypot(usual, 0.06))
-
-
-@pytest.mark.long
 def test_views_of_another_place_have_no_fix(atlas, views, places):
     track = LocalTrack(atlas, found(views, places), heading_known=False)
     rng = np.random.default_rng(1)

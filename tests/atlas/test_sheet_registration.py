@@ -14,11 +14,9 @@ pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[
 from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import PRIOR_SIGMAS, Prior, View
-from orthonav.ground.atlas import search as matches
 from orthonav.ground.atlas.locate import PlaceFinder, rectified
 from orthonav.ground.atlas.search import (
     SEARCHED,
-    PyramidPart,
     SearchRegion,
     SheetMatch,
     SheetRegistrar,
@@ -54,19 +52,6 @@ def candidate(atlas, view):
 
 def _off_m(place, truth):
     return distances_m([place.latlon_deg], [truth])[0]
-
-
-def test_a_part_of_a_pyramid_reads_as_the_whole(registrar, candidate):
-    whole = registrar.at(candidate, SIDE_M)[0].pyramid
-    unit = 2 ** (whole.levels - 1)
-    part = PyramidPart(whole, whole.levels, unit, 2 * unit, 5 * unit, 4 * unit)
-    for level in range(whole.levels):
-        rows, cols = part.shape(level)
-        assert (rows, cols) == (5 * unit >> level, 4 * unit >> level)
-        found = part.read(level, 1, 0, rows - 1, cols)
-        first = (unit >> level) + 1, 2 * unit >> level
-        expected = whole.read(level, *first, rows - 1, cols)
-        assert all(np.array_equal(*pair) for pair in zip(found, expected, strict=True))
 
 
 def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, candidate):
@@ -158,20 +143,6 @@ def test_candidates_are_searched_until_one_is_proven():
     assert Region.searched_before == SEARCHED
 
 
-def test_a_place_remains_a_rival_where_its_search_finds_another_one():
-    moved = SheetMatch(52.0, 8.0, 0.0, 0.0, _regions(30.0)[0].finished().evidence, None)
-    regions = _regions(40.0, 20.0, 18.0)
-    regions[0].searched = lambda: moved
-    found = _added(regions)
-    assert [each.lat_deg for each in found.found][:2] == [50.0, 52.0]
-    assert found.compared == [0, 1, 2]
-
-
-def test_a_place_that_only_its_search_shows_is_found():
-    found = _added(_regions(20.0, 18.0, 17.0, finds=(20.0, 90.0, 17.0)))
-    assert found.found[0].lat_deg == 50.1 and found.log_odds(0) > matches.PROVEN
-
-
 def test_candidates_that_are_not_finished_are_rivals():
     alone = _added(_regions(30.0, 8.0, 7.0, 6.0))
     rivals = _added(_regions(30.0, 14.9, 14.8, 14.7, 14.6))
@@ -184,25 +155,6 @@ def test_candidates_that_are_not_finished_are_rivals():
     assert rivals.log_odds(0) == before
     rivals._judged = [SimpleNamespace(latlon_deg=(51.0, 8.0), look=29.0)]
     assert rivals.log_odds(0) < before
-
-
-def test_expected_places_are_searched_unless_the_view_is_proven_there():
-    searched = []
-
-    def search(region):
-        searched.append(region.latlon_deg[0])
-
-    here, there = (SearchRegion(lat, 8.0, 0.0, 0.0, (lat, 8.0), 500.0, 0.1) for lat in (50.1, 51.0))
-    registrar = SimpleNamespace(searched=search)
-    proven, doubtful = _added(_regions(10.0, 90.0)), _added(_regions(15.0, 15.0))
-    for found, regions, expected in (
-        (proven, (here, there), []),
-        (proven, (there, here), [51.0]),
-        (doubtful, (here, there), [50.1, 51.0]),
-    ):
-        searched.clear()
-        found.add_expected(registrar, regions)
-        assert searched == expected
 
 
 def test_all_views_of_a_flight_are_found(atlas, registrar, flown):

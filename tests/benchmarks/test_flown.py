@@ -121,7 +121,6 @@ def test_lines_of_a_killed_program_are_read(tmp_path):
     path.write_text("\n".join([*map(json.dumps, (health, *views, health)), '{"frame": "3", "ag']))
     lines = Lines.read(path)
     assert lines.ages_ms.tolist() == [40.0, 50.0]
-    assert lines.sent_ages_ms.tolist() == [50.0]
     assert lines.reasons == {"searching": 2}
     assert lines.health["counts"] == {"taken": 2}
     assert Lines.read(tmp_path / "none").health == {}

@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from lab.landscape import DEFAULT_DATES, generate_area
 
+from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 
 
@@ -39,3 +40,13 @@ def half_blank(made_once):
     folder = made_once("half-blank", make)
     past, present = sorted(folder.glob("*.tif"))
     return SimpleNamespace(past=past, present=present, map=folder / "half.onav")
+
+
+@pytest.fixture(scope="module")
+def opened(map_path):
+    return open_map(map_path)
+
+
+@pytest.fixture(scope="module")
+def frame(opened):
+    return opened.manifest.sheets[0].frame

@@ -15,7 +15,7 @@ from orthonav.ground.check.ageing import (
     displaced,
     features,
 )
-from orthonav.ground.check.recalibrate import LEARNT, Recalibration
+from orthonav.ground.check.estimate import LEARNT, Recalibration
 from orthonav.ground.check.trials import reported_persistence
 
 SIZE = 256

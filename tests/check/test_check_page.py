@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from made_check import EVIL, FILES, small_route
 
-from orthonav.core.mapfile import open_map
 from orthonav.ground.check.outcome import CELL_VALUES
 from orthonav.ground.check.write import write_check
 from orthonav.ground.check.write.figures import (
@@ -63,16 +62,6 @@ class Page(HTMLParser):
     def handle_data(self, data):
         if self._open and self._open[-1] in self.inside:
             self.inside[self._open[-1]].append(data)
-
-
-@pytest.fixture(scope="module")
-def opened(map_path):
-    return open_map(map_path)
-
-
-@pytest.fixture(scope="module")
-def frame(opened):
-    return opened.manifest.sheets[0].frame
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ from made_check import EVIL, FILES, lost_in, made_cells, small_route
 
 from orthonav.core.errors import MissingExtraError, OutputError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.mapfile import open_map
 from orthonav.ground.check.outcome import Conditions
 from orthonav.ground.check.write import require_free, write_check
 from orthonav.ground.check.write.plain import (
@@ -28,16 +27,6 @@ from orthonav.ground.report.drawing import Drawing
 
 KINDS = ("tiny", "small_route", "long_route", "nearly_empty")
 FRAME = LocalFrame(48.2, -3.1)
-
-
-@pytest.fixture(scope="module")
-def opened(map_path):
-    return open_map(map_path)
-
-
-@pytest.fixture(scope="module")
-def frame(opened):
-    return opened.manifest.sheets[0].frame
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,5 @@
 """The whitened embedding: a view of a tile gives what the tile gave, however it came in."""
 
-import dataclasses
-import pickle
-
 import cv2
 import numpy as np
 import pytest
@@ -10,8 +7,8 @@ import pytest
 from orthonav.core.errors import AreaError, VariantError
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import MICRO, CellLayout
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn, pooled_features
-from orthonav.core.variants import make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.variants import make_variant
 
 TILE_PX = 128
 SHEET_PX = 384
@@ -137,14 +134,6 @@ def test_filling_block_by_block_equals_filling_at_once(place, stride_px, block_p
     np.testing.assert_allclose(blocks.valid, whole.valid, atol=1e-6)
 
 
-@pytest.mark.parametrize("size_px", [1, 3, 4, 5, 127])
-def test_samples_are_those_that_fit(size_px):
-    for stride_px in (1, 2, 4):
-        layout = CellLayout.for_tiles(TILE_PX, stride_px)
-        starts = [at for at in range(0, size_px, layout.spacing_px) if at + 4 <= size_px]
-        assert layout.samples(size_px) == len(starts)
-
-
 @pytest.mark.parametrize("hidden", [0.1, 0.3, 0.5])
 def test_part_of_a_view_still_finds_its_tile(place, hidden):
     stored = place.embedder.tiles(place.sheet, place.tiles_px).astype(np.float32)
@@ -193,25 +182,6 @@ def test_fewer_tiles_than_dims(place, count):
     assert np.isfinite(stored).all() and stored.shape == (len(place.tiles_px), embedder.dims)
 
 
-def test_no_more_dims_than_asked_for_and_the_first_are_the_same(place):
-    small = learn(WhitenedRecipe(dims=7), place.sheet, place.tiles_px)
-    assert small.dims == 7 and place.embedder.dims == 48
-    cosine = [
-        a @ b / np.linalg.norm(a) / np.linalg.norm(b)
-        for a, b in zip(
-            small.basis.T.astype(float), place.embedder.basis.T[:7].astype(float), strict=True
-        )
-    ]
-    assert min(cosine) > 0.999
-
-
-def test_identical_tiles_are_no_error():
-    maps, valid = np.zeros((7, SHEET_PX, SHEET_PX), np.float32), np.ones((SHEET_PX,) * 2, bool)
-    sheet = sheet_of(maps, valid, 16)
-    embedder = learn(WhitenedRecipe(), sheet, grid_px(16))
-    assert np.isfinite(embedder.tiles(sheet, grid_px(16))).all()
-
-
 def test_embeddings_are_unit_vectors(any_place):
     stored = any_place.embedder.tiles(any_place.sheet, any_place.tiles_px).astype(float)
     assert np.linalg.norm(stored, axis=1) == pytest.approx(1, abs=2e-3)
@@ -235,41 +205,11 @@ def test_the_same_bytes_every_time(place):
     assert stored.tobytes() == again.embedder.tiles(again.sheet, again.tiles_px).tobytes()
 
 
-def test_chunks_do_not_matter(place, monkeypatch):
-    stored = place.embedder.tiles(place.sheet, place.tiles_px)
-    monkeypatch.setattr("orthonav.core.tiles.whitened.CHUNK_TILES", 7)
-    np.testing.assert_allclose(place.embedder.tiles(place.sheet, place.tiles_px), stored, atol=2e-3)
-
-
-def test_a_share_of_many_tiles_is_learnt_from(place, monkeypatch):
-    monkeypatch.setattr("orthonav.core.tiles.whitened.MAX_LEARNT_TILES", 100)
-    thinned = learn(place.embedder.recipe, place.sheet, place.tiles_px)
-    taken = learn(place.embedder.recipe, place.sheet, place.tiles_px[::3])
-    assert thinned.basis.tobytes() == taken.basis.tobytes()
-
-
-def test_inputs_are_untouched(place):
-    maps, valid = (array.copy() for array in place.cut(16, 16))
-    valid[:40] = False
-    kept = maps.copy(), valid.copy()
-    maps.flags.writeable = valid.flags.writeable = False
-    place.embedder.view(maps, valid)
-    np.testing.assert_array_equal(maps, kept[0])
-    np.testing.assert_array_equal(valid, kept[1])
-
-
 def test_contrast_does_not_matter_much(place):
     """Each cell is divided by its own norm; only the floor below which it is empty stays."""
     maps, valid = place.cut(48, 32)
     assert place.embedder.view(maps, valid) @ place.embedder.view(maps * 2, valid) > 0.95
     assert place.embedder.view(maps * 3, valid) @ place.embedder.view(maps * 6, valid) > 0.99
-
-
-def test_features_are_normalized_cell_by_cell(place):
-    features, weights = pooled_features(WhitenedRecipe(), place.sheet, place.tiles_px[:3])
-    assert features.shape == weights.shape == (3, 8 * 8 * 7) and (weights == 1).all()
-    norms = np.linalg.norm(features.reshape(3, 64, 7), axis=2)
-    assert (norms < 1).all() and norms.mean() > 0.8
 
 
 @pytest.mark.parametrize("shape", [(7, 128, 96), (7, 100, 100), (7, 33, 33)])
@@ -282,24 +222,6 @@ def test_views_of_another_shape_are_refused(place, shape):
 def test_tiles_that_cannot_be_divided_are_refused(tile_px):
     with pytest.raises(AreaError, match=f"multiple of {MICRO}"):
         CellLayout.for_tiles(tile_px, 16)
-
-
-@pytest.mark.parametrize("name", sorted(embed.TABLE))
-def test_recipe_is_a_frozen_value(name):
-    recipe = make_variant(embed.TABLE, name)
-    assert pickle.loads(pickle.dumps(recipe)) == recipe and hash(recipe) == hash(
-        make_variant(embed.TABLE, name)
-    )
-    assert variant_from_recipe(embed.TABLE, variant_recipe(embed.TABLE, recipe)) == recipe
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        recipe.dims = 3
-
-
-def test_embedder_can_be_sent_to_another_process(place):
-    again = pickle.loads(pickle.dumps(place.embedder))
-    np.testing.assert_array_equal(
-        again.view(*place.cut(16, 0)), place.embedder.view(*place.cut(16, 0))
-    )
 
 
 @pytest.mark.parametrize(

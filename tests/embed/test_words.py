@@ -1,8 +1,6 @@
 """Bags of visual words: frequencies of known features, and places distinguished by them."""
 
 import functools
-import json
-import pickle
 import subprocess
 import sys
 
@@ -17,7 +15,7 @@ from orthonav.core.tiles.words import (
     WordsRecipe,
     describe,
 )
-from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+from orthonav.core.variants import Variant, make_variant
 from orthonav.research.words import learn_words
 
 TABLE = {"bovw": Variant("orthonav.core.tiles.words:WordsRecipe")}
@@ -98,14 +96,6 @@ def test_assignment_is_exact(words):
     np.testing.assert_array_equal(found[4090:4100], embedder.assigned(descriptors[4090:4100]))
 
 
-def test_equally_near_words_are_the_first():
-    embedder = random_embedder()
-    twice = np.concatenate([embedder.vocabulary[:150], embedder.vocabulary[:150]])
-    doubled = WordsEmbedder(embedder.recipe, twice, NOTHING)
-    found = doubled.assigned(twice[150:].astype(np.float32))
-    np.testing.assert_array_equal(found, np.arange(150))
-
-
 @pytest.mark.parametrize("tfidf", [0, 1])
 def test_similarity_says_how_vectors_are_scaled(tfidf):
     grey = tiles(area())[3]
@@ -131,42 +121,6 @@ def test_views_without_features_are_zero(similarity, tfidf):
     assert not blind.any() and np.isfinite(blind).all()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (2, 3), (8, 8), (33, 47)])
-def test_any_size_is_taken(shape):
-    grey = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
-    out = random_embedder().view(maps_of(grey), everywhere(grey))
-    assert out.shape == (300,) and (not out.any() or out.sum() == pytest.approx(1))
-
-
-def test_grey_levels_of_either_range_are_taken():
-    embedder, grey = random_embedder(), tiles(area())[0]
-    whole = grey.astype(np.float32)[None]
-    np.testing.assert_array_equal(
-        embedder.view(whole, everywhere(grey)), embedder.view(maps_of(grey), everywhere(grey))
-    )
-
-
-def test_several_channels_are_refused():
-    with pytest.raises(ValueError, match="one channel"):
-        random_embedder().view(np.zeros((7, 64, 64), np.float32), np.ones((64, 64), bool))
-
-
-def test_views_are_one_by_one():
-    embedder = random_embedder()
-    greys = tiles(area())[:3]
-    maps = np.stack([maps_of(grey) for grey in greys])
-    out = embedder.views(maps)
-    assert out.shape == (3, 300) and out.dtype == np.float32
-    for one, row in zip(maps, out, strict=True):
-        np.testing.assert_array_equal(embedder.view(one, np.ones((128, 128), bool)), row)
-    valid = np.ones((3, 128, 128), bool)
-    valid[1, :, 64:] = False
-    seen = embedder.views(maps, valid)
-    np.testing.assert_array_equal(seen[[0, 2]], out[[0, 2]])
-    np.testing.assert_array_equal(seen[1], embedder.view(maps[1], valid[1]))
-    assert not np.array_equal(seen[1], out[1])
-
-
 def test_features_that_see_invalid_pixels_are_dropped():
     """What lies there has no influence, and its border gives no features."""
     grey = tiles(area(), size=192)[0]
@@ -179,24 +133,6 @@ def test_features_that_see_invalid_pixels_are_dropped():
     assert 0.2 < len(kept) / len(describe(recipe, grey, everywhere(grey))) < 0.5
     flat = np.where(valid, np.uint8(40), np.uint8(220))
     assert len(describe(recipe, flat, valid)) == 0
-
-
-def test_features_are_limited_to_the_strongest():
-    grey = tiles(area(), size=256)[0]
-    all_of_them = describe(WordsRecipe(), grey, everywhere(grey))
-    few = describe(WordsRecipe(max_features=40), grey, everywhere(grey))
-    assert len(few) == 40 < len(all_of_them)
-    rows = {row.tobytes() for row in all_of_them}
-    assert sum(row.tobytes() in rows for row in few) == 40
-
-
-def test_deterministic_and_inputs_untouched():
-    grey = tiles(area())[0]
-    maps, valid = maps_of(grey), everywhere(grey)
-    maps.flags.writeable = valid.flags.writeable = False
-    first, second = (random_embedder().view(maps, valid) for _ in range(2))
-    assert first.tobytes() == second.tobytes()
-    np.testing.assert_array_equal(maps, maps_of(grey))
 
 
 # Learning.
@@ -244,24 +180,6 @@ def test_learning_is_deterministic_and_seeded():
     assert first == same != other
 
 
-def test_large_samples_are_drawn_evenly(monkeypatch):
-    """More descriptors than are wanted: every picture still has its share."""
-    import orthonav.research.words as words
-
-    sample = words._Sample(1000, seed=3)
-    for number in range(50):
-        sample.put(np.full((200, 1), number))
-    rows = sample.rows()[:, 0]
-    assert len(rows) == 1000 and (np.diff(rows) >= 0).all()
-    counts = np.bincount(rows, minlength=50)
-    assert counts.min() >= 5 and counts.max() <= 40
-    monkeypatch.setattr(words, "MIN_SAMPLES", 300)
-    monkeypatch.setattr(words, "SAMPLES_PER_WORD", 1)
-    shown = pictures_of(tiles(area())[:20])
-    made = learn_words(WordsRecipe(words=256, tfidf=1), shown, seed=1)
-    assert made.vocabulary.shape == (256, 128) and made.idf.max() <= np.log(21) + 1e-5
-
-
 def test_rare_words_weigh_more():
     """Half of the pictures are one and the same: their words are common."""
     common, *rest = tiles(area())
@@ -278,18 +196,6 @@ def test_rare_words_weigh_more():
 def test_too_few_features_are_refused(greys):
     with pytest.raises(VariantError, match=r"1024 words cannot be learned from \d+ features"):
         learn_words(WordsRecipe(), pictures_of(greys))
-
-
-def test_learning_reports_and_leaves_out_what_is_not_valid():
-    shares, grey = [], area()
-    grey = grey[:400, :400]
-    half = everywhere(grey)
-    half[:, 300:] = False
-    made = learn_words(WordsRecipe(words=256), [(grey, half)], seed=1, progress=shares.append)
-    assert shares == sorted(shares) and shares[-1] == 1 and len(shares) > 5
-    painted = np.where(half, grey, 7).astype(np.uint8)
-    again = learn_words(WordsRecipe(words=256), [(painted, half)], seed=1)
-    assert again.vocabulary.tobytes() == made.vocabulary.tobytes()
 
 
 def test_without_faiss_the_extra_is_named(monkeypatch):
@@ -349,20 +255,6 @@ print({name.partition(".")[0] for name in sys.modules} & {"torch", "faiss", "tra
         [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout.strip()) == (0, "set()"), done.stderr
-
-
-def test_recipe_round_trip():
-    made = make_variant(TABLE, "bovw:words=512,similarity=cosine,tfidf=1,max_features=300")
-    assert made == WordsRecipe(512, "sift", "", 300, "cosine", 1)
-    recipe = json.loads(json.dumps(variant_recipe(TABLE, made)))
-    assert variant_from_recipe(TABLE, recipe) == made
-
-
-def test_embedders_can_be_pickled():
-    embedder, grey = random_embedder(), tiles(area())[0]
-    first = embedder.view(maps_of(grey), everywhere(grey))
-    again = pickle.loads(pickle.dumps(embedder))
-    np.testing.assert_array_equal(again.view(maps_of(grey), everywhere(grey)), first)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from experiments.paper import published, runs, scenes
-from experiments.paper.__main__ import main, side_by_side
+from experiments.paper.__main__ import main
 from experiments.paper.methods import (
     FULL,
     GPU,
@@ -159,7 +159,7 @@ def test_runs_side_by_side_say_what_went_wrong(place, scene, made, tmp_path):
     method = Method("gradient", "gradient", "gradient")
     missing = replace(scene, name="none", past=tmp_path / "none.tif")
     tasks = [(place, scene, method), (place, missing, method)]
-    ended = {task[1].name: outcome for task, outcome in side_by_side(tasks, 2)}
+    ended = {task[1].name: outcome for task, outcome in runs.side_by_side(tasks, 2)}
     assert ended["B"] == made["minutes"] and isinstance(ended["none"], MissingFileError)
 
 

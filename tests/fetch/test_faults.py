@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 
 import numpy as np
 import pytest
@@ -141,6 +142,23 @@ def test_a_service_that_is_down_ends_the_fetch(take):
         with pytest.raises(FetchError, match=r"20 requests in a row failed.*HTTP 401"):
             take(source(server), half_m=900)
         assert len(server.log) < 60
+
+
+@pytest.mark.parametrize("protocol", ["xyz", "wmts", "cog"])
+def test_an_error_of_a_service_that_quotes_the_key_does_not_show_it(take, protocol, monkeypatch):
+    monkeypatch.setenv("MY_KEY", "s3cr3t-v4lue")
+    report = (
+        b"<ExceptionReport><ExceptionText>bad key s3cr3t-v4lue</ExceptionText></ExceptionReport>"
+    )
+    with servers.serving(lambda asked: servers.Answer(report)) as server:
+        address = f"{protocol}:{server.url}/{{z}}/{{x}}/{{y}}.png?token={{key}}"
+        if protocol != "xyz":
+            address = f"{protocol}:{server.url}/a?token={{key}}"
+        with pytest.raises(FetchError) as raised:
+            take(address, terms={"key_env": "MY_KEY"})
+        assert server.log[0].query["TOKEN"] == "s3cr3t-v4lue"
+    assert "s3cr3t" not in "".join(traceback.format_exception(raised.value))
+    assert protocol != "wmts" or "bad key {key}" in str(raised.value)
 
 
 def test_limits_end_a_fetch_before_it_starts(take, tmp_path, names_below):

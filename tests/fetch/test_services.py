@@ -84,6 +84,7 @@ def test_wms_chooses_utm_and_jpeg_by_itself(mapproxy, take):
 def test_tiles_of_the_web_grid(take):
     with servers.serving(servers.tiles) as server:
         _, path = take(f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png")
+        assert all(asked.headers["User-Agent"].startswith("orthonav/") for asked in server.log)
     worst, _ = placed(path, "EPSG:3857")
     assert worst <= 1
 

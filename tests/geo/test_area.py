@@ -49,22 +49,6 @@ def test_extent_of_bounds_is_true_metres():
     assert west == pytest.approx(-east, abs=1e-6)
 
 
-def test_box_of_an_outline_holds_its_points_tightly():
-    lat, lon = np.array([46.50, 46.53, 46.51]), np.array([2.50, 2.52, 2.55])
-    area = Area.from_outline(lat, lon)
-    points = area.frame.en_from_latlon(lat, lon)
-    assert area.contains(points, margin_m=1e-6).all()
-    assert area.extent_en_m == pytest.approx((*points.min(axis=0), *points.max(axis=0)))
-
-
-def test_margin_widens_a_box():
-    area = Area.from_bounds((2.49, 46.49, 2.51, 46.51))
-    east = area.extent_en_m[2]
-    points = np.array([[east - 1, 0], [east + 9, 0], [east + 11, 0]])
-    assert area.contains(points, margin_m=10).tolist() == [True, True, False]
-    assert area.contains(points).tolist() == [True, False, False]
-
-
 def test_band_is_as_wide_as_asked_in_true_metres():
     area = Area.from_route(Route(((46.5, 2.5), (46.6, 2.5))), band_m=400)
     side = [GEOD.fwd(2.5, 46.55, 90, distance)[:2] for distance in (199.9, 200.1)]

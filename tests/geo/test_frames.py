@@ -73,26 +73,6 @@ def test_axes_point_true_east_and_north(bearing, east, north):
     np.testing.assert_allclose(brest.en_from_latlon(lat, lon), expected, atol=ONE_MM)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (5,), (3, 4)])
-def test_arrays_keep_their_shape(shape):
-    frame = LocalFrame(46.5, 2.5)
-    en = frame.en_from_latlon(np.full(shape, 46.51), np.full(shape, 2.49))
-    assert en.shape == (*shape, 2)
-    lat, lon = frame.latlon_from_en(en)
-    assert lat.shape == lon.shape == shape
-
-
-@pytest.mark.parametrize("number", [float, np.float64, np.float32, int])
-def test_proj_string_is_plain_whatever_the_kind_of_number(number):
-    assert "+lat_0=46" in LocalFrame(number(46), number(2)).proj4
-    assert "+lon_0=2" in LocalFrame(number(46), number(2)).proj4
-
-
-def test_far_away_is_far_away():
-    en = LocalFrame(46.5, 2.5).en_from_latlon([46.5, -46.5, 89.0], [12.5, -177.5, 2.5])
-    assert np.isfinite(en).all() and (np.linalg.norm(en, axis=1) > 500_000).all()
-
-
 @pytest.mark.parametrize(
     "lat, lon", [(90, 0), (-89.95, 0), (math.nan, 0), (0, math.nan), (0, 361), (math.inf, 0)]
 )

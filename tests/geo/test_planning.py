@@ -120,13 +120,6 @@ def test_height_above_ground_leg_by_leg(heights, agl_m, expected):
     assert legs[0].relief == pytest.approx(10 / expected[0][0], rel=0.15)
 
 
-def test_home_is_the_planned_home():
-    route = Route(PLACES, (Height(100, "home"),) * 3, home_amsl_m=700)
-    assert profile(route, (1.0, 1.0), None, 0.0, slope)[1].agl_m == pytest.approx(
-        (300, 300), abs=0.1
-    )
-
-
 def test_hills_and_collisions_give_cautions():
     route = Route(PLACES, (Height(450, "amsl"),) * 3)
     low = profile(route, (10.0, 10.0), None, 100.0, slope)
@@ -158,8 +151,3 @@ def test_unknown_heights_are_refused():
         profile(ellipsoid, (1.0, 1.0), None, 10.0, slope)
     with pytest.raises(RouteError, match="does not cover leg 1"):
         profile(Route(PLACES), (1.0, 1.0), 100, 10.0, lambda lat, lon: np.full(lat.shape, np.nan))
-
-
-def test_a_single_waypoint_has_a_profile():
-    (leg,) = profile(Route(PLACES[:1]), (100.0,), 100, 50.0, slope)
-    assert leg.length_m == 0 and leg.agl_m == (100, 100)

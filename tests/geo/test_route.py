@@ -1,6 +1,5 @@
 """Routes: what is read, what is refused, distances to them and positions along them."""
 
-import errno
 import json
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from hypothesis.extra.numpy import arrays
 from pyproj import Geod
 
 from orthonav.core.errors import MissingFileError, RouteError
-from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.planning import route as route_module
 from orthonav.ground.planning.route import (
     Height,
@@ -29,7 +27,8 @@ from orthonav.ground.planning.routes.geojson import read_geojson, to_geojson
 
 GEOD = Geod(ellps="WGS84")
 WAYPOINTS = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
-LINE = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in WAYPOINTS]}
+POINTS = [[lon, lat] for lat, lon in WAYPOINTS]
+LINE = {"type": "LineString", "coordinates": POINTS}
 HIGH_LINE = LINE | {"coordinates": [[*point, 120.0] for point in LINE["coordinates"]]}
 POINT = {"type": "Point", "coordinates": [0, 0]}
 OTHER_LINE = {"type": "LineString", "coordinates": [[9, 9], [9.1, 9]]}
@@ -56,10 +55,20 @@ def polylines(least=1):
         feature(LINE),
         collection(LINE),
         collection(None, POINT, LINE, OTHER_LINE),
+        {"type": "MultiLineString", "coordinates": [POINTS[:1], POINTS[1:]]},
         {"type": "GeometryCollection", "geometries": [POINT, LINE, OTHER_LINE]},
         feature({"type": "GeometryCollection", "geometries": [LINE]}),
     ],
-    ids=["bare", "with height", "feature", "collection", "first line", "geometries", "nested"],
+    ids=[
+        "bare",
+        "with height",
+        "feature",
+        "collection",
+        "first line",
+        "parts",
+        "geometries",
+        "nested",
+    ],
 )
 @pytest.mark.parametrize("suffix", [".geojson", ".json", ".GeoJSON"])
 def test_geojson_is_read(tmp_path, document, suffix):
@@ -166,14 +175,6 @@ def test_lines_are_picked_by_name(tmp_path, caplog):
     assert read_route(Path(f"{path}#2")).waypoints == WAYPOINTS  # a name comes before a number
 
 
-def test_a_multilinestring_is_one_line(tmp_path):
-    path = tmp_path / "a.geojson"
-    points = LINE["coordinates"]
-    parts = {"type": "MultiLineString", "coordinates": [points[:1], points[1:]]}
-    path.write_text(json.dumps(parts))
-    assert read_route(path).waypoints == WAYPOINTS
-
-
 heights = st.none() | st.builds(
     Height, st.floats(-500, 9000), st.sampled_from([None, "agl", "home", "amsl"])
 )
@@ -222,24 +223,18 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.geojson", b'{"type": "LineString"}', "coordinates is missing"),
         ("a.geojson", b'{"type": "LineString", "coordinates": []}', "no waypoints"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1], [2]]}', "as numbers"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": [["x", 1]]}', "as numbers"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": [[null, 1]]}', "as numbers"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [["1", "2"]]}', "as numbers"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": ["12", "34"]}', "as numbers"),
         ("a.geojson", b'{"type": "LineString", "coordinates": "1234"}', "as numbers"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": {"12": 1}}', "as numbers"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[true, 2]]}', "as numbers"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[NaN, 1]]}', "a latitude within 90"),
         ("a.geojson", b'{"coordinates": [[1%s, 1]], "type": "LineString"}' % (b"0" * 400), "read"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1, 91]]}', "a latitude within 90"),
         ("a.csv", b"", "is empty"),
-        ("a.csv", b" \n ", "is empty"),
         ("a.csv", b"x,y\n1,2\n", "columns lat_deg,lon_deg .* got x,y"),
         ("a.csv", b"PNG\0\0\0\n\0", "route table cannot be read|columns"),
         ("a.csv", b"lat,lon,alt\n1,2,1e9\n", "height of a waypoint must be within"),
         ("a.csv", b"lat,lon,band_m\n1,2,0\n1,3,\n", "band of a leg must be wider than 0"),
         ("a.csv", b"lat,lon\n" + b"1,2\n" * 100_001, "100,001 waypoints, at most 100,000"),
-        ("a.csv", b"lat,lon\n1,361\n", "a latitude within 90"),
         ("a.csv", b"lat_deg,lon_deg\n", "no waypoints"),
         ("a.csv", b"lat_deg,lon_deg\n46.5\n", "cannot be read"),
         ("a.csv", b"lat_deg,lon_deg\n46.5,east\n", "cannot be read"),
@@ -264,18 +259,6 @@ def test_missing_folder_and_huge_files_are_refused(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_text("lat_deg,lon_deg\n1,2\n")
     with pytest.raises(RouteError, match="larger than"):
         read_route(tmp_path / "a.csv")
-
-
-def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch):
-    path = tmp_path / "a.csv"
-    path.write_text("lat_deg,lon_deg\n1,2\n")
-
-    def refuse(*args, **kwargs):
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(Path, "read_bytes", refuse)
-    with pytest.raises(MissingFileError, match="cannot be read"):
-        read_route(path)
 
 
 @given(polylines(), arrays(float, (8, 2), elements=st.floats(-6000, 6000)))
@@ -333,15 +316,3 @@ def test_course_is_clockwise_from_north_and_turns_at_the_vertex():
     positions, course_deg = along_polyline_en_m(line, 50)
     assert positions[:5].tolist() == [[0, 0], [0, 50], [0, 100], [50, 100], [100, 100]]
     assert course_deg.tolist() == pytest.approx([0, 0, 0, 90, 90, 225, 225])
-
-
-def test_one_waypoint_is_one_position():
-    positions, course_deg = along_polyline_en_m(np.array([[3.0, 4.0]]), 10)
-    assert positions.tolist() == [[3, 4]] and course_deg.tolist() == [0]
-
-
-def test_waypoints_in_a_frame():
-    frame = LocalFrame(46.5, 2.5)
-    points = Route(WAYPOINTS).points_en_m(frame)
-    assert points[0] == pytest.approx([0, 0], abs=1e-6)
-    np.testing.assert_allclose(np.stack(frame.latlon_from_en(points), axis=1), WAYPOINTS)

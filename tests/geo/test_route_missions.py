@@ -94,19 +94,15 @@ def test_heights_above_terrain_that_a_plan_summed_up_itself(read):
         ({"DistanceToSurface": 60, "DistanceMode": 2}, "amsl"),
         ({"DistanceToSurface": 60, "DistanceMode": 3}, "agl"),
         ({"DistanceToSurface": 60, "DistanceMode": 4}, "agl"),
+        ({"DistanceToSurface": 60}, "agl"),
     ],
 )
 def test_a_survey_is_flown_along_its_transects(read, camera, frame):
-    polygon = [list(A), list(B), list(C)]
-    route = read(plan(transects("survey", (A, C, B), camera, polygon=polygon)))
+    survey = transects("survey", (A, C, B), camera, polygon=[list(A), list(B), list(C)])
+    survey["TransectStyleComplexItem"]["FollowTerrain"] = len(camera) == 1  # an older survey
+    route = read(plan(survey))
     assert route.waypoints == (A, C, B)
     assert route.heights == (Height(60, frame),) * 3 and route.leg_bands_m == ()
-
-
-def test_terrain_of_an_older_survey(read):
-    survey = transects("survey", (A, B))
-    survey["TransectStyleComplexItem"]["FollowTerrain"] = True
-    assert read(plan(survey)).heights == (Height(60, "agl"),) * 2
 
 
 def test_a_corridor_has_a_band_of_its_own(read):

@@ -12,16 +12,6 @@ from orthonav.ground.planning.route import TABLE_1, Height, leg_lengths_m, prese
 GEOD = Geod(ellps="WGS84")
 
 
-def test_the_table_is_the_papers():
-    rows = [(t.agl_m, t.length_m, t.band_m, t.overlap) for t in TABLE_1.values()]
-    assert rows == [
-        (40, 150, 10, 0.995),
-        (2000, 12_000, 1000, 0.875),
-        (4000, 50_000, 5000, 0.875),
-        (2000, 2000, 2000, 0.875),
-    ]
-
-
 @given(st.sampled_from("abcdABCD"), st.floats(-80, 80), st.floats(-180, 180), st.floats(-360, 360))
 def test_a_preset_has_its_length_centre_and_bearing(name, lat, lon, bearing):
     route = preset(f"paper:{name}@{lat},{lon},{bearing}")

@@ -109,13 +109,6 @@ def test_a_leg_longer_than_a_sheet_is_cut():
     assert len(whole) == 1
 
 
-def test_many_waypoints_are_divided_quickly():
-    lat = np.linspace(46, 50, 10_000)
-    route = Route(tuple((value, 2.0) for value in lat.tolist()))
-    parts = sheets_of_route(route, 1000)
-    assert len(parts) == 10 and sum(part.legs for part in parts) == route.legs
-
-
 @pytest.mark.parametrize(
     "route, band_m, message",
     [

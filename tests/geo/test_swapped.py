@@ -1,12 +1,9 @@
 """Swapped latitude and longitude are named where a position cannot be right."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from orthonav.core.errors import AreaError, RouteError
 from orthonav.core.geo.swapped import HINT, swapped_hint
-from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.sheets import WorldSheets, sheets_of_bounds
 
@@ -30,17 +27,6 @@ def near(lat_deg, lon_deg):
 )
 def test_swapped_positions(lat_deg, lon_deg, contains, swapped):
     assert swapped_hint(lat_deg, lon_deg, contains) == (f"; {HINT}" if swapped else "")
-
-
-@given(st.floats(-90, 90), st.floats(-360, 360))
-def test_a_valid_position_is_never_called_swapped(lat_deg, lon_deg):
-    assert swapped_hint(lat_deg, lon_deg) == ""
-    assert swapped_hint(lat_deg, lon_deg, lambda lat, lon: True) == ""
-
-
-def test_swapped_bounds_out_of_range_are_named():
-    with pytest.raises(AreaError, match=HINT):
-        Area.from_bounds((24.0, 121.0, 24.1, 121.1))
 
 
 def test_swapped_waypoints_out_of_range_are_named():

@@ -69,14 +69,6 @@ def test_every_sheet_fits_a_map(side_m, lat):
         assert east - west > 0.9 * side_m
 
 
-@pytest.mark.parametrize("lat", [-90.0, 89.9])
-def test_no_map_reaches_a_pole(lat):
-    """The box of a sheet is too wide in longitude there, which is said."""
-    sheets = WorldSheets(LARGEST_SIDE_M)
-    with pytest.raises(AreaError, match="at most 10 degrees"):
-        Area.from_bounds(sheets.bounds_deg(sheets.name_at(lat, 12.3)))
-
-
 @settings(max_examples=60)
 @given(
     st.floats(-89, 88.5),
@@ -101,16 +93,6 @@ def test_a_box_is_covered_and_nothing_far_is_named(south, west, height, width, u
             left + turn <= east + 1e-9 and right_deg + turn >= west - 1e-9
             for turn in (-360, 0, 360)
         )
-
-
-def test_across_the_antimeridian():
-    sheets = WorldSheets(40_000.0)
-    names = list(sheets.over((179.9, -17.0, -179.9, -16.9)))
-    boxes = [sheets.bounds_deg(name) for name in names]
-    assert {sheets.name_at(-16.95, lon) for lon in (179.95, -179.95)} <= set(names)
-    assert all(box[0] == -180 or box[0] > 179 for box in boxes)
-    assert {box[0] == -180 for box in boxes} == {True, False}
-    assert sheets.name_at(-16.95, 180.0) == sheets.name_at(-16.95, -180.0)
 
 
 def test_around_the_earth_and_the_poles():

@@ -108,23 +108,6 @@ def test_colour_of_every_kind_is_the_same_picture(tmp_path, make):
     assert off.max() <= (8 if make is jpeg_ycbcr else 3)
 
 
-def grey(path):
-    return write(path, SCENE[:1])
-
-
-def two_bands(path):
-    return write(path, SCENE[:2])
-
-
-@pytest.mark.parametrize("make", [grey, two_bands])
-def test_grey_fills_all_three(tmp_path, make):
-    pixels = read(make(tmp_path / "ortho.tif"))
-    for band in range(3):
-        off = np.abs(pixels.rgb[INNER][..., band].astype(int) - SCENE[0][INNER])
-        assert off.max() <= 3
-    assert np.abs(pixels.grey[INNER].astype(int) - SCENE[0][INNER]).max() <= 3
-
-
 @pytest.mark.parametrize(
     "dtype, scale, offset",
     [("uint16", 16, 100), ("int16", 20, -3000), ("float32", 1 / 255, 0), ("float64", 1e4, -7e5)],
@@ -302,25 +285,6 @@ def test_colours_beside_a_hole_are_not_mixed_with_it(tmp_path, make):
     rim = pixels.valid & binary_dilation(HOLE, iterations=3)
     off = np.abs(pixels.rgb[..., 0] - whole[0])[rim]
     assert rim.sum() > 100 and off.max() <= 30
-
-
-@pytest.mark.parametrize("make", HOLED)
-@pytest.mark.parametrize("coarser", [2, 5])
-def test_thinning_keeps_the_holes(tmp_path, make, coarser):
-    pixels = read(make(tmp_path / "ortho.tif"), SIZE // coarser, gsd_m=coarser)
-    share = HOLE.reshape(SIZE // coarser, coarser, -1, coarser).mean(axis=(1, 3))
-    inner = np.s_[2:-2, 2:-2]
-    assert not pixels.valid[share == 1].any()
-    assert pixels.valid[inner][~binary_dilation(share > 0, iterations=2)[inner]].all()
-    assert not pixels.rgb[~pixels.valid].any()
-
-
-def test_outside_the_imagery_is_not_valid_and_black(tmp_path):
-    pixels = read(rgb(tmp_path / "ortho.tif"), 2 * SIZE)
-    inside = np.s_[SIZE // 2 + 2 : -SIZE // 2 - 2]
-    assert pixels.valid[inside, inside].all()
-    assert pixels.valid.sum() == pytest.approx(SIZE**2, rel=0.04)
-    assert not pixels.rgb[~pixels.valid].any() and not pixels.grey[~pixels.valid].any()
 
 
 def shifted(path, cols, level, **more):

@@ -37,11 +37,6 @@ def test_a_file_that_is_missing(tmp_path):
         Mosaic.open([tmp_path / "none.tif"])
 
 
-def test_no_file_at_all():
-    with pytest.raises(ImageryError, match="no orthophoto was given"):
-        Mosaic.open([])
-
-
 @pytest.mark.parametrize("content", [b"", b"not an image", b"II*\0" + b"\xff" * 40, bytes(4096)])
 def test_a_file_that_is_no_image(ortho, content):
     ortho.write_bytes(content)
@@ -82,10 +77,6 @@ def test_too_small(ortho, shape):
     refused(write(ortho, np.ones((3, *shape), np.uint8)), f"only {shape[1]} x {shape[0]} px")
 
 
-def test_complex_numbers(ortho):
-    refused(write(ortho, np.ones((1, 32, 32), np.complex64)), "no band of real numbers")
-
-
 def test_metres_called_degrees(ortho):
     refused(write(ortho, SCENE, crs="EPSG:4326"), "border cannot be converted to latitude")
 
@@ -101,11 +92,6 @@ def test_deep_images_of_nothing_but_nodata(ortho, dtype, nodata):
     write(ortho, np.full((3, SIZE, SIZE), nodata, dtype), nodata=nodata)
     with pytest.raises(ImageryError, match="no valid pixel"):
         Mosaic.open([ortho])
-
-
-def test_8_bit_images_of_nothing_but_nodata_have_no_valid_pixel(ortho):
-    write(ortho, np.zeros((3, SIZE, SIZE), np.uint8), nodata=0)
-    assert not read(ortho).valid.any()
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -172,17 +158,6 @@ def test_altered_bytes_are_noticed(ortho, kind):
     path.write_bytes(bytes(content))
     with pytest.raises(ImageryError, match="cannot be read"):
         read(path, 500)
-
-
-def test_what_lies_before_the_damage_can_be_read(ortho):
-    whole = read(write(ortho, noise(), **KINDS["deflate tiles"], interleave="pixel"), 500)
-    ortho.write_bytes(ortho.read_bytes()[:-1000])
-    with sheet_of(ortho, 500) as sheet:
-        first = sheet.read(0, 0, 200, 200)
-        with pytest.raises(ImageryError):
-            sheet.read(300, 300, 200, 200)
-        again = sheet.read(0, 0, 200, 200)
-    assert (first.rgb == whole.rgb[:200, :200]).all() and (again.rgb == first.rgb).all()
 
 
 def test_a_deep_file_that_was_cut_short(ortho):

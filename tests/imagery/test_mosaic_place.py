@@ -6,7 +6,6 @@ import pytest
 import rasterio
 from geotiffs import FRAME, LAMBERT, centres_en_m, from_local, placed, read, sheet_of, write
 from rasterio.enums import Resampling
-from rasterio.transform import Affine
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -103,34 +102,6 @@ def test_web_mercator_is_measured_in_true_metres(tmp_path):
     assert Mosaic.open([path]).gsd_m == pytest.approx(1.0, abs=0.005)
 
 
-@pytest.mark.parametrize("turn_deg", [0, 30, -100])
-def test_resolution_of_a_turned_raster(tmp_path, turn_deg):
-    transform = placed(gsd_m=0.5, turn_deg=turn_deg)
-    path = write(tmp_path / "a.tif", np.ones((1, 64, 64), np.uint8), transform=transform)
-    assert Mosaic.open([path]).gsd_m == pytest.approx(0.5, rel=2e-3)
-
-
-@pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
-@pytest.mark.parametrize("source_gsd_m", [1.0, 0.5, 0.2, 0.4, 2.0])
-def test_a_ramp_keeps_its_value_at_every_pixel_centre(tmp_path, frame, source_gsd_m):
-    """Two grey levels per metre of sheet: half a pixel off would show as one grey level."""
-    size = round(140 / source_gsd_m)
-    transform = placed(LAMBERT, source_gsd_m, size, frame=frame)
-    ramp = np.tile((np.arange(size) + 0.5) * source_gsd_m * 400, (size, 1))
-    bands = np.rint(np.stack([ramp, ramp.T, (ramp + ramp.T) / 2])).astype(np.uint16)
-    path = write(tmp_path / "ramp.tif", bands, transform=transform)
-    stretch = Mosaic.open([path]).stretch
-
-    pixels = read(path, 100, 1.0, frame)
-    x, y = from_local(LAMBERT, frame).transform(*centres_en_m(100, 1.0))
-    cols, rows = ~transform * (np.asarray(x), np.asarray(y))
-    raw = np.stack([cols, rows, (cols + rows) / 2], axis=-1) * source_gsd_m * 400
-    off = pixels.rgb - (raw - stretch.low) * 255 / (stretch.high - stretch.low)
-    assert pixels.valid.all()
-    assert np.abs(off).max() < 1.2
-    assert np.abs(off.mean(axis=(0, 1))).max() < 0.05
-
-
 def rich_scene(size, source_gsd_m, seed=0):
     """Structure at all scales from two sheet pixels up."""
     noise = np.random.default_rng(seed).normal(size=(3, size, size)).astype(np.float32)
@@ -212,16 +183,6 @@ def test_windows_at_the_border_of_the_imagery(tmp_path, source_gsd_m):
     assert np.abs(part.rgb.astype(int) - whole.rgb[window])[both].max() <= 2
 
 
-def test_a_window_may_reach_beyond_the_sheet(tmp_path):
-    scene = rich_scene(260, 1.0)
-    path = write(tmp_path / "ortho.tif", scene)
-    with sheet_of(path, 100) as sheet:
-        inside, beyond = sheet.read(0, 0, 100, 100), sheet.read(-20, -30, 150, 160)
-        nothing = sheet.read(200, 200, 10, 10)
-    assert (beyond.rgb[30:130, 20:120] == inside.rgb).all()
-    assert beyond.valid.sum() == 100 * 100 and not nothing.valid.any()
-
-
 @pytest.mark.parametrize("coarser", [2, 3, 4, 5, 8, 2.5, 3.4])
 @pytest.mark.parametrize("deep", [False, True], ids=["8 bit", "16 bit"])
 def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
@@ -235,22 +196,6 @@ def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
     assert np.abs(inner - 127.5).max() <= 127.5 / coarser**2 * 2.5 + 3
 
 
-def test_thinning_averages_the_right_pixels(tmp_path):
-    """Blocks of 5 x 5 pixels at 0.2 m, each with its own mean, are the pixels at 1 m."""
-    rng = np.random.default_rng(0)
-    means = cv2.GaussianBlur(rng.uniform(0, 255, (120, 120)), (0, 0), 3)
-    means = np.clip((means - means.mean()) * 3 + 128, 60, 195)
-    fine = np.kron(means, np.ones((5, 5))) + rng.uniform(-50, 50, (600, 600))
-    path = write(
-        tmp_path / "fine.tif",
-        np.rint(fine).astype(np.uint8)[None],
-        transform=placed(gsd_m=0.2, size=600),
-    )
-    expected = np.rint(fine).reshape(120, 5, 120, 5).mean(axis=(1, 3))
-    off = read(path, 120).grey.astype(float)[4:-4, 4:-4] - expected[4:-4, 4:-4]
-    assert np.abs(off).max() < 12 and abs(off.mean()) < 0.5
-
-
 def test_overviews_change_little(tmp_path):
     scene = rich_scene(800, 0.25)
     path = write(tmp_path / "ortho.tif", scene, transform=placed(gsd_m=0.25, size=800))
@@ -261,12 +206,6 @@ def test_overviews_change_little(tmp_path):
     assert np.abs(without.rgb.astype(int) - with_overviews.rgb)[4:-4, 4:-4].max() <= 6
 
 
-def test_a_sheet_far_from_the_imagery_is_empty(tmp_path):
-    path = write(tmp_path / "ortho.tif", rich_scene(64, 1.0))
-    for frame in (BREST, LocalFrame(-46.5, -177.0), LocalFrame(89.0, 3.0)):
-        assert not read(path, 50, 1.0, frame).valid.any()
-
-
 def test_across_the_antimeridian(tmp_path):
     """An orthophoto in UTM 60 that reaches into the western hemisphere."""
     frame = LocalFrame(-17.0, 180.0)
@@ -275,16 +214,3 @@ def test_across_the_antimeridian(tmp_path):
     source_with_marks(path, "EPSG:32760", transform, 260, frame, 2.5)
     pixels = read(path, 200, 1.0, frame)
     assert pixels.valid.all() and np.abs(marks_off_px(pixels.grey, 1.0)).max() < 0.1
-
-
-def test_identity_of_pixel_and_sheet_pixel(tmp_path):
-    """One bright pixel stays in its pixel: no half pixel is lost on the way."""
-    bands = np.zeros((1, 64, 64), np.uint8)
-    bands[0, 20, 41] = 255
-    path = write(tmp_path / "dot.tif", bands, transform=placed(size=64))
-    grey = read(path, 64).grey
-    assert np.unravel_index(grey.argmax(), grey.shape) == (20, 41) and grey.max() > 240
-    shifted = placed(size=64) * Affine.translation(0.5, 0)
-    path = write(tmp_path / "half.tif", bands, transform=shifted)
-    pair = read(path, 64).grey[20, 41:43].astype(int)
-    assert abs(pair[0] - pair[1]) < 20 and pair.min() > 100

@@ -14,7 +14,7 @@ from orthonav.core.errors import ImageryError
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.imagery.names import date_of, system_of, tab_transform
+from orthonav.ground.imagery.names import date_of, system_of
 
 SCENE = smooth_scene(200)
 PACKAGE = "BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D003_2013-01-01"
@@ -87,13 +87,6 @@ def test_a_package_of_bd_ortho(tmp_path, whole, caplog):
     assert np.abs(pixels.rgb.astype(int) - whole.rgb).max() <= 2
 
 
-@pytest.mark.parametrize("part", [PACKAGE, TILES])
-def test_any_folder_of_the_package_may_be_named(tmp_path, part):
-    ign(tmp_path)
-    (entry,) = Mosaic.open([tmp_path / part]).describe()
-    assert entry["date"] == "2013" and entry["crs"] == "EPSG:2154" and entry["files"] == 4
-
-
 def test_sidecars_of_mapinfo_place_jpeg_2000(tmp_path, whole):
     """Neither a geotransform nor a system in the files."""
     paths = ign(tmp_path / "ign", is_placed=False)
@@ -111,15 +104,6 @@ def test_sidecars_of_mapinfo_place_jpeg_2000(tmp_path, whole):
     pixels = read(tmp_path / "ign", 190)
     np.testing.assert_array_equal(pixels.valid, whole.valid)
     assert np.abs(pixels.rgb.astype(int) - whole.rgb).max() <= 2
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "(1,2) (0,0)", "(1,1) (0,0)\n" * 5, "(0,0) (0,0)\n(9,0) (1,0)\n(0,9) (0,1)\n(0,0) (1,1)"],
-)
-def test_sidecars_that_place_nothing(tmp_path, text):
-    (tmp_path / "a.tab").write_text(text)
-    assert tab_transform(tmp_path / "a.jp2") is None and tab_transform(tmp_path / "b.jp2") is None
 
 
 @pytest.mark.parametrize(
@@ -251,24 +235,6 @@ def test_tile_stores_are_read_at_their_finest(tmp_path, driver, suffix):
     assert other.valid.all()
     off = np.abs(one.rgb.astype(int) - other.rgb)
     assert off.mean() < 6  # GDAL resamples into the store's own zoom levels
-
-
-@pytest.mark.long
-def test_all_tables_of_a_geopackage(tmp_path):
-    if "gpkg" not in raster_driver_extensions():
-        pytest.skip("this GDAL has no GPKG driver")
-    path = tmp_path / "two.gpkg"
-    for number, col in enumerate((0, 100)):
-        part = np.ascontiguousarray(SCENE[:, :, col : col + 100])
-        here = placed("EPSG:32631", size=200) * Affine.translation(col, 0)
-        tif = write(tmp_path / f"{number}.tif", part, crs="EPSG:32631", transform=here)
-        more = {"APPEND_SUBDATASET": "YES"} if number else {}
-        rasterio.shutil.copy(
-            tif, path, driver="GPKG", RASTER_TABLE=f"t{number}", TILE_FORMAT="PNG", **more
-        )
-    mosaic = Mosaic.open([path])
-    assert [source.width_px for source in mosaic.sources] == [100, 100]
-    assert read(path, 150).valid.all()
 
 
 def test_naip_swissimage_and_drones(tmp_path):

@@ -153,31 +153,6 @@ def test_what_is_named_first_covers_what_it_shares_a_lattice_with(tmp_path):
     assert (pixels.rgb[10:-10, 3:8] == 150).all()
 
 
-def test_8_and_16_bit_are_mixed(tmp_path, caplog):
-    scene = smooth_scene()
-    shallow = write(tmp_path / "a.tif", scene, transform=placed() * Affine.translation(-60, 0))
-    deep = (scene.astype(np.uint16) - 30) * 300
-    paths = [
-        shallow,
-        write(tmp_path / "b.tif", deep, transform=placed() * Affine.translation(60, 0)),
-    ]
-    mosaic = Mosaic.open(paths)
-    assert mosaic.stretches[0] is None and mosaic.stretches[1] == mosaic.stretch is not None
-    assert "8 bits separately" in caplog.text
-    pixels = read(paths, 100)
-    assert pixels.valid[2:-2, 2:-2].all()
-    assert pixels.rgb[:, :45].std() > 20 and pixels.rgb[:, -45:].std() > 20
-
-
-def test_grey_is_that_of_the_colours(tmp_path):
-    size = 260
-    path = write(tmp_path / "a.tif", smooth_scene(size), transform=placed(gsd_m=0.5, size=size))
-    with sheet_of(path, 100) as sheet:
-        colour, grey = sheet.read(0, 0, 100, 100), sheet.read_grey(0, 0, 100, 100)
-    assert np.abs(colour.grey.astype(int) - grey.grey).max() <= 1
-    np.testing.assert_array_equal(colour.valid, grey.valid)
-
-
 def test_files_that_a_window_depends_on(tmp_path):
     paths = cut(tmp_path, smooth_scene(120), placed(), 30)
     with sheet_of(paths, 100) as sheet:

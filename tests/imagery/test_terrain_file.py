@@ -194,11 +194,6 @@ def test_files_that_are_no_terrain_are_refused(make_dem, change, words):
         open_dem(make_dem(change=change), "msl")
 
 
-def test_a_constant_terrain_is_named(make_dem, caplog):
-    open_dem(make_dem(change=lambda heights: np.zeros_like(heights)), "msl")
-    assert "0 m high everywhere" in caplog.text
-
-
 def test_files_that_cannot_be_read(tmp_path, make_dem):
     with pytest.raises(MissingFileError, match="terrain file does not exist"):
         open_dem(tmp_path / "none.tif")
@@ -209,15 +204,3 @@ def test_files_that_cannot_be_read(tmp_path, make_dem):
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(ImageryError, match="terrain file cannot be read"):
         open_dem(path, "msl")(*places(0.0, -2000.0))
-
-
-def test_a_large_file_is_read_by_windows(make_dem, monkeypatch):
-    dem = open_dem(make_dem(), "msl")
-    read = []
-    original = type(dem)._metres
-    monkeypatch.setattr(
-        type(dem), "_metres", lambda self, raw: read.append(raw.size) or original(self, raw)
-    )
-    for _ in range(3):
-        dem(*places(0.0, 0.0))
-    assert len(read) == 1 and read[0] < 0.25 * SIDE**2

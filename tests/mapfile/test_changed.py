@@ -137,15 +137,6 @@ def test_a_truncated_layer_raises_or_is_what_was_opened(copy):
         assert refused
 
 
-def test_a_restored_file_does_not_bring_the_map_back(path):
-    opened, content = open_map(path), path.read_bytes()
-    os.truncate(path, 50)
-    assert opened.change()
-    path.write_bytes(content)
-    with pytest.raises(MapChangedError, match="rename"):
-        opened.arrays["tiles"]
-
-
 def test_a_removed_or_replaced_file_stays_open(path):
     opened = open_map(path)
     write_map(path, manifest(), arrays(seed=1))

@@ -9,7 +9,6 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -120,15 +119,6 @@ MASK_CASES = {
 }
 
 
-@pytest.mark.parametrize("how", MASK_CASES)
-def test_crafted_masks(tmp_path, how, caplog):
-    opened = open_map(masked(MASK_CASES[how], tmp_path))
-    with pytest.raises(MapFileError, match=r"registration layer is damaged .*mask"):
-        everything_of_the_layer(opened)
-    located(opened)
-    assert not any(record.exc_info for record in caplog.records)
-
-
 COMMANDS = """
 import json, sys
 from orthonav.cli import main
@@ -161,12 +151,6 @@ def test_crafted_maps_print_no_traceback(tmp_path, flight_path):
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     codes = json.loads(done.stderr.splitlines()[-1])
     assert len(codes) == len(commands) and set(codes) <= {0, 1, 3, 4}
-
-
-def test_an_encoded_preview_of_another_kind(tmp_path):
-    encoded = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1]
-    with pytest.raises(MapFileError, match="preview"):
-        preview(open_map(written(tmp_path / "a.onav", {"sheet0/preview_jpeg": encoded})))
 
 
 def test_a_coarsest_level_of_gigapixels(tmp_path):

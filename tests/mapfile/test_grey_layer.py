@@ -18,7 +18,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile import layer as layer_module
-from orthonav.core.mapfile.layer import ChunkTable, part_names
+from orthonav.core.mapfile.layer import part_names
 from orthonav.ground.build.layer import GreyLayerWriter
 
 SHAPE, CHUNK_PX = (150, 210), 64
@@ -84,16 +84,6 @@ def whole(layer, level):
     return layer.read(level, 0, 0, *layer.shape(level))
 
 
-def test_levels_and_shapes(layer):
-    assert layer.levels == 3
-    assert [layer.shape(level) for level in range(3)] == [(150, 210), (75, 105), (38, 53)]
-    for level in (-1, 3):
-        with pytest.raises(IndexError, match="level must be 0 to 2"):
-            layer.shape(level)
-        with pytest.raises(IndexError, match="level must be 0 to 2"):
-            layer.read(level, 0, 0, 5, 5)
-
-
 def test_what_was_written_comes_back(layer):
     grey, valid = imagery()
     read, read_valid = whole(layer, 0)
@@ -141,41 +131,6 @@ def test_only_the_chunks_touched_are_decoded_and_once(layer, decoded):
     assert len(decoded) == 4
     layer.read(2, 0, 0, 38, 53)
     assert decoded[4:] == [(38, 53)]
-
-
-def test_the_cache_is_bounded(opened, decoded):
-    layer = GreyLayer.of(opened, cache_bytes=3 * 2 * CHUNK_PX**2)
-    for _ in range(2):
-        for level in range(3):
-            whole(layer, level)
-            assert 0 < layer._cache.held_bytes <= 3 * 2 * CHUNK_PX**2
-    before = len(decoded)
-    whole(layer, 2)
-    assert len(decoded) == before  # the last used are those kept
-    none = GreyLayer.of(opened, cache_bytes=0)
-    first, again = whole(none, 0), whole(none, 0)
-    np.testing.assert_array_equal(first[0], again[0])
-    assert none._cache.held_bytes == 0
-
-
-def test_the_chunk_used_longest_ago_goes_first(opened, decoded):
-    layer = GreyLayer.of(opened, cache_bytes=3 * CHUNK_PX**2)
-    a, b, c = (0, 64), (0, 130), (70, 130)  # the last one has a mask
-    for place in (a, b, a, c):
-        layer.read(0, *place, 5, 5)
-    assert len(decoded) == 3
-    layer.read(0, *a, 5, 5)
-    assert len(decoded) == 3
-    layer.read(0, *b, 5, 5)
-    assert len(decoded) == 4
-
-
-def test_what_is_changed_in_a_window_does_not_stay(layer):
-    first = layer.read(0, 0, 0, *SHAPE)
-    kept = first[0].copy(), first[1].copy()
-    first[0][:], first[1][:] = 7, True
-    for found, wanted in zip(layer.read(0, 0, 0, *SHAPE), kept, strict=True):
-        np.testing.assert_array_equal(found, wanted)
 
 
 def test_threads_may_share_it(opened):
@@ -285,14 +240,6 @@ def test_missing_parts(made, tmp_path, kind):
     left = {name: part for name, part in parts.items() if name != NAMES[kind]}
     with pytest.raises(MapFileError, match=f"{NAMES[kind]} must"):
         GreyLayer.of(write_layer(tmp_path / "odd.onav", info, left))
-
-
-@pytest.mark.parametrize("changes", [{"levels": 4}, {"levels": 2}, {"chunk_px": 32}], ids=str)
-def test_a_layer_with_other_chunks_than_stated_is_refused(made, tmp_path, changes):
-    info, parts = made
-    odd = write_layer(tmp_path / "odd.onav", dataclasses.replace(info, **changes), parts)
-    with pytest.raises(MapFileError, match="offsets must"):
-        GreyLayer.of(odd)
 
 
 def blobs_of(parts, kind):
@@ -410,16 +357,6 @@ def test_a_mask_that_is_none(made, tmp_path, mask):
     finally:
         tracemalloc.stop()
     assert peak < 1e6
-
-
-def test_a_mask_without_a_picture(made, tmp_path):
-    info, parts = made
-    layer = GreyLayer.of(write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, jpeg=b"")))
-    assert not layer.read(0, 0, 130, 10, 10)[1].any()  # wholly valid, had no mask
-    number = ChunkTable(*SHAPE, info.levels, CHUNK_PX).number(0, 0, 0)
-    odd = write_layer(tmp_path / "odd.onav", info, with_chunk(parts, number, jpeg=b""))
-    with pytest.raises(MapFileError, match="damaged"):
-        GreyLayer.of(odd).read(0, 0, 0, 10, 10)
 
 
 @settings(max_examples=200)

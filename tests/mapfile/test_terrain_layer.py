@@ -83,13 +83,6 @@ def test_holes_and_what_lies_outside_are_unknown(layer):
     assert np.isfinite(layer.at_en_m([-44.0, 100.0]))
 
 
-def test_a_map_without_terrain_is_as_before(tmp_path):
-    write_map(tmp_path / "a.onav", manifest(), arrays())
-    opened = open_map(tmp_path / "a.onav")
-    assert TerrainLayer.of(opened) is None
-    assert b"terrain" not in (tmp_path / "a.onav").read_bytes()
-
-
 @given(
     st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1), st.sampled_from([0, 0.3, 1])
 )

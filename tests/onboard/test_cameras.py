@@ -13,7 +13,6 @@ from orthonav.core.records import Telemetry
 from orthonav.onboard.cameras import (
     CameraGoneError,
     CameraImage,
-    CameraThread,
     FrozenCheck,
     LiveCamera,
     NewestImage,
@@ -60,18 +59,6 @@ class Device:
 
     def release(self):
         self.released = True
-
-
-def test_take_returns_the_newest_image():
-    newest = NewestImage()
-    for number in range(5):
-        newest.put(image(number))
-    assert newest.take(0).number == 4
-    assert newest.take(0) is None
-    assert (newest.taken, newest.replaced, newest.is_over) == (5, 4, False)
-    newest.put(image(5))
-    newest.end()
-    assert not newest.is_over and newest.take(1).number == 5 and newest.is_over
 
 
 def test_take_waits_for_an_image():
@@ -280,21 +267,3 @@ def test_hovering_is_not_frozen():
     """The same scene with the noise of a good sensor, one grey level."""
     scene, check = ground(), FrozenCheck()
     assert not any(check.is_repeat(sensed(scene, seed)) for seed in range(10))
-
-
-def test_a_moving_view_is_not_frozen():
-    scene, check = ground(), FrozenCheck()
-    assert not any(check.is_repeat(scene[:, i : i + 500]) for i in range(5))
-    assert not check.is_repeat(scene[:100, :500])  # another size
-
-
-def test_a_camera_reads_in_a_thread(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), noisy(0))
-    time, stopping = Time(), threading.Event()
-    source = Playback(
-        recorded_images(tmp_path), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
-    )
-    thread = CameraThread(source, stopping)
-    assert thread.newest.take(5).frame == "a.png"
-    thread.stop()
-    assert thread.newest.is_over

@@ -98,12 +98,6 @@ def test_missing_inputs_are_no_reason_right_after_the_start():
     assert old.reasons == ("no_camera", "link_down", "no_telemetry")
 
 
-def test_texts_name_every_reason():
-    assert Health(Level.OK).text() == "orthonav OK"
-    every = Health(Level.FAILED, tuple(FAULTS)).text()
-    assert every == f"orthonav FAILED: {', '.join(FAULTS)}"
-
-
 def test_changes_are_reported_at_most_every_five_seconds():
     reporter, good, bad = HealthReporter(), Health(Level.OK), Health(Level.DEGRADED, ("lost",))
     reported = [

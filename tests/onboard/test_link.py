@@ -9,7 +9,7 @@ import time
 import pytest
 from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
 
-from orthonav.core.errors import MissingExtraError, VariantError
+from orthonav.core.errors import VariantError
 from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.mavlink import Signing, Target, dialect, signing_timestamp
@@ -224,27 +224,6 @@ def test_timesync_is_answered_by_the_clock_of_the_stamps():
     px4_offset_us = ((answer["ts1"] // 1000) * 2 - (answer["tc1"] // 1000) * 2) // 2
     stamp_us = flying.link.boot_ns(flying.time.now_ns) // 1000
     assert stamp_us + px4_offset_us == pytest.approx(flying.boot_ns() // 1000, abs=1000)
-
-
-def test_a_restart_of_the_autopilot_is_detected(flying):
-    flying.hear(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=10.0))
-    for number in range(40):
-        flying.time.go(0.05)
-        flying.hear(flying.autopilot.attitude((number + 1) * 50 * MS, yaw_deg=70.0))
-    assert flying.link.status().jumps == 1
-    assert flying.telemetry().yaw_deg == pytest.approx(70.0, abs=1e-3)
-
-
-def test_a_port_that_fails_is_opened_again(flying):
-    flying.port.broken = OSError("unplugged")
-    assert flying.link.poll() == 0 and not flying.link.status().is_open
-    flying.port.broken = None
-    assert not flying.link.send(dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-    flying.link.poll()
-    assert flying.port.opened == 1  # not yet
-    flying.time.go(RETRY_S[0])
-    assert flying.hear(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=3.0)) == 1
-    assert flying.port.opened == 2 and flying.telemetry().yaw_deg == pytest.approx(3.0, abs=1e-3)
 
 
 def test_a_missing_port_is_retried_at_growing_intervals():
@@ -488,12 +467,6 @@ def test_the_link_thread_survives_exceptions(monkeypatch, caplog):
             time.sleep(0.02)
     thread.stop()
     assert link.counts["HEARTBEAT"] > 0 and "autopilot" in caplog.text
-
-
-def test_missing_pymavlink_is_named(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pymavlink.dialects.v20.common", None)
-    with pytest.raises(MissingExtraError, match="autopilot"):
-        AutopilotLink(Port().open, TelemetryBuffer(), Time().clocks)
 
 
 def test_heights_that_px4_names_otherwise(flying):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
-from orthonav.core.flight import open_flight, read_image
+from orthonav.core.flight import open_flight
 from orthonav.core.localize import Localizer
-from orthonav.core.records import Fix, NoFix, Prior, View
-from orthonav.onboard.run import SingleViews, localize_flight, locate_view
+from orthonav.core.records import NoFix, Prior
+from orthonav.onboard.run import SingleViews, localize_flight
 
 VIEWS = 8
 
@@ -88,12 +88,6 @@ def test_order_time_and_latency(localizer, short):
     assert all(0 < result.latency_ms < 60_000 for result in results)
 
 
-def test_views_can_be_reordered_or_left_out(localizer, short):
-    chosen = [short.views[4], short.views[1]]
-    results = list(localize_flight(SingleViews(localizer), short, views=chosen))
-    assert [result.frame for result in results] == [view.frame for view in chosen]
-
-
 def test_results_come_one_by_one(localizer, short):
     """A live flight cannot wait for its end."""
     taken = []
@@ -162,12 +156,3 @@ def test_the_heading_may_be_unknown(localizer, short):
         SingleViews(localizer, heading_known=False), short, views=views
     )
     assert set(outcomes(without_heading)) == {"fix"}
-
-
-def test_one_view_is_the_same_as_in_a_flight(localizer, short):
-    view = short.views[0]
-    alone, grey = SingleViews(localizer), read_image(view.path)
-    outcome, latency_ms = locate_view(alone, View(grey, short.camera, view.telemetry))
-    flown = next(localize_flight(SingleViews(localizer), short)).outcome
-    assert isinstance(outcome, Fix) and latency_ms > 0
-    assert (outcome.lat_deg, outcome.lon_deg) == (flown.lat_deg, flown.lon_deg)

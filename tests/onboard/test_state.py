@@ -100,11 +100,6 @@ def test_a_write_that_fails_leaves_the_old_one(tmp_path, monkeypatch, names_in):
     assert load(path) == SAVED and names_in(tmp_path) == ["state.json"]
 
 
-def test_a_missing_folder_is_an_error(tmp_path):
-    with pytest.raises(OSError):
-        save(tmp_path / "nowhere" / "state.json", SAVED)
-
-
 def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_path):
     path = tmp_path / "state.json"
     learnt = replace(unknown("camera"), mean=np.array([12.5, -3.25, 0.01, -0.02, 0.125]))

@@ -79,13 +79,6 @@ def test_dense_attitudes_are_extrapolated_a_little(every_ms, known):
     assert later.yaw_deg == pytest.approx(4 * every_ms * 0.1)
 
 
-def test_single_attitudes_are_not_extrapolated():
-    buffer = TelemetryBuffer()
-    assert buffer.covered_ns is None
-    attitude(buffer, 0)
-    assert buffer.covered_ns == 0
-
-
 def test_gaps_are_not_interpolated():
     buffer = TelemetryBuffer()
     assert buffer.at(0).ned_from_body is None and buffer.covered_ns is None
@@ -128,16 +121,6 @@ def test_a_distance_is_corrected_for_the_tilt():
     buffer.add_distance(1, 100.0)
     tilt = math.cos(math.radians(20)) * math.cos(math.radians(10))
     assert buffer.at(1).height_m == pytest.approx(100 * tilt)
-
-
-def test_velocity_and_height_of_the_local_frame():
-    buffer = TelemetryBuffer()
-    buffer.add_local(0, (10.0, 2.0, -1.0), -50.0)
-    buffer.add_local(1 * S, (12.0, 2.0, math.nan), -50.0)
-    vehicle = buffer.at(0)
-    assert vehicle.telemetry(0).vel_en_mps == (2.0, 10.0)
-    assert (vehicle.velocity_ned_mps[2], vehicle.down_m) == (-1.0, -50.0)
-    assert VehicleState(None).telemetry(0).vel_en_mps is None
 
 
 def circling(time_ns):
@@ -290,18 +273,6 @@ def test_heights_above_sea_and_home_are_apart_from_the_one_above_ground():
     buffer.add_height("distance", 0, 60.0)
     telemetry = buffer.at(0).telemetry(0)
     assert (telemetry.agl_m, telemetry.home_m, telemetry.amsl_m) == (60.0, 90.0, 700.0)
-
-
-def test_a_second_height_above_sea_stands_in_for_the_first():
-    buffer = TelemetryBuffer()
-    buffer.add_height("altitude", 0, 650.0)
-    assert buffer.at(0).amsl_m == 650.0
-    buffer.add_height("amsl", 0, 700.0)
-    assert buffer.at(0).amsl_m == 700.0
-    only = TelemetryBuffer(heights=("home",))
-    only.add_height("amsl", 0, 700.0)
-    only.add_height("altitude", 0, 700.0)
-    assert math.isnan(only.at(0).amsl_m)
 
 
 @pytest.mark.parametrize("rate", [-0.022, 0.03, 2e-5])

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import textwrap
 import threading
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,16 +15,14 @@ import rasterio
 from rasterio.transform import Affine
 
 from helpers import textured
-from orthonav.core.errors import AreaError, ImageryError, OutputError, VariantError
+from orthonav.core.errors import ImageryError, OutputError
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.core.tiles.represent import Gray
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.block_cache import BlockCache
 from orthonav.ground.build.calibrate import CropSampler, RegistrationCalibration
-from orthonav.ground.build.sheet import AHEAD, Block, SheetPictures, SheetReader, grid_of, in_order
+from orthonav.ground.build.sheet import AHEAD, SheetPictures, SheetReader, grid_of, in_order
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Route
 
 BLOCKS = 9
 SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
@@ -100,12 +97,6 @@ def test_any_number_of_workers_gives_the_same_bytes(ortho, tmp_path, request_):
         for workers in (1, 3)
     ]
     assert maps[0] == maps[1]
-
-
-@pytest.mark.parametrize("workers", [0, -1, 65])
-def test_how_many_workers_may_be(ortho, tmp_path, workers):
-    with pytest.raises(VariantError, match="workers"):
-        built(ortho, tmp_path / "a.onav", workers=workers)
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -271,21 +262,6 @@ def test_a_work_folder_that_was_named(ortho, tmp_path, names_in, monkeypatch, re
     assert names_in(tmp_path) == ["map.onav", "work", "work/mine.txt"]
 
 
-def test_what_is_not_ours_in_the_folder_stays(ortho, tmp_path, names_in):
-    folder = tmp_path / "map.onav.work"
-    folder.mkdir()
-    (folder / "letter.npz").write_text("mine")
-    built(ortho, tmp_path / "map.onav")
-    assert names_in(tmp_path) == ["map.onav", "map.onav.work", "map.onav.work/letter.npz"]
-
-
-def test_an_area_without_tiles_leaves_nothing(ortho, tmp_path, names_in):
-    route = Route(((46.4, 3.0), (46.401, 3.001)))
-    with pytest.raises(AreaError):
-        built(ortho, tmp_path / "map.onav", route=route, band_m=900.0)
-    assert names_in(tmp_path) == []
-
-
 def test_a_full_disk_is_an_error_and_leaves_no_partial_block(
     ortho, tmp_path, monkeypatch, reads, whole
 ):
@@ -314,15 +290,6 @@ def test_too_little_disk_space_is_an_error_before_reading(ortho, tmp_path, monke
     assert not reads and not any(tmp_path.iterdir())
 
 
-def test_a_block_without_imagery_is_cached_too(tmp_path):
-    kept = BlockCache(tmp_path / "work", "request", 0)
-    block = Block(0, 0, 8, 8)
-    assert kept.begin([(block, None)]) == 0 and kept.load(block) is None
-    kept.store(block, {})
-    assert kept.load(block) == {} and kept.begin([(block, None)]) == 1
-    assert kept.begin([(block, "other")]) == 0 and not any((tmp_path / "work").iterdir())
-
-
 @contextmanager
 def worker(log=None):
     if log is not None:
@@ -337,22 +304,6 @@ def test_results_come_in_order(workers, count):
     found = list(in_order(range(count), lambda: worker(log), workers))
     assert found == [item * item for item in range(count)]
     assert len(set(log)) == len(log) <= max(1, min(workers, count))
-
-
-def test_work_does_not_run_far_ahead():
-    begun = []
-
-    @contextmanager
-    def noting():
-        def work(item):
-            begun.append(item)
-            return item
-
-        yield work
-
-    for item in in_order(range(100), noting, 3):
-        time.sleep(0.002)
-        assert max(begun) <= item + 1 + 3 + AHEAD
 
 
 @pytest.mark.parametrize("workers", [1, 3])

@@ -2,7 +2,6 @@
 
 import errno
 import os
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,21 +10,14 @@ import pytest
 from helpers import textured
 from orthonav.core.errors import (
     AreaError,
-    MissingFileError,
-    OrthonavError,
     OutputError,
     VariantError,
 )
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
-from orthonav.core.localize.confidence import (
-    TILE_FEATURES,
-    LogisticConfidence,
-    RegisteredConfidence,
-)
+from orthonav.core.localize.confidence import LogisticConfidence, RegisteredConfidence
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.core.tiles import represent
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import RADIUS_STRIDES
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -128,28 +120,12 @@ def test_the_same_request_gives_the_same_bytes(small_ortho, tmp_path, names_in, 
     assert recipe["overlap"] == 0.75 and recipe["seed"] == request_.get("seed", 0)
 
 
-def test_the_recipe_is_in_the_map(small_ortho, tmp_path):
-    recipe = built(small_ortho, tmp_path, **REQUESTS["both"]).manifest.recipe
-    assert recipe["embed"] == {"name": "gradient", "cells": 16, "dims": 32, "floor": 0.6}
-    assert recipe["represent"] == {"name": "canny", "low": 100.0, "high": 200.0, "kernel": 3}
-
-
 @pytest.mark.parametrize("edges", ["gray", "canny", "gradient"])
 def test_one_channel_is_compared_on_finer_cells(small_ortho, tmp_path, edges):
     chosen = built(small_ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
     assert chosen == (8 if edges == "gradient" else 16)
     stated = built(small_ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
     assert stated.manifest.recipe["embed"]["cells"] == 4
-
-
-@pytest.mark.long
-def test_another_seed_changes_the_calibration_only(small_ortho, tmp_path, calibrated):
-    a = built(small_ortho, tmp_path, "a.onav", **WITH_LAYER)
-    b = built(small_ortho, tmp_path, "b.onav", **WITH_LAYER, seed=1)
-    assert a.manifest.confidence and b.manifest.confidence
-    for name, part in a.arrays.items():
-        np.testing.assert_array_equal(part, b.arrays[name])
-    assert a.manifest.confidence != b.manifest.confidence
 
 
 def test_the_whole_imagery_is_covered(ortho, tmp_path, frame):
@@ -191,25 +167,6 @@ def test_a_band_around_a_route_is_covered(ortho, tmp_path, frame):
     centres = frame.en_from_latlon(*sheet.frame.latlon_from_en(centres_en_m(opened)))
     assert inside_band(centres, a, b, 40.0 + stride_m).all()
     assert sheet.tiles == len(centres) < sheet.grid.rows * sheet.grid.cols / 2
-
-
-def test_imagery_with_a_hole_is_covered_around_it(make_ortho, tmp_path, frame):
-    grey = textured()
-    grey[150:300, 170:260] = 0
-    opened = built(make_ortho(tmp_path / "hole.tif", grey, nodata=0), tmp_path)
-    cols, rows = np.meshgrid(np.arange(400), np.arange(400))
-    missing = cv2.dilate((grey == 0).astype(np.uint8), np.ones((65, 65), np.uint8)) > 0
-    points = np.stack([cols + 0.5 - 200, 200 - rows - 0.5], axis=-1)[40:360:5, 40:360:5]
-    points = points.reshape(-1, 2)[~missing[40:360:5, 40:360:5].ravel()]
-    stride_m = opened.manifest.sheets[0].grid.stride_m
-    assert farthest_m(points, opened, frame).max() <= stride_m / 2 + 0.5
-    assert farthest_m(np.array([[215 - 200, 200 - 225.0]]), opened, frame)[0] > stride_m
-
-
-@pytest.mark.parametrize("asked, expected", [(None, 1.0), (1.7, 1.7)])
-def test_ground_resolution(ortho, tmp_path, asked, expected):
-    grid = built(ortho, tmp_path, gsd_m=asked, tile_px=32).manifest.sheets[0].grid
-    assert grid.gsd_m == expected and grid.stride_m == 8 * expected
 
 
 def test_the_finest_orthophoto_gives_the_resolution(make_ortho, tmp_path):
@@ -256,16 +213,6 @@ def test_the_manifest(small_ortho, tmp_path):
     )
 
 
-def test_the_preview_shows_the_area(small_ortho, tmp_path):
-    opened = built(small_ortho, tmp_path)
-    picture = cv2.imdecode(opened.array("sheet0/preview_jpeg", np.uint8, 1), cv2.IMREAD_GRAYSCALE)
-    grid = opened.manifest.sheets[0].grid
-    assert picture.shape[0] / picture.shape[1] == pytest.approx(
-        grid.height_px / grid.width_px, rel=0.02
-    )
-    assert picture.std() > 10
-
-
 REFUSED = {
     "both": (lambda frame: {"bounds_deg": (2, 46, 3, 47), "route": ROUTE}, AreaError, "not both"),
     "band alone": (lambda frame: {"band_m": 100.0}, AreaError, "needs a route"),
@@ -304,19 +251,6 @@ ROUTE = Route(((46.0, 2.0), (46.001, 2.001)))
 def test_what_cannot_be_built(ortho, tmp_path, frame, names_in, request_, error, message):
     with pytest.raises(error, match=message):
         built(ortho, tmp_path, **request_(frame))
-    assert names_in(tmp_path) == []
-
-
-def test_imagery_without_any_pixel(make_ortho, tmp_path, names_in):
-    nothing = make_ortho(tmp_path / "nothing.tif", np.zeros((300, 300), np.uint8), nodata=0)
-    with pytest.raises(OrthonavError, match=r"valid|nodata"):
-        built(nothing, tmp_path)
-    assert names_in(tmp_path) == ["nothing.tif"]
-
-
-def test_imagery_that_is_not_there(tmp_path, names_in):
-    with pytest.raises(MissingFileError):
-        built(tmp_path / "no.tif", tmp_path)
     assert names_in(tmp_path) == []
 
 
@@ -409,40 +343,10 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     assert np.isfinite(own).all() and own.min() >= 0 and max(own.max(), false.max()) <= 1
 
 
-def test_confidence_is_a_probability_whatever_the_evidence(localizer):
-    rng = np.random.default_rng(0)
-    for scale in (0, 1, 1e3, 1e300):
-        for values in rng.uniform(-1, 1, (20, len(TILE_FEATURES))) * scale:
-            confidence = localizer.tiles.confidence(dict(zip(TILE_FEATURES, values, strict=True)))
-            assert 0 <= confidence <= 1
-
-
 def test_the_stated_error_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, calibrated):
     for opened in (open_map(map_path), built(ortho, tmp_path)):
         grid = opened.manifest.sheets[0].grid
         assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
-
-
-def test_slow_representations_are_calibrated_on_fewer_crops(small_ortho, tmp_path, monkeypatch):
-    """For representations that take minutes; counted by the reported progress."""
-    crops = {}
-    for name in ("canny", "slow"):
-        if name == "slow":
-            table = {**represent.TABLE, "canny": replace(represent.TABLE["canny"], flies=False)}
-            monkeypatch.setattr(represent, "TABLE", table)
-        monkeypatch.setattr("orthonav.ground.build.calibrate.SLOW_CROPS", 6)
-        shares = []
-
-        def progress(stage, share, shares=shares):
-            if stage == "calibrate":
-                shares.append(share)
-
-        request = BuildRequest(
-            [small_ortho], tmp_path / f"{name}.onav", tile_px=64, edges="canny", registration=False
-        )
-        build_map(request, progress)
-        crops[name] = len(shares)
-    assert crops["slow"] == 6 < crops["canny"]
 
 
 @pytest.mark.parametrize("kind", ["bounds", "route"])

@@ -1,7 +1,6 @@
 """What a map learns of its own registration: which views to believe, and how dates agree."""
 
 import logging
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +9,7 @@ import pytest
 from helpers import textured
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.confidence import (
-    USUAL_CHANCES,
-    USUAL_CONFIDENCE,
-    RegisteredConfidence,
-)
+from orthonav.core.localize.confidence import USUAL_CONFIDENCE, RegisteredConfidence
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import SheetInfo, open_map
 from orthonav.ground.build import BuildRequest, build_map
@@ -23,7 +18,6 @@ from orthonav.ground.build.calibrate import (
     FLOOR_LIMITS_PX,
     FLOOR_PX,
     Crop,
-    RegistrationCalibration,
     calibrate_registration,
 )
 from orthonav.ground.build.layer import halved
@@ -103,32 +97,6 @@ def test_the_same_seed_gives_the_same(localizer, learnt):
     assert calibrated(localizer, crops_of(GREY)) == learnt
 
 
-def test_another_seed_gives_another(localizer, learnt):
-    other = calibrated(localizer, crops_of(GREY), seed=1)
-    assert other.confidence != learnt.confidence and other.floor_px == learnt.floor_px == FLOOR_PX
-
-
-def test_no_more_views_are_made_than_asked_for(localizer, monkeypatch):
-    monkeypatch.setattr(module, "_placed", lambda *_: None)
-    crops, calls = crops_of(GREY, 7), []
-    for views, expected in ((2, 2), (4, 4), (50, 7)):
-        calls.clear()
-        calibrate_registration(localizer, crops, [], views, 0, lambda *call: calls.append(call))
-        assert len(calls) == expected
-
-
-def test_crops_are_unchanged_and_progress_is_reported(localizer):
-    crops, calls = crops_of(GREY, 6), []
-    kept = [crop.grey.copy() for crop in crops]
-    for crop in crops:
-        crop.grey.flags.writeable = False
-    calibrated(localizer, crops, report=lambda *call: calls.append(call))
-    assert all(np.array_equal(crop.grey, grey) for crop, grey in zip(crops, kept, strict=True))
-    shares = [share for _, share in calls]
-    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) >= 6
-    assert {stage for stage, _ in calls} == {"calibrate registration"}
-
-
 def verdicts(localizer, confidence, crops, mirrored):
     """Confidence in views of crops as they are, and how far from the truth they were placed."""
     rng = np.random.default_rng(5)
@@ -152,20 +120,6 @@ def test_views_of_the_map_are_confident_and_mirrored_ones_are_not(localizer, lea
     assert own.min() > false.max()
 
 
-def test_views_of_crops_are_vertical_with_telemetry_errors(localizer):
-    rng = np.random.default_rng(1)
-    crop = crops_of(GREY, 1)[0]
-    off = []
-    for _ in range(60):
-        view = module._view(rng, crop.grey, localizer.grid)
-        grey, camera, telemetry = view.grey, view.camera, view.telemetry
-        assert grey.shape == (camera.height_px, camera.width_px) and grey.dtype == np.uint8
-        assert 0.5 * TILE_PX < camera.width_px <= TILE_PX and grey.std() > 5
-        assert telemetry.pitch_deg == telemetry.roll_deg == 0
-        off.append(telemetry.agl_m / camera.fx_px / localizer.grid.gsd_m - 1)
-    assert 0.5 * module.AGL_STD < np.std(off) < 1.5 * module.AGL_STD
-
-
 @pytest.mark.parametrize(
     "moved_px, expected",
     [
@@ -180,19 +134,10 @@ def test_the_floor_is_the_offset_of_the_other_date(localizer, moved_px, expected
     assert found.floor_px == pytest.approx(expected, rel=0.06)
 
 
-def test_a_few_views_of_another_date_say_nothing(localizer):
-    later = crops_of(GREY, 5, seed=2, moved_px=(2, 1))
-    assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
-
-
 def test_another_place_does_not_count_as_another_date(localizer):
     """What is not found at its place is wrong, not badly registered."""
     later = crops_of(textured((SIDE_PX, SIDE_PX), 7), 8, seed=2)
     assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
-
-
-def test_without_crops_the_confidence_is_the_usual_one(localizer):
-    assert calibrated(localizer, []) == RegistrationCalibration(USUAL_CONFIDENCE, FLOOR_PX)
 
 
 def test_mirrored_views_measure_chance_only(localizer, learnt):
@@ -200,22 +145,6 @@ def test_mirrored_views_measure_chance_only(localizer, learnt):
     assert learnt.confidence == RegisteredConfidence.usual(chances) != USUAL_CONFIDENCE
     few = calibrated(localizer, crops_of(GREY, module.MIN_NEGATIVES - 1))
     assert few.confidence == USUAL_CONFIDENCE
-
-
-@pytest.mark.parametrize("of_two", [0, module.MIN_NEGATIVES - 1, module.MIN_NEGATIVES])
-def test_views_of_one_level_do_not_lower_the_chance_of_two(of_two):
-    """On maps of small tiles most views are judged and finished at one level."""
-    one = {"strength": 16.0, "look": 16.0, "fine": math.nan, "detail_ratio": math.nan}
-    two = {"strength": 40.0, "look": 16.0, "fine": math.nan, "detail_ratio": 1.5}
-    usual = 16.0 + USUAL_CHANCES.total - USUAL_CHANCES.look
-    chances = module._chances([one] * 20 + [two] * of_two)
-    assert chances.look == 16.0
-    assert chances.total == pytest.approx(40.0 if of_two == module.MIN_NEGATIVES else usual)
-
-
-def test_another_date_draws_the_usual_weights_to_it(localizer):
-    made = calibrated(localizer, crops_of(GREY), crops_of(GREY, seed=2)).confidence
-    assert made != RegisteredConfidence.usual(made.chances)
 
 
 def test_without_mirrored_views_the_weights_are_the_usual_ones(localizer, monkeypatch):

@@ -60,27 +60,6 @@ def test_tiles_are_embedded_as_from_the_imagery(cells):
     assert alike.sum(axis=1).min() > 0.999
 
 
-def test_threads_learn_and_embed_the_same(cells, monkeypatch):
-    monkeypatch.setattr("orthonav.core.tiles.whitened.CHUNK_TILES", 4)
-    tiles_px = np.mgrid[:6, :5].reshape(2, -1).T * 32
-    one, three = (learn(WhitenedRecipe(dims=16), cells, tiles_px, each) for each in (1, 3))
-    assert np.array_equal(one.mean, three.mean) and np.array_equal(one.basis, three.basis)
-    assert np.array_equal(one.tiles(cells, tiles_px), one.tiles(cells, tiles_px, 3))
-
-
-@pytest.mark.parametrize("step", [1, 2, 3])
-def test_cells_of_tiles_are_those_of_the_sheet(step):
-    sheet = CellSheet(CellLayout(4 * step, 4), 4 * (32 * step + 20), 4 * (32 * step + 9), 2)
-    sheet.means[:] = np.random.default_rng(0).random(sheet.means.shape)
-    tiles_px = np.array([[0, 0], [4, 12], [20, 8]])
-    reach = np.arange(32) * step
-    row, col = (tiles_px // 4).T
-    expected = sheet.means[(row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]]
-    assert np.array_equal(sheet.micro_cells(sheet.means, tiles_px), expected)
-    with pytest.raises(IndexError):
-        sheet.micro_cells(sheet.means, np.array([[400, 0]]))
-
-
 def test_windows_may_reach_beyond_the_sheet(cells):
     found = stored(cells)
     rows, cols = cells.valid.shape
@@ -101,14 +80,6 @@ def test_shares_are_stored_only_for_incomplete_cells(cells):
     assert set(parts) == {"sheet0/cells/codes", "sheet0/cells/scale"}
     means, share = stored(whole).read(0, 0, 4, 4)
     assert (share == 1).all() and not means.any()
-
-
-def test_one_channel_is_stored_as_well():
-    grey = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 1)
-    grey.means[:] = np.random.default_rng(0).random(grey.means.shape)
-    grey.valid[:] = 1
-    means, _ = stored(grey).read(0, 0, *grey.valid.shape)
-    assert np.abs(means - grey.means).max() < 0.002
 
 
 @pytest.mark.parametrize("name", ["codes", "scale", "valid"])

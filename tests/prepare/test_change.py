@@ -22,31 +22,6 @@ def alike(one, other):
     return float((parts[0] * parts[1]).sum() / np.sqrt(np.prod([(p**2).sum() for p in parts])))
 
 
-@pytest.mark.parametrize("size", [12, 16, 33, 64, 129, 384])
-@pytest.mark.parametrize("other_size", [16, 64, 100])
-def test_shape_and_dtype(size, other_size):
-    grey, other = textured((400, 400), 3)[:size, :size], OTHER[:other_size, :other_size]
-    for seed in range(3):
-        out = drawn(seed, grey, other)
-        assert out.shape == (size, size) and out.dtype == np.uint8
-
-
-def test_inputs_untouched():
-    grey, other = GREY.copy(), OTHER.copy()
-    grey.flags.writeable = other.flags.writeable = False
-    for seed in range(5):
-        out = drawn(seed, grey, other)
-        assert not np.shares_memory(out, grey) and not np.shares_memory(out, other)
-    np.testing.assert_array_equal(grey, GREY)
-    np.testing.assert_array_equal(other, OTHER)
-
-
-def test_views_into_larger_pictures_are_taken():
-    large = textured((300, 300), 4)
-    window = large[10:266:2, 150:22:-1]
-    np.testing.assert_array_equal(drawn(5, window), drawn(5, window.copy()))
-
-
 def test_the_same_seed_gives_the_same_picture():
     for seed in range(4):
         np.testing.assert_array_equal(drawn(seed), drawn(seed))
@@ -60,14 +35,6 @@ def test_most_pictures_still_show_the_same_ground_in_place():
     best = drawn(int(np.argmax(likes)))
     moved = [alike(best, np.roll(GREY, shift, (0, 1))) for shift in ((0, 2), (2, 0), (-2, 0))]
     assert max(likes) > max(moved) + 0.1
-
-
-def test_contrast_and_light_differ_from_draw_to_draw():
-    pictures = [drawn(seed).astype(float) for seed in range(30)]
-    assert np.ptp([each.mean() for each in pictures]) > 40
-    assert np.ptp([each.std() for each in pictures]) > 5
-    turned = [np.corrcoef(each.ravel(), GREY.ravel())[0, 1] for each in pictures]
-    assert np.ptp(turned) > 0.3
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])

@@ -11,11 +11,9 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
 from orthonav.core.tiles.network import NetworkEmbedder
-from orthonav.core.tiles.represent import TABLE
 from orthonav.core.tiles.words import WordsEmbedder
-from orthonav.core.variants import make_variant
 from orthonav.ground.build import BuildRequest, build_map, encoders
-from orthonav.ground.build.encoders import stored_representation, usual_edges
+from orthonav.ground.build.encoders import usual_edges
 from orthonav.onboard.run import SingleViews, localize_flight
 
 SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
@@ -144,28 +142,6 @@ def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, say
     with pytest.raises(VariantError, match=says):
         build_map(request)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow  # another method than the default one
-def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
-    parts = []
-    for name in ("a.onav", "b.onav"):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
-            request = BuildRequest(
-                [area.past], tmp_path / name, method="bovw:words=256", registration=False, **SMALL
-            )
-            build_map(request)
-        parts.append((tmp_path / name).read_bytes())
-    assert parts[0] == parts[1]
-
-
-def test_a_map_does_not_name_the_machine_that_built_it(monkeypatch):
-    monkeypatch.setenv("ORTHONAV_SAM_WEIGHTS", "")
-    made = make_variant(TABLE, "sam:weights=/home/somebody/sam,cache=/home/somebody/kept,grid=16")
-    stored = stored_representation(made)
-    assert stored["name"] == "sam" and stored["grid"] == 16
-    assert stored["weights"] == stored["cache"] == ""
 
 
 def test_words_of_files_elsewhere_do_not_fly():

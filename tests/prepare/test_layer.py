@@ -1,6 +1,5 @@
 """The registration layer as built: the pyramid is exact, however its blocks come, and small."""
 
-import json
 import tracemalloc
 
 import cv2
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.cli import main
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import ChunkTable, decode_chunk, part_names
 from orthonav.ground.build import BuildRequest, build_map
@@ -18,7 +16,6 @@ from orthonav.ground.build.layer import (
     GreyLayerWriter,
     encode_chunk,
     halved,
-    level_count,
 )
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
@@ -120,39 +117,6 @@ def test_how_the_blocks_come_does_not_matter(steps):
             np.testing.assert_array_equal(part, other[name])
 
 
-def test_blocks_that_never_come_are_not_valid():
-    grey = textured((150, 237))
-    valid = np.ones(grey.shape, bool)
-    writer = GreyLayerWriter(150, 237, chunk_px=32)
-    came = np.zeros(grey.shape, bool)
-    for row, col in ((0, 0), (40, 80), (90, 160)):
-        part = np.s_[row : row + 43, col : col + 77]
-        writer.add(row, col, grey[part], valid[part])
-        came[part] = True
-    info, parts = writer.finish()
-    wanted_info, wanted = written(np.where(came, grey, 0).astype(np.uint8), came, chunk_px=32)
-    assert info == wanted_info
-    for name in parts:
-        np.testing.assert_array_equal(parts[name], wanted[name])
-
-
-@pytest.mark.parametrize(
-    "shape, levels",
-    [
-        ((1, 1), 1),
-        ((64, 64), 1),
-        ((16, 65), 2),
-        ((128, 128), 2),
-        ((129, 20), 3),
-        ((2272, 2272), 7),
-        ((50_000, 1000), 10),
-        ((60_000_000, 1), 10),
-    ],
-)
-def test_levels_end_at_64_px_or_after_ten(shape, levels):
-    assert level_count(*shape) == level_count(*shape[::-1]) == levels
-
-
 def test_a_chunk_without_a_hole_has_no_mask_and_holes_cost_no_ringing():
     grey = textured((64, 64))
     full = np.ones((64, 64), bool)
@@ -185,12 +149,6 @@ def test_noise_cannot_make_it_large(kind):
     assert total_bytes(parts) < 4 / 3 * MAX_BYTES_PER_PX * grey.size
     holed = written(grey, np.random.default_rng(1).random(grey.shape) < 0.7)[1]
     assert total_bytes(holed) < 0.8 * grey.size
-
-
-def test_nothing_at_all():
-    info, parts = written(np.zeros((300, 300), np.uint8), np.zeros((300, 300), bool))
-    assert info.valid_px == 0 and parts[NAMES["bytes"]].size == 0
-    assert not parts[NAMES["offsets"]].any()
 
 
 def test_memory_does_not_grow_with_the_sheet():
@@ -285,32 +243,3 @@ def test_without_a_layer(ortho, small_map, tmp_path):
     assert set(with_it.arrays) - set(without.arrays) == set(NAMES.values())
     for name, part in without.arrays.items():
         np.testing.assert_array_equal(part, with_it.arrays[name])
-
-
-def test_info_describes_the_layer(small_map, capsys):
-    opened = small_map
-    grey = opened.manifest.sheets[0].grey
-    assert main(["info", str(opened.path), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)["registration"]
-    size = sum(opened.arrays[name].nbytes for name in NAMES.values())
-    assert summary["bytes"] == size and summary["levels"] == grey.levels
-    assert summary["raw_bytes"] == 3 * grey.valid_px
-    assert summary["raw_ratio"] == pytest.approx(3 * grey.valid_px / size, abs=0.01)
-    assert summary["mb_per_km2"] == pytest.approx(size / grey.valid_px, rel=0.01)  # 1 m pixels
-    assert main(["info", str(opened.path)]) == 0
-    text = capsys.readouterr().out
-    assert f"registration layer of {size / 1e6:.3f} MB" in text
-    assert f"{grey.levels} levels, 1/{summary['raw_ratio']:.0f} of the raw orthophoto" in text
-
-
-def test_the_command_can_leave_it_out(ortho, tmp_path, capsys):
-    arguments = ["--ortho", str(ortho), "--tile-px", "64", "--overlap", "0.75", "-q"]
-    arguments += ["--calibration-views", "2"]
-    out = tmp_path / "map.onav"
-    assert main(["build", *arguments, "--no-registration", "--out", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["registration"] is None
-    assert main(["info", str(out)]) == 0
-    assert "no registration layer: positions at tile level only" in capsys.readouterr().out
-    assert main(["build", *arguments, "--out", str(out)]) == 0
-    assert "registration layer of" in capsys.readouterr().out
-    assert GreyLayer.of(open_map(out)) is not None

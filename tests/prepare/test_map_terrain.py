@@ -19,7 +19,6 @@ from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import open_map, write_map
-from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix
 from orthonav.ground.build.terrain import terrain_of_dem
@@ -87,14 +86,6 @@ def test_terrain_is_all_that_a_map_gains(run, make_ortho, tmp_path, monkeypatch)
     np.testing.assert_allclose(found, hill(*frame.en_from_latlon(lat, lon).T), atol=1)
 
 
-def test_info_shows_the_terrain(run, hill_map, map_path):
-    plain = json.loads(run("info", hill_map, "--json").out)["terrain"]
-    assert plain["posting_m"] == 25 and plain["mb_per_km2"] < 0.02
-    assert plain["low_m"] == pytest.approx(100, abs=1) and plain["datum"] == "MSL height"
-    assert "terrain    100 to 240 m above the sea every 25 m" in run("info", hill_map).out
-    assert json.loads(run("info", map_path, "--json").out)["terrain"] is None
-
-
 @pytest.mark.long
 def test_terrain_of_a_corridor_is_small_and_holes_are_named(tmp_path, caplog):
     def holed(heights):
@@ -147,7 +138,7 @@ def flown(area, frame, dem, tmp_path_factory):
         terrain=open_dem(dem, "msl"), seed=1,
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
+        patch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)
         simulate_flight(request)
     return out
 
@@ -268,27 +259,6 @@ def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
     assert done.code == 1 and "the terrain lies outside the map" in done.err
 
 
-def test_random_views_report_heights_above_sea_only(run, area, flown, dem, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.ground.simulate.imagery.COVERAGE_PX", 256)
-    done = run(
-        "simulate", "--ortho", area.present, "--random", 3, "--agl-m", 250, "--dem", dem,
-        "--dem-datum", "msl", "--camera", flown / "flight.json", "--out", tmp_path / "flight",
-    )  # fmt: skip
-    assert done.code == 0
-    reported = rows(tmp_path / "flight")
-    assert {row["agl_m"] for row in reported} == {"nan"} and "home_m" not in reported[0]
-    assert all(340 < float(row["amsl_m"]) < 500 for row in reported)
-
-
-def test_options_that_exclude_each_other(run, flown, map_path, dem, tmp_path):
-    for more, said in (
-        (("--dem-datum", "msl"), "give --dem too"),
-        (("--dem", dem, "--ground-alt-m", 5), "give it or --dem"),
-    ):
-        done = run("localize", map_path, flown, *more, "--out", tmp_path / "f.jsonl")
-        assert done.code == 1 and said in done.err and done.err.count("\n") == 1
-
-
 def test_terrain_is_flown_without_gdal_and_proj(hill_map, flown):
     script = f"""
 import sys
@@ -304,13 +274,3 @@ print(heights.corrected(view.telemetry).agl_m)
         [sys.executable, "-c", script], capture_output=True, text=True, env=dict(os.environ)
     )
     assert 200 < float(done.stdout) < 400, done.stderr
-
-
-def test_a_map_in_memory_has_its_terrain_too(hill_map):
-    opened = open_map(hill_map)
-    held = MapFile(
-        hill_map, 0, opened.manifest, {name: opened.arrays[name] for name in opened.arrays}
-    )
-    points = np.array([[0.0, 0.0], [100.0, 200.0]])
-    found = TerrainLayer.of(held).at_en_m(points)
-    np.testing.assert_array_equal(found, TerrainLayer.of(opened).at_en_m(points))

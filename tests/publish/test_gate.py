@@ -49,20 +49,6 @@ def test_positions_in_doubt_are_withheld_and_counted(reason, change, later_s) ->
     assert gate.withheld == {reason: 1}
 
 
-@pytest.mark.parametrize("state", [None, "tracking"])
-def test_a_confident_and_recent_position_passes(state: str | None) -> None:
-    gate = Gate()
-    passed = gate.admit(estimate_at(0.0, state=state), now(0.9))
-    assert passed is not None and passed.reset_counter == 0
-    assert not gate.withheld
-
-
-def test_no_fix_is_counted() -> None:
-    gate = Gate()
-    assert gate.admit(None, now(0)) is None
-    assert gate.withheld == {"no_fix": 1}
-
-
 def test_min_confidence_can_be_set() -> None:
     strict, lax = Gate(GateRules(min_confidence=0.99)), Gate(GateRules(min_confidence=0.5))
     assert strict.admit(estimate_at(0.0), now(0)) is None
@@ -198,14 +184,6 @@ def test_poles_and_the_antimeridian_are_no_jump(place: tuple[float, float]) -> N
     gate.admit(estimate_at(0.0, lat_deg=lat, lon_deg=lon), now(0))
     passed = gate.admit(estimate_at(1.0, lat_deg=lat, lon_deg=-lon), now(1))
     assert passed is not None and passed.reset_counter == 0
-
-
-def test_the_rate_of_messages_is_limited() -> None:
-    gate = Gate(GateRules(min_interval_s={"A": 1.0}))
-    sent = [gate.due("A", now(0.25 * step)) for step in range(17)]
-    assert [step for step, out in enumerate(sent) if out] == [0, 4, 8, 12, 16]
-    assert gate.sent == {"A": 5} and gate.withheld == {"rate:A": 12}
-    assert all(gate.due("B", now(0.0)) for _ in range(3))
 
 
 def test_views_with_a_small_jitter_all_pass() -> None:

@@ -5,7 +5,6 @@ The decoder is that of `wire`.
 
 import hashlib
 import math
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import MissingExtraError
-from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.onboard.messages.mavlink import (
     Packer,
@@ -26,7 +24,6 @@ from orthonav.onboard.messages.mavlink import (
     external_position_estimate,
     global_position_sensor,
     gps_input,
-    request_message,
     signing_timestamp,
     status_texts,
 )
@@ -255,12 +252,6 @@ def test_texts_of_any_length_arrive_whole(length: int) -> None:
     assert single or len(read[-1]["text"].rstrip(b"\0")) < 50  # this ends the text
 
 
-def test_a_message_is_requested() -> None:
-    read = sent(request_message(49, Target(3, 1)))
-    assert (read["target_system"], read["target_component"]) == (3, 1)
-    assert (read["command"], read["param1"], read["param7"]) == (512, 49.0, 0.0)
-
-
 def test_odometry_for_px4_is_north_east_down() -> None:
     read = sent(odometry(ESTIMATE, POSE, Autopilot.PX4))
     assert (read["frame_id"], read["child_frame_id"]) == (1, 1)
@@ -421,22 +412,6 @@ def test_ardupilot_converts_degrees_by_a_constant(
     assert east == pytest.approx(right * per_degree * scale, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("autopilot", "miss_m"), [(Autopilot.PX4, 29.7), (Autopilot.ARDUPILOT, 20.5)]
-)
-def test_ellipsoidal_metres_would_be_converted_to_another_position(
-    autopilot: Autopilot, miss_m: float
-) -> None:
-    """What true metres miss by, ten kilometres off in Brittany, in an autopilot's formula."""
-    frame = LocalFrame(48.0, -4.0)
-    true_en = np.array([[10_000.0, 0.0], [0.0, 10_000.0]])
-    misses = []
-    for east_north, lat, lon in zip(true_en, *frame.latlon_from_en(true_en), strict=True):
-        north, east = north_east_m(Origin(48.0, -4.0, 0), float(lat), float(lon), autopilot)
-        misses.append(math.hypot(north - east_north[1], east - east_north[0]))
-    assert max(misses) == pytest.approx(miss_m, abs=0.1)
-
-
 def test_a_signature_is_that_of_the_protocol() -> None:
     packer = Packer(signing=SIGNING)
     stamps = []
@@ -484,13 +459,3 @@ def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20.common", None)
     with pytest.raises(MissingExtraError, match=r"orthonav\[autopilot\]"):
         gps_input(ESTIMATE)
-
-
-def test_localizing_does_not_load_pymavlink() -> None:
-    script = (
-        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.core.flight.fixes, "
-        "orthonav.onboard.messages.gate, orthonav.onboard.messages.mavlink_local, "
-        "orthonav.onboard.messages.nmea\n"
-        "assert not [name for name in sys.modules if name.startswith('pymavlink')]"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
-from orthonav.onboard.messages.nmea import MPS_PER_KNOT, Quality, checksum, gga, gst, rmc
+from orthonav.onboard.messages.nmea import MPS_PER_KNOT, Quality, gga, gst, rmc
 
 MAX_LENGTH = 82  # characters of a sentence with `$` and the line end, NMEA 0183
 UTC_NS = 1_789_000_000_123_456_789  # 2026-09-10 00:26:40
@@ -68,11 +68,6 @@ def read(sentence: bytes) -> pynmeagps.NMEAMessage:
 )
 def test_sentences_equal_recorded_ones(made: bytes, golden: bytes) -> None:
     assert made == golden
-
-
-def test_the_checksum_is_that_of_a_published_sentence() -> None:
-    published = "GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
-    assert checksum(published) == "47"
 
 
 def test_pynmeagps_reads_every_field() -> None:

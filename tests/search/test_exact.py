@@ -41,38 +41,12 @@ def test_rows_give_the_same_as_all(cache_bytes, picked):
     np.testing.assert_allclose(some, index.scores(queries())[rows], atol=1e-6)
 
 
-def test_cached_and_uncached_agree_in_value_and_order():
-    stored = embeddings(3000)
-    blocks, cached = (ExactIndex(stored, limit).scores(queries()) for limit in (0, 2**27))
-    np.testing.assert_allclose(blocks, cached, atol=1e-6)
-    assert (blocks.argmax(axis=0) == cached.argmax(axis=0)).all()
-
-
 @CACHES
 def test_every_float16_is_decoded_exactly(cache_bytes):
     every = np.arange(2**16, dtype=np.uint16).view(np.float16)
     stored = every[np.isfinite(every)].reshape(-1, 2).copy()
     scores = ExactIndex(stored, cache_bytes).scores(np.eye(2, dtype=np.float32))
     assert (scores == stored.astype(np.float32)).all()
-
-
-@CACHES
-def test_storage_may_be_read_only_and_stays_as_it_is(cache_bytes, tmp_path):
-    stored = embeddings(1500)
-    np.save(tmp_path / "stored.npy", stored)
-    mapped = np.load(tmp_path / "stored.npy", mmap_mode="r")
-    index, asked = ExactIndex(mapped, cache_bytes), queries()
-    asked.flags.writeable = False
-    first, second = index.scores(asked), index.scores(asked)
-    assert len(index) == 1500
-    assert (first == second).all() and (mapped == stored).all()
-
-
-@CACHES
-def test_a_stored_embedding_finds_itself(cache_bytes):
-    stored = embeddings(2500)
-    asked = stored[[7, 1300, 2499]].astype(np.float32)
-    assert ExactIndex(stored, cache_bytes).scores(asked).argmax(axis=0).tolist() == [7, 1300, 2499]
 
 
 @pytest.mark.parametrize(
@@ -107,11 +81,6 @@ def test_best_is_that_of_all_scores(cache_bytes, count, asked):
     np.testing.assert_allclose(best, scores.max(axis=1), atol=1e-6)
     rows = np.random.default_rng(3).permutation(count)[:40]
     np.testing.assert_allclose(index.best(many, rows), best[rows], atol=1e-6)
-
-
-def test_the_best_of_no_queries_is_an_error():
-    with pytest.raises(ValueError, match="at least one query"):
-        ExactIndex(embeddings(4)).best(queries(0))
 
 
 def test_best_needs_little_memory():

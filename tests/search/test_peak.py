@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.tiles.position import TileNeighbours, find, parabola_peak
+from orthonav.core.tiles.position import TileNeighbours, parabola_peak
 
 GRID = TileGrid.covering((0.0, 0.0, 900.0, 600.0), gsd_m=1.0, tile_px=256, overlap=0.875)
 
@@ -29,13 +29,6 @@ def test_parabola_is_recovered(peak, curvature, height):
     behind, middle, ahead = (height - curvature * (x - peak) ** 2 for x in (-1.0, 0.0, 1.0))
     if middle >= behind and middle >= ahead:
         assert parabola_peak(behind, middle, ahead) == pytest.approx(peak, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "values", [(1, 1, 1), (2, 1, 0), (0, 1, 2), (np.nan, 1, 0), (0, 1, np.nan), (0, np.nan, 0)]
-)
-def test_no_peak_no_offset(values):
-    assert parabola_peak(*map(float, values)) == 0.0
 
 
 @given(st.floats(64, 830), st.floats(64, 530))
@@ -94,15 +87,6 @@ def test_missing_neighbours_leave_their_axis_alone():
     assert offset[0] == 0.0 and offset[1] == pytest.approx(0.25, abs=0.02)
 
 
-def test_borders_have_no_neighbours_around_the_corner():
-    centres = GRID.centres_en_m(tiles()).astype(np.float32)
-    neighbours = TileNeighbours(GRID, centres)
-    last_of_first_row = GRID.cols - 1
-    assert neighbours.beside(last_of_first_row, 1, 0) is None
-    assert neighbours.beside(0, 0, 1) is None
-    assert neighbours.beside(0, 1, 0) == 1
-
-
 @pytest.mark.parametrize("broken", ["reversed", "twice", "outside"])
 def test_centres_that_are_no_grid_are_refused(broken):
     centres = GRID.centres_en_m(tiles()).astype(np.float32)
@@ -114,8 +98,3 @@ def test_centres_that_are_no_grid_are_refused(broken):
         centres = centres - np.float32(10 * GRID.stride_m)
     with pytest.raises(MapFileError, match="grid"):
         TileNeighbours(GRID, centres)
-
-
-def test_find():
-    values = np.array([2, 3, 5, 8])
-    assert [find(values, value) for value in (2, 8, 4, 9, -1)] == [0, 3, None, None, None]

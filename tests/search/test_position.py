@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from orthonav.core.errors import VariantError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.tiles.position import RULES, TileNeighbours, check_rule, offset_en_m
+from orthonav.core.tiles.position import RULES, TileNeighbours, offset_en_m
 
 GRID = TileGrid.covering((0.0, 0.0, 800.0, 640.0), gsd_m=1.0, tile_px=256, overlap=0.875)
 ROWS, COLS = np.mgrid[: GRID.rows, : GRID.cols]
@@ -70,20 +69,6 @@ def test_a_part_of_the_tiles_is_a_part_of_the_answer(rule):
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("value", [0.0, -1.0, 1.0])
-def test_scores_that_say_nothing_move_nothing_far(rule, value):
-    scores = np.full(len(CENTRES), value, np.float32)
-    offset = offset_en_m(rule, scores, 0, None, CENTRES, NEIGHBOURS, GRID.stride_m)
-    assert np.isfinite(offset).all()
-
-
-@pytest.mark.parametrize("rule", RULES)
 def test_one_tile_alone_is_the_answer(rule):
     rows = np.array([7], np.intp)
     np.testing.assert_array_equal(position(rule, np.array([0.3], np.float32), rows), CENTRES[7])
-
-
-def test_rules_by_name():
-    assert [check_rule(rule) for rule in RULES] == list(RULES)
-    with pytest.raises(VariantError, match="unknown rule of position 'mean'"):
-        check_rule("mean")

@@ -1,7 +1,6 @@
 """Simulated flights of a real aircraft: wind, odometry, biases, clouds, ground beyond the map."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,16 +9,12 @@ from helpers import textured
 from orthonav.core.errors import AreaError, FlightError
 from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize import downsampled, rectify
-from orthonav.core.records import View
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route, distance_to_polyline_m
-from orthonav.ground.simulate.clouds import Clouds
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.imagery import reflected
 from orthonav.ground.simulate.motion import Wind
-from orthonav.ground.simulate.render import ViewEffects
+from orthonav.ground.simulate.render import Clouds, ViewEffects
 
 PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -104,28 +99,6 @@ def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):
     assert velocity[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
 
 
-def test_reported_velocity_drifts(fly, frame, tmp_path):
-    exact, truth = fly("exact", errors=Errors(velocity_drift=0.0), spacing_m=80.0, seed=2)
-    erring, same = fly("erring", errors=Errors(velocity_drift=0.1), spacing_m=80.0, seed=2)
-    assert truth == same
-    true, drifting = (reported(flight, "vel_en_mps")[:, 0] for flight in (exact, erring))
-    ratio = np.linalg.norm(drifting, axis=1) / np.linalg.norm(true, axis=1) - 1
-    assert 0.001 < np.abs(ratio).mean() < 0.3 and np.abs(np.diff(ratio)).max() < 0.05
-    header = (tmp_path / "erring/telemetry.csv").read_text().splitlines()[0]
-    assert "vel_east_mps,vel_north_mps" in header
-
-
-def test_turns_are_arcs(fly, frame):
-    flight, truth = fly(turn_radius_m=100.0, spacing_m=20.0)
-    yaw = reported(flight, "yaw_deg")[:, 0]
-    turned = (np.diff(yaw) + 180) % 360 - 180
-    assert turned.sum() == pytest.approx(90, abs=0.1)
-    assert np.abs(turned).max() < 1.1 * math.degrees(20 / 100)
-    places = np.array([frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
-    inside = np.linalg.norm(places - [-200.0, 0.0], axis=1)
-    assert inside[(yaw > 5) & (yaw < 85)] == pytest.approx(100, abs=0.5)
-
-
 def test_biases_are_constant(fly):
     exact, truth = fly("exact", errors=ALL, spacing_m=100.0, seed=3)
     bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
@@ -138,40 +111,6 @@ def test_biases_are_constant(fly):
     assert (reported(erring, *rest) == reported(exact, *rest)).all()
     for a, b in zip(pictures(exact), pictures(erring), strict=True):
         assert (a == b).all()
-
-
-@pytest.mark.long
-def test_the_mount_tilt_is_not_reported(fly, ortho, frame):
-    """A view shows the ground at the truth if it is levelled with the bias too."""
-    bias = Errors(attitude_std_deg=1.0, pitch_bias_deg=4.0, roll_bias_deg=-3.0)
-    straight, truth = fly("straight", camera=SEEN, errors=Errors(attitude_std_deg=1.0))
-    tilted, same = fly("tilted", camera=SEEN, errors=bias)
-    rest = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-    assert truth == same and (reported(straight, *rest) == reported(tilted, *rest)).all()
-
-    def alike(view, pitch_deg, roll_deg):
-        """Correlation of the levelled view with the orthophoto where it should lie."""
-        telemetry, size_px = view.telemetry, 64
-        corrected = replace(
-            telemetry,
-            pitch_deg=telemetry.pitch_deg + pitch_deg,
-            roll_deg=telemetry.roll_deg + roll_deg,
-        )
-        seen = View(read_image(view.path), SEEN, corrected)
-        levelled = rectify(downsampled(seen, 1.0), gsd_m=1.0, size_px=size_px)
-        west, north = (
-            frame.en_from_latlon(*truth[view.frame])
-            + levelled.offset_en_m
-            + [-size_px / 2, size_px / 2]
-        )
-        sheet = {"west_m": west, "north_m": north, "width_px": size_px, "height_px": size_px}
-        with Mosaic.open([ortho]).sheet(frame, **sheet, gsd_m=1.0) as raster:
-            ground = raster.read(0, 0, size_px, size_px).grey
-        return np.corrcoef(levelled.grey.ravel(), ground.ravel())[0, 1]
-
-    for view in tilted.views[::8]:
-        assert alike(view, 4.0, -3.0) > 0.98 and alike(view, 0.0, 0.0) < 0.8
-    assert alike(straight.views[0], 0.0, 0.0) > 0.98
 
 
 def test_clouds_hide_some_views_and_leave_the_others(fly):
@@ -221,20 +160,12 @@ def test_the_mirror_is_the_border(fly):
     assert alike > 0.9
 
 
-def test_mirrors_at_both_ends():
-    """The last row comes first again: nothing is skipped at the border."""
-    assert reflected(np.arange(-3, 9), 0, 3).tolist() == [2, 1, 0, 0, 1, 2, 2, 1, 0, 0, 1, 2]
-    assert reflected(np.arange(3, 8), 4, 6).tolist() == [4, 4, 5, 5, 4]
-
-
 REFUSED = {
-    "gale": ({"wind": Wind(25.0)}, "too strong"),
+    "gale": ({"wind": Wind(25.0)}, r"too strong .* airspeed of 25 m/s"),
     "turn": ({"turn_radius_m": -1.0}, "turn radius"),
-    "turn nan": ({"turn_radius_m": math.nan}, "turn radius"),
-    "cloud": ({"cloud_share": -0.1}, "cloud_share must be 0 to 1"),
-    "clouds": ({"cloud_share": 1.1}, "cloud_share must be 0 to 1"),
     "cloud nan": ({"cloud_share": math.nan}, "cloud_share must be 0 to 1"),
-    "spacing": ({"spacing_m": math.inf}, "above 0"),
+    "spacing": ({"spacing_m": 0.0}, "above 0"),
+    "far": ({"spacing_m": math.inf}, "above 0"),
     "speed": ({"airspeed_mps": math.nan}, "above 0"),
 }
 
@@ -259,25 +190,6 @@ def test_flights_that_cannot_be(fly, tmp_path, names_in, request_, message):
 def test_random_positions_refuse_route_options(fly, request, request_):
     with pytest.raises(FlightError, match=f"{request.node.callspec.id}: only along a route"):
         fly(route=None, random=3, **request_)
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("velocity_drift", -0.02),
-        ("velocity_drift", 2.0),
-        ("velocity_drift", math.nan),
-        ("yaw_bias_deg", math.nan),
-        ("yaw_bias_deg", 270.0),
-        ("agl_bias", 1.5),
-        ("agl_bias", math.nan),
-        ("pitch_bias_deg", -45.0),
-        ("roll_bias_deg", math.inf),
-    ],
-)
-def test_impossible_errors_are_refused(name, value):
-    with pytest.raises(FlightError, match=f"{name} must be"):
-        Errors(**{name: value})
 
 
 def test_the_command(run, ortho, frame, tmp_path):

@@ -73,12 +73,6 @@ def test_no_wind_gives_the_steady_path():
     assert np.abs(still.times_s - steady.times_s).max() < 1e-9
 
 
-@pytest.mark.parametrize("speed", [18.0, 25.0, 60.0])
-def test_wind_stronger_than_the_airspeed_is_refused(speed):
-    with pytest.raises(FlightError, match=r"too strong .* airspeed of 25 m/s"):
-        flown(LINE, Wind(speed))
-
-
 @pytest.mark.parametrize(
     "wind, message",
     [
@@ -91,11 +85,6 @@ def test_wind_stronger_than_the_airspeed_is_refused(speed):
 def test_impossible_wind_is_refused(wind, message):
     with pytest.raises(FlightError, match=message):
         Wind(*wind)
-
-
-def test_a_flight_that_never_ends_is_cut_short():
-    way = windy_path(NORTH, 100.0, AIRSPEED, Wind(8.0), np.random.default_rng(0), 20)
-    assert len(way.times_s) == 21
 
 
 def test_velocities_integrate_to_the_path():
@@ -148,16 +137,6 @@ def test_a_rounded_corner_is_an_arc_of_the_radius():
     first = made[1:48]  # 90 deg in steps of 2
     assert first[0] == pytest.approx([0, 3600]) and first[-1] == pytest.approx([400, 4000])
     assert np.linalg.norm(first - [400, 3600], axis=1) == pytest.approx(400)
-
-
-def test_where_there_is_no_room_the_arc_is_tighter():
-    made = rounded(np.array([[0.0, 0], [0, 100], [100, 100]]), 400.0)
-    assert made[1] == pytest.approx([0, 50]) and made[-2] == pytest.approx([50, 100])
-
-
-def test_an_about_turn_stays():
-    back = np.array([[0.0, 0], [0, 1000], [0, 0]])
-    assert rounded(back, 400.0) == pytest.approx(back)
 
 
 angles = st.floats(-180, 180), st.floats(-30, 30), st.floats(-30, 30)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from lab.landscape import generate_area, generate_heights
 from lab.landscape.epoch import DEFAULT_DATES
-from lab.landscape.scene import Landscape
 from test_flight import FISH, LENS, PLAIN, SEEN
 
 from orthonav.core.errors import FlightError
@@ -93,21 +92,3 @@ def test_objects_of_the_landscape_stand_where_they_are_drawn(tmp_path):
     objects = over - bare[0, 0]
     assert 0.02 < (objects > 2).mean() < 0.9 and 5 < objects.max() <= 26
     assert (objects >= 0).all()
-
-
-def test_heights_show_progress_and_an_interrupt_leaves_none(tmp_path, monkeypatch):
-    shares = []
-    size = {"size_m": (200.0, 150.0), "dates": (AUTUMN,), "seed": 1}
-    made = generate_heights(tmp_path / "whole", slope=0.1, progress=shares.append, **size)
-    assert sorted(each.name for each in (tmp_path / "whole").iterdir()) == sorted(
-        each.name for each in made
-    )
-    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
-
-    def interrupted(self, *window):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Landscape, "object_heights", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        generate_heights(tmp_path / "stopped", slope=0.1, **size)
-    assert not (tmp_path / "stopped").exists()

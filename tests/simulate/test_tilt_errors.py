@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.errors import FlightError
 from orthonav.core.flight import open_flight
 from orthonav.core.geo.camera import Camera, axis_on_ground_en_m
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate import flight as flight_module
-from orthonav.ground.simulate.attitude import HORIZON_TIME_S, camera_attitude, horizon_errors
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.motion import HORIZON_TIME_S, horizon_errors
 
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 LEVEL = (0.0, 0.0, 0.0)
@@ -58,6 +57,8 @@ def route(ortho):
 
 def test_the_mount_is_constant_and_of_the_stated_size(tilts):
     errors = Errors(mount_std_deg=2.0)
+    biased = Errors(mount_std_deg=2.0, pitch_bias_deg=3.0, roll_bias_deg=-4.0)
+    assert biased.mount_deg(1) - errors.mount_deg(1) == pytest.approx([3.0, -4.0])
     for seed in range(3):
         true, reported = tilts(f"f{seed}", random=2, seed=seed, errors=errors)
         assert true == pytest.approx(np.tile(errors.mount_deg(seed), (2, 1)), abs=1e-9)
@@ -65,13 +66,6 @@ def test_the_mount_is_constant_and_of_the_stated_size(tilts):
     mounts = np.array([errors.mount_deg(seed) for seed in range(400)])
     assert mounts.std(axis=0) == pytest.approx([2.0, 2.0], rel=0.15)
     assert np.abs(mounts.mean(axis=0)).max() < 4 * 2.0 / math.sqrt(400)
-
-
-def test_the_mount_is_added_to_its_bias(tilts):
-    bias = {"pitch_bias_deg": 3.0, "roll_bias_deg": -4.0}
-    drawn, _ = tilts("drawn", random=1, errors=Errors(mount_std_deg=1.0))
-    both, _ = tilts("both", random=1, errors=Errors(mount_std_deg=1.0, **bias))
-    assert both - drawn == pytest.approx(np.array([[3.0, -4.0]]), abs=1e-6)
 
 
 def test_the_horizon_errs_independently_at_random_positions(tilts):
@@ -103,14 +97,6 @@ def test_the_horizon_is_forgotten_within_its_correlation_time():
     assert abs(np.corrcoef(errors.T)[0, 1]) < 0.1
 
 
-def test_mount_and_horizon_add_up():
-    none = np.zeros(2)
-    assert camera_attitude((30.0, 1.0, 2.0), none, none) == (30.0, 1.0, 2.0)
-    assert camera_attitude((30.0, 1.0, 2.0), np.array([0.5, -1.0]), none) == (30.0, 1.5, 1.0)
-    both = camera_attitude(LEVEL, np.array([1.0, 0.0]), np.array([2.0, 0.0]))
-    assert both[1:] == pytest.approx((3.0, 0.0))
-
-
 def test_what_the_telemetry_states(tilts):
     stated = {
         0.0: Errors(),
@@ -131,24 +117,6 @@ def test_reported_tilt_is_still_that_of_the_aircraft(tilts):
     reported = np.array([(t.pitch_deg, t.roll_deg) for t in reported])
     assert (true - reported).std() == pytest.approx(1.0, rel=0.2)
     assert reported.std() == pytest.approx(exact.std(), rel=0.2)
-
-
-def test_the_seed_decides(tilts):
-    errors = Errors(mount_std_deg=1.0, horizon_std_deg=1.0)
-    first, again, other = (
-        tilts(name, random=3, seed=seed, errors=errors)[0]
-        for name, seed in (("a", 1), ("b", 1), ("c", 2))
-    )
-    assert (first == again).all() and (first != other).all()
-    longer, _ = tilts("d", random=5, seed=1, errors=errors)
-    assert (longer[:3] == first).all()
-
-
-@pytest.mark.parametrize("name", ["mount_std_deg", "horizon_std_deg"])
-@pytest.mark.parametrize("value", [-1.0, 21.0, math.nan])
-def test_impossible_deviations_are_refused(name, value):
-    with pytest.raises(FlightError, match=f"{name} must be 0 to 20"):
-        Errors(**{name: value})
 
 
 def test_the_command_tilts_by_default(run, ortho, tmp_path, monkeypatch):

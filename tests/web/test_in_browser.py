@@ -97,7 +97,7 @@ def test_the_run_is_drawn_where_it_is(page, columns):
     assert page.locator("#legend").inner_text().split("\n") == [
         "●confident",
         "●tracking",
-        "—truth",
+        "—ground truth",
         "◯false fix",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")

@@ -46,6 +46,21 @@ def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
     return parse
 
 
+def _number(
+    group: argparse._ActionsContainer,
+    name: str,
+    unit: str,
+    meaning: str,
+    default: float | None = None,
+    *,
+    kind: type[float] = float,
+) -> None:
+    """Add an option that is a number."""
+    if default is not None:
+        meaning += f" (default {default:g})"
+    group.add_argument(name, type=kind, default=default, metavar=unit, help=meaning)
+
+
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
@@ -126,11 +141,12 @@ def _add_autopilot(group: argparse._ActionsContainer) -> None:
         help="MAVLink connection: udpin:[HOST:]PORT (default HOST: loopback), udpout:HOST:PORT, "
         "tcp:HOST:PORT or /dev/DEVICE:BAUD",
     )
-    group.add_argument(
+    _number(
+        group,
         "--system-id",
-        type=int,
-        metavar="N",
-        help="system id of the autopilot (default: the first one heard)",
+        "N",
+        "system id of the autopilot (default: the first one heard)",
+        kind=int,
     )
     group.add_argument(
         "--signing-key",
@@ -146,12 +162,12 @@ def _add_autopilot(group: argparse._ActionsContainer) -> None:
         help="source of the height above ground; can be repeated in order of preference (default: "
         "all, in this order)",
     )
-    group.add_argument(
+    _number(
+        group,
         "--telemetry-wait-ms",
-        type=float,
-        default=150.0,
-        metavar="MS",
-        help="longest wait of a view for the attitude at its exposure (default 150)",
+        "MS",
+        "longest wait of a view for the attitude at its exposure",
+        150.0,
     )
 
 
@@ -195,12 +211,7 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
         help="append one line of JSON per view to a file, or write them to stdout (-); can be "
         "repeated",
     )
-    group.add_argument(
-        "--send-rate-hz",
-        type=float,
-        metavar="HZ",
-        help="maximum rate of each message (default: one per view)",
-    )
+    _number(group, "--send-rate-hz", "HZ", "maximum rate of each message (default: one per view)")
     group.add_argument(
         "--accept",
         default="confidence:0.9",
@@ -208,12 +219,8 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
         help="criterion of a confident fix and its threshold: confidence:0.9 (default), or "
         "peak_ratio:1.3 in addition; other fixes are not sent",
     )
-    group.add_argument(
-        "--max-std-m",
-        type=float,
-        default=50.0,
-        metavar="M",
-        help="largest standard deviation of a position that is sent (default 50)",
+    _number(
+        group, "--max-std-m", "M", "largest standard deviation of a position that is sent", 50.0
     )
     group.add_argument(
         "--send-coasting",
@@ -221,12 +228,8 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
         help="also send dead-reckoned positions of views that do not show the map, only as "
         "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, which PX4 ignores",
     )
-    group.add_argument(
-        "--min-std-m",
-        type=float,
-        default=0.0,
-        metavar="M",
-        help="lower bound of the standard deviation that messages state (default 0)",
+    _number(
+        group, "--min-std-m", "M", "lower bound of the standard deviation that messages state", 0.0
     )
     group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
 
@@ -246,28 +249,14 @@ def _add_messages(group: argparse._ActionsContainer) -> None:
         help="origin of the local frame (degrees, m above mean sea level), for odometry and "
         "vision: set where the autopilot has none; with --ros2: origin of the map frame",
     )
-    group.add_argument(
-        "--sensor-id",
-        type=int,
-        default=1,
-        metavar="N",
-        help="id of GLOBAL_POSITION_SENSOR, as EKF2_AGP0_ID (default 1)",
-    )
-    group.add_argument(
-        "--gps-id", type=int, default=0, metavar="N", help="gps_id of GPS_INPUT (default 0)"
-    )
-    group.add_argument(
-        "--satellites",
-        type=int,
-        default=0,
-        metavar="N",
-        help="satellites_visible of GPS_INPUT (default 0)",
-    )
-    group.add_argument(
+    _number(group, "--sensor-id", "N", "id of GLOBAL_POSITION_SENSOR, as EKF2_AGP0_ID", 1, kind=int)
+    _number(group, "--gps-id", "N", "gps_id of GPS_INPUT", 0, kind=int)
+    _number(group, "--satellites", "N", "satellites_visible of GPS_INPUT", 0, kind=int)
+    _number(
+        group,
         "--hdop-m",
-        type=float,
-        metavar="M",
-        help="hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)",
+        "M",
+        "hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)",
     )
     group.add_argument(
         "--nmea-as-gps",
@@ -296,13 +285,13 @@ def _add_flight(group: argparse._ActionsContainer) -> None:
         metavar="FILE",
         help="save the last position to this file and start from it after a restart",
     )
-    group.add_argument(
+    _number(
+        group,
         "--state-max-age-s",
-        type=float,
-        default=300.0,
-        metavar="S",
-        help="largest age of a saved position that a flight starts from, and of a stop after which "
-        "the learning of --gnss continues (default 300)",
+        "S",
+        "largest age of a saved position that a flight starts from, and of a stop after which the "
+        "learning of --gnss continues",
+        300.0,
     )
     group.add_argument(
         "--gnss",
@@ -312,19 +301,18 @@ def _add_flight(group: argparse._ActionsContainer) -> None:
         "errors of the mount and the latency; correct: also correct positions by what earlier "
         "flights stored in --state (default off)",
     )
-    group.add_argument(
+    _number(
+        group,
         "--deadline-ms",
-        type=float,
-        default=500.0,
-        metavar="MS",
-        help="largest age of a view when its processing starts; older views are dropped "
-        "(default 500)",
+        "MS",
+        "largest age of a view when its processing starts; older views are dropped",
+        500.0,
     )
-    group.add_argument(
+    _number(
+        group,
         "--min-agl-m",
-        type=float,
-        metavar="M",
-        help="height above ground from which views are located (default: where a view covers 60 "
+        "M",
+        "height above ground from which views are located (default: where a view covers 60 "
         "pixels of the map)",
     )
     add_search(group)
@@ -335,11 +323,11 @@ def _add_log(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--log", type=Path, metavar="FILE.mcap", help="write a flight log that can be replayed"
     )
-    group.add_argument(
+    _number(
+        group,
         "--log-max-mb",
-        type=float,
-        metavar="MB",
-        help="maximum size of the log; its oldest files are deleted (default: no limit)",
+        "MB",
+        "maximum size of the log; its oldest files are deleted (default: no limit)",
     )
     group.add_argument(
         "--log-views",

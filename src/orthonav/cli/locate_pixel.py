@@ -57,8 +57,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
     from orthonav.core.flight.mount import read_mount
     from orthonav.core.records import Fix
-    from orthonav.ground.recordings.pixel import locate_pixel
-    from orthonav.onboard.messages.estimate import ellipse_95
+    from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 
     results = {each.frame: each for each in read_results(options.fixes)}
     if options.frame not in results and Path(options.frame).name in results:

@@ -1,6 +1,7 @@
 """`orthonav simulate`: simulate a flight over an orthophoto of another year."""
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 
 from orthonav.cli.common import ROUTE_HELP, add_dem, add_orthos, counted, print_json, progress
@@ -76,83 +77,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: "
         "1280 x 960 px, 65 deg wide",
     )
-    errors = parser.add_argument_group("telemetry noise")
-    errors.add_argument(
-        "--yaw-std-deg",
-        type=float,
-        default=0.0,
-        help="standard deviation of the reported heading (default 0)",
-    )
-    errors.add_argument(
-        "--agl-std",
-        type=float,
-        default=0.0,
-        metavar="FRACTION",
-        help="standard deviation of the reported height, as a fraction of it (default 0)",
-    )
-    errors.add_argument(
-        "--tilt-std-deg",
-        type=float,
-        default=0.0,
-        help="standard deviation of the error of the reported pitch and roll from view to view, "
-        "which the telemetry states (default 0)",
-    )
-    errors.add_argument(
-        "--attitude-std-deg",
-        type=float,
-        default=0.0,
-        help="standard deviation of the true pitch and roll (default 0)",
-    )
-    errors.add_argument(
-        "--prior-std-m",
-        type=float,
-        help="standard deviation of the prior position, per axis (default: no prior is reported)",
-    )
-    errors.add_argument(
-        "--velocity-drift",
-        type=float,
-        metavar="FRACTION",
-        help="standard deviation of the scale error (a fraction) and the direction error (rad) of "
-        "the reported velocity (default: no velocity is reported)",
-    )
-    tilt = parser.add_argument_group("unreported tilt")
-    tilt.add_argument(
-        "--mount-std-deg",
-        type=float,
-        default=MOUNT_STD_DEG,
-        help="standard deviation of pitch and roll of the camera mount, constant in a flight "
-        f"(default {MOUNT_STD_DEG:g})",
-    )
-    tilt.add_argument(
-        "--horizon-std-deg",
-        type=float,
-        default=HORIZON_STD_DEG,
-        help="standard deviation of the error of the autopilot's horizon, pitch and roll; on a "
-        f"route it changes within 15 s (default {HORIZON_STD_DEG:g})",
-    )
-    biases = parser.add_argument_group("constant telemetry biases")
-    biases.add_argument(
-        "--yaw-bias-deg", type=float, default=0.0, help="reported heading minus true heading"
-    )
-    biases.add_argument(
-        "--agl-bias",
-        type=float,
-        default=0.0,
-        metavar="FRACTION",
-        help="reported height minus true height, as a fraction of it: 0.05 is 5 %%",
-    )
-    biases.add_argument(
-        "--pitch-bias-deg",
-        type=float,
-        default=0.0,
-        help="unreported pitch of the camera mount, to which --mount-std-deg adds",
-    )
-    biases.add_argument(
-        "--roll-bias-deg",
-        type=float,
-        default=0.0,
-        help="unreported roll of the camera mount, to which --mount-std-deg adds",
-    )
+    _add_errors(parser)
     parser.add_argument(
         "--receiver",
         metavar="NAME[:KEY=VALUE,..]",
@@ -199,6 +124,64 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
+def _add_errors(parser: argparse.ArgumentParser) -> None:
+    """Options for the fields of `Errors`."""
+
+    def option(
+        flag: str, text: str, default: float | None = 0.0, metavar: str | None = None
+    ) -> None:
+        group.add_argument(flag, type=float, default=default, help=text, metavar=metavar)
+
+    group = parser.add_argument_group("telemetry noise")
+    option("--yaw-std-deg", "standard deviation of the reported heading (default 0)")
+    option(
+        "--agl-std",
+        "standard deviation of the reported height, as a fraction of it (default 0)",
+        metavar="FRACTION",
+    )
+    option(
+        "--tilt-std-deg",
+        "standard deviation of the error of the reported pitch and roll from view to view, which "
+        "the telemetry states (default 0)",
+    )
+    option("--attitude-std-deg", "standard deviation of the true pitch and roll (default 0)")
+    option(
+        "--prior-std-m",
+        "standard deviation of the prior position, per axis (default: no prior is reported)",
+        None,
+    )
+    option(
+        "--velocity-drift",
+        "standard deviation of the scale error (a fraction) and the direction error (rad) of the "
+        "reported velocity (default: no velocity is reported)",
+        None,
+        metavar="FRACTION",
+    )
+    group = parser.add_argument_group("unreported tilt")
+    option(
+        "--mount-std-deg",
+        "standard deviation of pitch and roll of the camera mount, constant in a flight "
+        f"(default {MOUNT_STD_DEG:g})",
+        MOUNT_STD_DEG,
+    )
+    option(
+        "--horizon-std-deg",
+        "standard deviation of the error of the autopilot's horizon, pitch and roll; on a route it "
+        f"changes within 15 s (default {HORIZON_STD_DEG:g})",
+        HORIZON_STD_DEG,
+    )
+    group = parser.add_argument_group("constant telemetry biases")
+    option("--yaw-bias-deg", "reported heading minus true heading")
+    option(
+        "--agl-bias",
+        "reported height minus true height, as a fraction of it: 0.05 is 5 %%",
+        metavar="FRACTION",
+    )
+    added = "to which --mount-std-deg adds"
+    option("--pitch-bias-deg", f"unreported pitch of the camera mount, {added}")
+    option("--roll-bias-deg", f"unreported roll of the camera mount, {added}")
+
+
 def run(options: argparse.Namespace) -> None:
     """Simulate a flight and report the number of views."""
     from orthonav.core.errors import FlightError
@@ -227,20 +210,7 @@ def run(options: argparse.Namespace) -> None:
         spacing_m=options.spacing_m,
         airspeed_mps=options.airspeed_mps,
         camera=read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
-        errors=Errors(
-            yaw_std_deg=options.yaw_std_deg,
-            agl_std=options.agl_std,
-            tilt_std_deg=options.tilt_std_deg,
-            attitude_std_deg=options.attitude_std_deg,
-            prior_std_m=options.prior_std_m,
-            yaw_bias_deg=options.yaw_bias_deg,
-            agl_bias=options.agl_bias,
-            pitch_bias_deg=options.pitch_bias_deg,
-            roll_bias_deg=options.roll_bias_deg,
-            velocity_drift=options.velocity_drift,
-            mount_std_deg=options.mount_std_deg,
-            horizon_std_deg=options.horizon_std_deg,
-        ),
+        errors=Errors(**{each.name: getattr(options, each.name) for each in fields(Errors)}),
         effects=ViewEffects(
             options.exposure_std, options.blur_px, options.noise_std, options.jpeg_quality
         ),

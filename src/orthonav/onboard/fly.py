@@ -206,7 +206,8 @@ class Runner:
                 refused = self._refusal("wrong_camera", "wrong_camera", str(error))
         if refused is not None or image.grey is None:
             refused = refused or NoFix("bad_image", "no image")
-            if latency is not None and self._latency is not None and "frozen" in refused.reason:
+            is_frozen = refused.reason == "frozen_image"
+            if is_frozen and latency is not None and self._latency is not None:
                 self._latency.frozen(latency.arrived_ns)
             return self._refused(image, refused, vehicle)
         try:

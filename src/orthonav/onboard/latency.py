@@ -181,7 +181,8 @@ class LatencyMonitor:
     def _doubt(self) -> tuple[str | None, str]:
         """Reason why the latency cannot be used, and one sentence about it; None where it can."""
         if not self._is_stated:
-            return UNKNOWN, "camera latency not known: give --camera-latency-ms"
+            advice = "give --camera-latency-ms, as `orthonav calibrate --latency` measures it"
+            return UNKNOWN, f"camera latency not known: {advice}"
         if self._contradicted:
             causes = "--camera-latency-ms, --mount-deg, the height and the heading"
             return MISMATCH, f"images do not move as the autopilot reports: check {causes}"

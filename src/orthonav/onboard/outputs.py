@@ -1,5 +1,6 @@
 """Outputs of positions: MAVLink messages to the autopilot, NMEA sentences, lines of JSON."""
 
+import contextlib
 import errno
 import json
 import logging
@@ -41,7 +42,7 @@ from orthonav.onboard.messages.mavlink_local import (
     vision_position_estimate,
 )
 from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
-from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
+from orthonav.onboard.ports import Descriptor, Udp, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
@@ -256,26 +257,6 @@ class Sink(Protocol):
         """Close the output."""
 
 
-class UdpSink:
-    """Datagrams to one address."""
-
-    def __init__(self, address: tuple[str, int]) -> None:
-        self._address = address
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-
-    def write(self, data: bytes) -> None:
-        """Send one datagram; a receiver that does not listen is no error."""
-        try:
-            self._socket.sendto(data, self._address)
-        except (BlockingIOError, ConnectionRefusedError):
-            return
-
-    def close(self) -> None:
-        """See `Sink.close`."""
-        self._socket.close()
-
-
 class TcpSink:
     """TCP server that sends the same data to all clients; one that does not read is dropped."""
 
@@ -343,7 +324,7 @@ def open_sink(url: str) -> Sink:
     `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where it cannot be opened."""
     kind, _, rest = url.partition(":")
     if kind == "udp":
-        return UdpSink(host_port(rest, url))
+        return Udp(None, host_port(rest, url))
     if kind == "tcp-listen":
         return TcpSink(host_port(rest, url))
     if kind == "serial":
@@ -416,16 +397,9 @@ class JsonOut:
         except OSError:
             stream, self._stream = self._stream, None
             if self._path is not None:
-                _close_quietly(stream)
+                with contextlib.suppress(OSError):  # a full disk: its buffered data are lost
+                    stream.close()
             raise
-
-
-def _close_quietly(stream: TextIO) -> None:
-    """Close a file whose disk is full; its buffered data are lost."""
-    try:
-        stream.close()
-    except OSError:
-        return
 
 
 class ViewOutput(Protocol):

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
-from orthonav.core.mapfile.blobs import Blobs
 from orthonav.core.mapfile.manifest import GreyInfo
-from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.reader import Blobs, MapFile
 
 CACHE_BYTES = 64 * 2**20
 """Decoded chunks cached: 64 km2 at 1 m where no chunk has a mask."""

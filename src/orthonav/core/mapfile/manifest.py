@@ -7,7 +7,7 @@ untrusted file.
 import hashlib
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from orthonav.core.errors import AreaError, MapFileError, MapVersionError
@@ -61,11 +61,9 @@ class GreyInfo:
     @classmethod
     def from_plain(cls, plain: Any, grid: TileGrid) -> "GreyInfo":
         """Inverse of `to_plain` for a sheet with `grid`; raises `MapFileError`."""
-        codec = _get(plain, "codec", str)
-        names = ("chunk_px", "levels", "quality", "valid_px")
-        info = cls(**{name: _get(plain, name, int) for name in names})
+        info = cls(**_fields(cls, plain))
         sane = (
-            codec == CODEC
+            _get(plain, "codec", str) == CODEC
             and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
             and info.chunk_px % 2 == 0
             and 1 <= info.levels <= MAX_LEVELS
@@ -110,17 +108,10 @@ class TerrainInfo:
     @classmethod
     def from_plain(cls, plain: Any) -> "TerrainInfo":
         """Inverse of `to_plain`; raises `MapFileError`."""
-        codec = _get(plain, "codec", str)
-        numbers = ("west_m", "north_m", "posting_m", "low_m", "high_m", "unit_m")
-        values: dict[str, Any] = {name: _number(plain, name) for name in numbers}
-        for name in ("rows", "cols", "chunk_px", "known"):
-            values[name] = _get(plain, name, int)
-        for name in ("name", "datum"):
-            values[name] = _get(plain, name, str)[:MAX_NAME]
-        info = cls(**values)
+        info = cls(**_fields(cls, plain))
         most = 4 * MAX_SHEET_M
         sane = (
-            codec == TERRAIN_CODEC
+            _get(plain, "codec", str) == TERRAIN_CODEC
             and 1 <= info.posting_m <= MAX_POSTING_M
             and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
             and min(info.rows, info.cols) >= 1
@@ -154,21 +145,12 @@ class SheetInfo:
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for the manifest; maps without terrain do not name it."""
-        grid = self.grid
         terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}
         return {
             **terrain,
             "origin_lat_deg": self.frame.lat_deg,
             "origin_lon_deg": self.frame.lon_deg,
-            "grid": {
-                "west_m": grid.west_m,
-                "north_m": grid.north_m,
-                "gsd_m": grid.gsd_m,
-                "tile_px": grid.tile_px,
-                "stride_px": grid.stride_px,
-                "rows": grid.rows,
-                "cols": grid.cols,
-            },
+            "grid": vars(self.grid),
             "tiles": self.tiles,
             "area_km2": self.area_km2,
             "grey": None if self.grey is None else self.grey.to_plain(),
@@ -178,12 +160,7 @@ class SheetInfo:
     def from_plain(cls, plain: Any) -> "SheetInfo":
         """Inverse of `to_plain`; raises `MapFileError` on impossible values."""
         raw = _get(plain, "grid", dict)
-        grid = TileGrid(
-            west_m=_number(raw, "west_m"),
-            north_m=_number(raw, "north_m"),
-            gsd_m=_number(raw, "gsd_m"),
-            **{name: _get(raw, name, int) for name in ("tile_px", "stride_px", "rows", "cols")},
-        )
+        grid = TileGrid(**_fields(TileGrid, raw))
         tiles = _get(plain, "tiles", int)
         sane = (
             grid.gsd_m > 0
@@ -332,6 +309,16 @@ def _get(plain: Any, name: str, kind: type) -> Any:
             f"manifest of the map: {name} must be {kind.__name__}, got {value!r:.80}"
         )
     return value
+
+
+def _fields(record: type, plain: Any) -> dict[str, Any]:
+    """The values of the fields of a record, each of its type; raises `MapFileError`."""
+    found = {}
+    for each in fields(record):
+        kind: Any = each.type
+        value: Any = _number(plain, each.name) if kind is float else _get(plain, each.name, kind)
+        found[each.name] = value[:MAX_NAME] if kind is str else value
+    return found
 
 
 def _number(plain: Any, name: str) -> float:

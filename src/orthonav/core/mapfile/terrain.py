@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.mapfile.blobs import Blobs
 from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
-from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.reader import Blobs, MapFile
 
 CACHE_BYTES = 16 * 2**20
 """Decoded chunks cached: 400 km2 at 10 m."""

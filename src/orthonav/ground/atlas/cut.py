@@ -523,7 +523,7 @@ def _learnt(
     grey, grey_parts = cutter.layer.finish()
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     made = cut_terrain(members, area, grid)
-    terrain, terrain_parts = (None, {}) if made is None else made.content
+    terrain, terrain_parts = (None, {}) if made is None else made
     sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey, terrain)
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {

@@ -404,7 +404,7 @@ def map_content(
     grey, grey_parts = (None, {}) if sheet.layer is None else sheet.layer.finish()
     tiles = len(embedding.centres_en_m)
     area_km2 = round(tiles * grid.stride_m**2 / 1e6, 6)
-    terrain, terrain_parts = (None, {}) if inputs.terrain is None else inputs.terrain.content
+    terrain, terrain_parts = (None, {}) if inputs.terrain is None else inputs.terrain
     sheet_info = SheetInfo(inputs.area.frame, grid, tiles, area_km2, grey, terrain)
     manifest = Manifest(
         recipe={

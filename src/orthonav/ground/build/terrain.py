@@ -3,8 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +29,11 @@ mean sea level of samples at the posting, NaN where unknown."""
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class TerrainParts:
+class TerrainParts(NamedTuple):
     """A finished terrain layer: its record for the manifest, and its arrays by name."""
 
     info: TerrainInfo
     arrays: dict[str, NDArray[Any]]
-
-    @property
-    def content(self) -> tuple[TerrainInfo, dict[str, NDArray[Any]]]:
-        """Record and arrays."""
-        return self.info, self.arrays
 
 
 def terrain_of_dem(

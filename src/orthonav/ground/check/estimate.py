@@ -2,20 +2,77 @@
 
 Nearby trials, weighted by distance, are joined with a logistic regression over all trials of the
 map (on persistence and on the part of a view that the map covers) as a beta distribution, in which
-the regression counts as `PRIOR_TRIALS` trials.
+the regression counts as `PRIOR_TRIALS` trials. Trials show the map's own imagery with simulated
+ageing; real ground changes more or less than that. A recalibration, fitted to real scenes of two
+dates (`python -m benchmarks.check_trust --fit`), turns rates of trials into predicted ones.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.ground.build.fit import fit_weights
-from orthonav.ground.check.recalibrate import PLAIN, expit, logit
-from orthonav.ground.check.trials import Trial
+
+if TYPE_CHECKING:
+    from orthonav.ground.check.trials import Trial
 
 Array = NDArray[np.float64]
+FULL_VIEW_PX = 256.0
+"""Views of so many pixels of the map across need no correction for their width."""
+LEAST, MOST = 0.01, 0.99
+"""Limits of predictions: no check is more certain of fixes, or of their absence."""
+
+
+@dataclass(frozen=True)
+class Recalibration:
+    """Logit of the predicted rate: `shift` + `slope` times that of trials + corrections.
+
+    `narrow`: for every halving of the width of a view below `FULL_VIEW_PX`; `no_prior`: without a
+    prior position; `std`: standard deviation of the logit from scene to scene, 0 or more.
+    """
+
+    shift: float
+    slope: float
+    narrow: float
+    no_prior: float
+    std: float
+
+    def __call__(self, share: Array, view_px: float, has_prior: bool) -> Array:
+        """Predicted rates (N,) from those of trials, for views `view_px` pixels of the map."""
+        octaves = max(0.0, math.log2(FULL_VIEW_PX / max(view_px, 1.0)))
+        added = self.shift + self.narrow * octaves + self.no_prior * (not has_prior)
+        return np.asarray(np.clip(expit(self.slope * logit(share) + added), LEAST, MOST))
+
+    def other_sensor(self) -> "Recalibration":
+        """For views of another sensor than the map's: a drone over satellite imagery, say."""
+        std = math.hypot(self.std, OTHER_SENSOR_STD)
+        return replace(self, shift=self.shift + OTHER_SENSOR_SHIFT, std=std)
+
+
+def logit(share: Array) -> Array:
+    """Logarithm of the odds of rates, which are held between `LEAST` and `MOST`."""
+    held = np.clip(share, LEAST, MOST)
+    return np.asarray(np.log(held / (1 - held)))
+
+
+def expit(value: Array) -> Array:
+    """The inverse of `logit`."""
+    return np.asarray(1 / (1 + np.exp(-value)))
+
+
+PLAIN = Recalibration(0.0, 1.0, 0.0, 0.0, 0.6)
+"""Trials as they are; between dates of generated and NAIP imagery the logit differs by 0.6."""
+LEARNT = Recalibration(0.85, 0.54, -0.51, -0.2, 0.8)
+"""What checks use: fitted to 57 conditions of nine scenes of two dates (docs/check.md)."""
+OTHER_SENSOR_SHIFT, OTHER_SENSOR_STD = -0.8, 0.8
+"""An assumption that rests on one flight: a drone over two satellite maps was placed less often
+than predicted by 0.6 and 1.0 (docs/check.md)."""
+
+
 # Chosen on generated landscapes by the calibration error of `python -m benchmarks.prediction`.
 PRIOR_TRIALS = 3.0
 BANDWIDTH_VIEWS = 0.4
@@ -55,11 +112,11 @@ class Predictor:
 
     def __init__(
         self,
-        trials: Sequence[Trial],
+        trials: "Sequence[Trial]",
         *,
         view_side_m: float,
         spacing_m: float,
-        other_date: Sequence[Trial] = (),
+        other_date: "Sequence[Trial]" = (),
         least_error_m: float = 0.0,
         coverage: Callable[[Array], Array],
         recalibrated: Callable[[Array], Array] = np.asarray,
@@ -84,7 +141,7 @@ class Predictor:
         self._recalibrated, self._scenes_std = recalibrated, scenes_std
         self._expected = self._regression()
 
-    def _persistence_of(self, trials: Sequence[Trial], other: Sequence[Trial]) -> Array:
+    def _persistence_of(self, trials: "Sequence[Trial]", other: "Sequence[Trial]") -> Array:
         """Expected persistence at every trial; a trial of the second date takes the nearest."""
         own = np.array([each.expected for each in trials], np.float64)
         if not other:

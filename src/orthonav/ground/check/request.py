@@ -8,8 +8,8 @@ from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.changes.record import ChangedGround
+from orthonav.ground.check.estimate import LEARNT, Recalibration
 from orthonav.ground.check.outcome import CheckedInputs
-from orthonav.ground.check.recalibrate import LEARNT, Recalibration
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 

@@ -88,7 +88,7 @@ def metrics_to_json(metrics: Metrics) -> Plain:
     same = (
         *("n_views", "n_fixes", "n_confident", "n_confident_wrong", "wrong_above_m"),
         *("wrong_upper_95", "availability", "availability_95", "n_without_truth"),
-        *("n_without_result", "radius_m", "coverage", "latency_median_ms", "latency_p95_ms"),
+        *("n_without_result", "radius_m", "coverage"),
     )
     confident, standard = metrics.of_confident, metrics.standard
     found = metrics.consistency
@@ -107,6 +107,8 @@ def metrics_to_json(metrics: Metrics) -> Plain:
             "error_p95_m": standard.cep95_m,
             "error_mean_m": standard.ape.mean_m,
             "error_max_m": standard.ape.max_m,
+            "latency_median_ms": metrics.latency_median_ms,
+            "latency_p95_ms": metrics.latency_p95_ms,
             "reasons": metrics.reasons,
             "criteria": [_criterion_to_json(row) for row in metrics.criteria],
             "standard": _standard_to_json(standard),

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import logging
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -89,26 +88,21 @@ def write_mosaic(
     source: CellSource,
     selection: Selection,
     read: CellReader,
-    parallel: int,
+    folder: Path,
     packing: Packing,
     progress: Progress,
     *,
+    parallel: int,
     allow_holes: bool,
 ) -> CellCounts:
     """Read the cells and write them as one GeoTIFF, with missing ones masked.
 
-    Raises `FetchError` where cells failed, unless `allow_holes`, and where no pixel is valid;
-    `OutputError` where the file cannot be written.
+    The raw mosaic is written into `folder` first. Raises `FetchError` where cells failed, unless
+    `allow_holes`, and where no pixel is valid; `OutputError` where the file cannot be written.
     """
-    with (
-        replacing(out) as temporary,
-        tempfile.TemporaryDirectory(
-            prefix=f".{out.name}.", suffix=".tmp", dir=temporary.parent
-        ) as folder,
-        rasterio.Env(**GDAL_OPTIONS),
-    ):
-        raw = Path(folder) / "mosaic.tif"
-        try:
+    raw = folder / "mosaic.tif"
+    try:
+        with rasterio.Env(**GDAL_OPTIONS):
             with rasterio.open(raw, "w", **_profile(source, selection)) as dataset:
                 dataset.update_tags(**tags_of(source.provenance, selection))
                 if source.bands == 3:
@@ -119,10 +113,11 @@ def write_mosaic(
             if counts.valid_px == 0:
                 raise FetchError("the service has no imagery of this area in this layer")
             progress("pack", 0.1)
-            _pack(raw, temporary, packing)
+            with replacing(out) as temporary:
+                _pack(raw, temporary, packing)
             progress("pack", 1.0)
-        except (RasterioError, MemoryError) as error:
-            raise not_written(error.__cause__ or error, out) from error
+    except (RasterioError, MemoryError) as error:
+        raise not_written(error.__cause__ or error, out) from error
     return counts
 
 

@@ -2,14 +2,16 @@
 
 import logging
 import math
+import re
 import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from orthonav.core.errors import AreaError, FetchError, OutputError
-from orthonav.core.files import Progress, no_progress, with_paths
+from orthonav.core.files import Progress, no_progress, not_written, with_paths
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.ground.fetch.cog import cog_source
 from orthonav.ground.fetch.grid import Selection, select
@@ -32,6 +34,8 @@ _SECONDS_PER_TILE = 0.3
 """Usual latency of a tile service; an assumption for the estimate."""
 _BYTES_PER_SECOND = 3e6
 """Usual throughput of a connection; an assumption for the estimate."""
+_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")
+"""Names in a cache that GDAL and this program make."""
 log = logging.getLogger(__name__)
 
 
@@ -137,20 +141,30 @@ def fetch(
         if selection.is_cut:
             log.warning("part of the area lies outside what the service covers")
         try:
-            cells = write_mosaic(
-                request.out,
-                source,
-                selection,
-                source.reader(web, selection, cache),
-                request.limits.parallel,
-                request.packing,
-                progress,
-                allow_holes=request.allow_holes,
-            )
+            cache.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:
+                cells = write_mosaic(
+                    request.out,
+                    source,
+                    selection,
+                    source.reader(web, selection, cache),
+                    Path(folder),
+                    request.packing,
+                    progress,
+                    parallel=request.limits.parallel,
+                    allow_holes=request.allow_holes,
+                )
         except FetchError as error:
-            hint = f"; fetched tiles are stored, rerun the command to resume: {cache}"
-            raise FetchError(f"{error}{hint if cache.exists() else ''}") from None
-    if request.cache is None:
+            if any(cache.iterdir()):
+                stored = f"fetched tiles are stored, rerun the command to resume: {cache}"
+                raise FetchError(f"{error}; {stored}") from None
+            cache.rmdir()
+            raise
+        except OutputError:
+            raise
+        except OSError as error:
+            raise not_written(error, cache) from error
+    if request.cache is None and all(_OURS.fullmatch(path.name) for path in cache.iterdir()):
         shutil.rmtree(cache, ignore_errors=True)
     grid = selection.grid
     share = cells.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)

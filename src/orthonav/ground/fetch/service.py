@@ -33,14 +33,14 @@ GDAL_OPTIONS = {
     "GDAL_ERROR_ON_LIBJPEG_WARNING": True,  # half a JPEG would be grey in its lower half
     "GDAL_CACHEMAX": 64 * 2**20,
 }
-TIMEOUT_S = 60
+TIMEOUT_S = 120
 MIN_EMPTY_PX = 4096
 """Smallest patch of the empty colour that is masked, 64 x 64 px: larger than a roof or shadow."""
 _EMPTY_COLOURS = {"black": 0, "white": 255}
 _BYTES_PER_PX = {"image/jpeg": 0.35, "image/webp": 0.25, "image/png": 1.9, HEIGHTS_FORMAT: 4.0}
 """Size of usual tiles of orthophotos relative to their pixels, for the estimate."""
-_CACHE_BYTES = 2**50
-"""GDAL would remove the oldest tiles above 64 MB."""
+_FOR_EVER = {"Expires": 2**31 - 1, "CleanTimeout": 0}
+"""GDAL would remove every file of the folder that is older than a week."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +121,13 @@ def service_source(
                 "ZeroBlockHttpCodes": "204,404,410" if is_tiled else "204",
                 "Timeout": TIMEOUT_S,
                 "UserAgent": USER_AGENT,
-                "Cache": {"Path": cache, "Unique": False, "MaxSize": _CACHE_BYTES},
+                "Cache": {"Path": cache, "Unique": False} | _FOR_EVER,
             },
         )
 
         def read(row: int, col: int) -> CellPixels:
             window = Window((col - col0) * width, (row - row0) * height, width, height)
-            where = f"{shown(address)} (row {row}, column {col})"
+            where = f"{shown(address.replace('$', ''))} (row {row}, column {col})"
             pixels = _read(web, description, window, where)
             return _heights(pixels) if heights else _imagery(pixels, spec.options.empty)
 
@@ -166,14 +166,13 @@ def reason_of(error: BaseException) -> tuple[str, bool]:
     while cause := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(cause)
     text = " ".join(" ".join(map(str, chain)).split())
-    if found := re.search(r"HTTP status code: (\d+), error: (.*?)\. ?Add", text):
+    if found := re.search(
+        r"CURL error: (.{,200}?)(?: CURL|$)|HTTP status code: 0, error: (.*?)\. ?Add", text
+    ):
+        return found.group(1) or found.group(2), True
+    if found := re.search(r"HTTP (?:status|response) code: (\d+)", text):
         status = int(found.group(1))
-        if status == 0:
-            return found.group(2), True
         return ("empty answer", True) if status == 200 else (f"HTTP {status}", is_temporary(status))
-    if found := re.search(r"(?:HTTP response code: |CURL error: )(\d{3}|.{,200})", text):
-        problem = str(found.group(1))
-        return (f"HTTP {problem}" if problem.isdecimal() else problem), True
     if found := re.search(r"Incorrect size (.*?) of downloaded block, expected (.*?),", text):
         return f"image of {found.group(1)} px instead of {found.group(2)}", False
     if found := re.search(r"server returned exception: (.{,300}?)( GDAL|$)", text):

@@ -90,11 +90,11 @@ def _features(web: Web, url: str, box_deg: Box, options: ImageryOptions) -> Feat
     query |= {"datetime": options.time} if options.time else {}
     if search:
         query |= {"collections": [options.collection]} if options.collection else {}
-        return _paged(web, _linked(url, search[0]), query)
+        return _paged(web, linked(url, search[0]["href"]), query)
     if listing and not _related(root, "child", "item"):
         bbox = ",".join(f"{value:.7f}" for value in box_deg)
         parameters = {name: str(value) for name, value in query.items()} | {"bbox": bbox}
-        return _paged(web, with_query(_linked(url, listing[0]), parameters), None)
+        return _paged(web, with_query(linked(url, listing[0]["href"]), parameters), None)
     return _walked(web, url, root)
 
 
@@ -110,7 +110,7 @@ def _paged(web: Web, url: str, body: dict[str, Any] | None) -> Features:
         following = next(iter(_related(page, "next")), None)
         if following is None:
             return
-        url = _linked(here, following)
+        url = linked(here, following["href"])
         more = following.get("body")
         if str(following.get("method", "GET")).upper() == "POST":
             merged = body if following.get("merge") and body else {}
@@ -131,7 +131,7 @@ def _walked(web: Web, url: str, root: dict[str, Any]) -> Features:
             yield document, where
             continue
         for link in _related(document, "child", "item"):
-            if (address := _linked(where, link)) not in known:
+            if (address := linked(where, link["href"])) not in known:
                 known.add(address)
                 stack.append((address, web.get_json(address)))
     raise FetchError(
@@ -197,12 +197,9 @@ def _in_time(time: str, wanted: str | None) -> bool:
 
 
 def _related(document: dict[str, Any], *kinds: str) -> list[dict[str, Any]]:
-    """Links of a document of these kinds."""
+    """Links of a document of these kinds, each with its `href`."""
     links = document.get("links")
     known = [link for link in links if isinstance(link, dict)] if isinstance(links, list) else []
-    return [link for link in known if link.get("rel") in kinds]
-
-
-def _linked(base: str, link: dict[str, Any]) -> str:
-    """Address of a link in the document at `base`."""
-    return linked(base, str(link.get("href", "")))
+    return [
+        link | {"href": str(link.get("href", ""))} for link in known if link.get("rel") in kinds
+    ]

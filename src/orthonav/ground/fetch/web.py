@@ -95,6 +95,8 @@ class Web:
             root = fromstring(body)
         except (ParseError, ValueError):
             raise FetchError(f"not an XML document ({self._excerpt(body)}): {shown(url)}") from None
+        if "Exception" in root.tag:
+            raise FetchError(f"an error of the service ({self._excerpt(body)}): {shown(url)}")
         for element in root.iter():
             element.tag = str(element.tag).rpartition("}")[2]
             element.attrib = {key.rpartition("}")[2]: v for key, v in element.attrib.items()}
@@ -161,7 +163,7 @@ class Web:
 
     def _excerpt(self, body: bytes) -> str:
         """The beginning of an answer as text on one line, for an error."""
-        text = body[:1200].decode("utf-8", errors="replace")
+        text = body[:2000].decode("utf-8", errors="replace")
         if "\0" in text or 10 * text.count("\ufffd") > len(text):
             return f"{len(body)} bytes that are not text"
         words = re.sub(r"<[^>]*>", " ", text).split()

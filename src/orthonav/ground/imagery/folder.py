@@ -4,7 +4,6 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.core.errors import ImageryError, MissingFileError
@@ -28,30 +27,17 @@ MAX_FILES = 1_000_000
 NAMED = 5
 
 
-@dataclass(frozen=True)
-class FolderContents:
-    """Orthophotos of a folder, and the number of skipped files by reason."""
-
-    files: tuple[Path, ...]
-    skipped: dict[str, int]
-
-    @property
-    def summary(self) -> str:
-        """Skipped files by reason, on one line."""
-        return "; ".join(f"{count} {reason}" for reason, count in sorted(self.skipped.items()))
-
-
 def sources_in(folder: Path) -> list[Source]:
     """The orthophotos of a folder and its folders, newest first, then the finest, then by name.
 
     Other files are skipped and logged. Raises `ImageryError` where no orthophoto is left, with the
     kinds of files seen, and where one is damaged or has no coordinate system.
     """
-    found = orthophotos_in(folder)
-    sources, unfit = open_sources(found.files, folder)
-    skipped = found.skipped | ({_UNFIT: len(unfit)} if unfit else {})
+    files, skipped = _orthophotos_in(folder)
+    sources, unfit = open_sources(files, folder)
+    skipped |= {_UNFIT: len(unfit)} if unfit else {}
     if not sources:
-        raise _nothing(folder, FolderContents((), skipped))
+        raise _nothing(folder, skipped)
     for reason in unfit[:NAMED]:
         log.warning("skipped: %s", reason)
     if _ARCHIVES in skipped:
@@ -60,14 +46,17 @@ def sources_in(folder: Path) -> list[Source]:
         log.info(
             "%d orthophotos; skipped %s: %s",
             len(sources),
-            FolderContents((), skipped).summary,
+            _summary(skipped),
             folder,
         )
     return sorted(sources, key=_preference)
 
 
-def orthophotos_in(folder: Path) -> FolderContents:
-    """Files that may be orthophotos by their names; raises `ImageryError` where there are none."""
+def _orthophotos_in(folder: Path) -> tuple[list[Path], dict[str, int]]:
+    """Files that may be orthophotos by their names, and the number of skipped ones by reason.
+
+    Raises `ImageryError` where there are none.
+    """
     files: list[Path] = []
     skipped: Counter[str] = Counter()
     for path in _files(folder):
@@ -80,10 +69,13 @@ def orthophotos_in(folder: Path) -> FolderContents:
     if virtual and len(virtual) < len(files):
         files = [path for path in files if path not in virtual]
         skipped["virtual rasters (.vrt), because their files are there"] += len(virtual)
-    found = FolderContents(tuple(sorted(files)), dict(skipped))
     if not files:
-        raise _nothing(folder, found)
-    return found
+        raise _nothing(folder, skipped)
+    return sorted(files), dict(skipped)
+
+
+def _summary(skipped: dict[str, int]) -> str:
+    return "; ".join(f"{count} {reason}" for reason, count in sorted(skipped.items()))
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -120,7 +112,7 @@ def _has_sidecar(path: Path) -> bool:
     return any(name.is_file() for name in names)
 
 
-def _nothing(folder: Path, found: FolderContents) -> ImageryError:
+def _nothing(folder: Path, skipped: dict[str, int]) -> ImageryError:
     archives = sorted(path for path in _files(folder) if _ARCHIVE.search(path.name))
     if archives:
         first = archives[0]
@@ -130,7 +122,7 @@ def _nothing(folder: Path, found: FolderContents) -> ImageryError:
             f"folder holds archives ({len(archives)} files) but no orthophotos; unpack them first: "
             f"{how}"
         )
-    seen = found.summary or _suffixes(folder)
+    seen = _summary(skipped) or _suffixes(folder)
     return ImageryError(f"folder holds no usable orthophotos; seen: {seen}: {folder}")
 
 

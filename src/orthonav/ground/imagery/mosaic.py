@@ -105,45 +105,17 @@ class Mosaic:
             kinds.setdefault(alike, []).append(source)
         return tuple(_described(members) for members in kinds.values())
 
-    def sheet(
-        self,
-        frame: LocalFrame,
-        *,
-        west_m: float,
-        north_m: float,
-        width_px: int,
-        height_px: int,
-        gsd_m: float,
-        threads: int | None = None,
-    ) -> "SheetRaster":
-        """The mosaic resampled into `frame`, as a raster that is read by windows (use `with`).
-
-        It belongs to the thread that enters it, and uses `threads` of its own (None: all cores).
-        """
-        return SheetRaster(
-            self,
-            frame,
-            west_m=west_m,
-            north_m=north_m,
-            width_px=width_px,
-            height_px=height_px,
-            gsd_m=gsd_m,
-            threads=threads,
-        )
+    def sheet(self, frame: LocalFrame, **place: Any) -> "SheetRaster":
+        """The mosaic resampled into `frame`; `place` is that of `SheetRaster`."""
+        return SheetRaster(self, frame, **place)
 
     def grid_sheet(
         self, frame: LocalFrame, grid: TileGrid, threads: int | None = None
     ) -> "SheetRaster":
-        """The raster that all tiles of a grid together cover (use `with`)."""
-        return self.sheet(
-            frame,
-            west_m=grid.west_m,
-            north_m=grid.north_m,
-            width_px=grid.width_px,
-            height_px=grid.height_px,
-            gsd_m=grid.gsd_m,
-            threads=threads,
-        )
+        """The raster that all tiles of a grid together cover."""
+        names = ("west_m", "north_m", "width_px", "height_px", "gsd_m")
+        place = {name: getattr(grid, name) for name in names}
+        return SheetRaster(self, frame, **place, threads=threads)
 
     @cached_property
     def lattices(self) -> list[Lattice]:
@@ -192,8 +164,8 @@ class GreyPixels:
 class SheetRaster:
     """A north-up raster in a sheet's plane over orthophotos; a context manager.
 
-    It belongs to the thread that enters it; start other threads than the main one inside `quiet`.
-    Made by `Mosaic.sheet`.
+    Its first pixel begins at `west_m`, `north_m`. It belongs to the thread that enters it; start
+    other threads than the main one inside `quiet`. It uses `threads` of its own (None: all cores).
     """
 
     def __init__(
@@ -256,9 +228,10 @@ class SheetRaster:
 
         A pixel that several lattices cover only together, as along a seam, is their mean.
         """
-        seams = _Seams(window, colours)
-        out = np.zeros((window.height, window.width, colours), dtype=np.uint8)
-        valid = np.zeros((window.height, window.width), dtype=bool)
+        shape = window.height, window.width
+        out = np.zeros((*shape, colours), np.uint8)
+        valid = np.zeros(shape, np.bool_)
+        weight, total = np.zeros(shape, np.float32), np.zeros((*shape, colours), np.float32)
         for lattice, (x0, y0, x1, y1) in self._parts(window):
             part = np.s_[
                 y0 - window.row_off : y1 - window.row_off, x0 - window.col_off : x1 - window.col_off
@@ -269,9 +242,13 @@ class SheetRaster:
             new = (mask >= WHOLLY_VALID) & ~valid[part]
             np.copyto(out[part], values, where=new[..., None])
             valid[part] |= new
-            seams.add(part, values, np.where(valid[part], 0, mask))
-        seams.close(out, valid)
-        return out, valid
+            partly = np.where(valid[part], 0, mask).astype(np.float32)
+            if partly.any():
+                weight[part] += partly
+                total[part] += values * partly[..., None]
+        closed = (weight >= WHOLLY_VALID) & ~valid
+        out[closed] = np.rint(total[closed] / weight[closed][:, None])
+        return out, valid | closed
 
     def _parts(self, window: Window) -> Iterator[tuple[Lattice, tuple[int, int, int, int]]]:
         """Lattices that may overlap a window, and the overlap: left, top, right, bottom."""
@@ -406,35 +383,6 @@ class SheetRaster:
         low = np.floor([x.min(axis=1), y.min(axis=1)]) - 2
         high = np.ceil([x.max(axis=1), y.max(axis=1)]) + 2
         return np.concatenate([low, high]).T.astype(np.int64)
-
-
-class _Seams:
-    """Weighted sums of the pixels that lattices cover in part."""
-
-    def __init__(self, window: Window, colours: int) -> None:
-        self._shape = (window.height, window.width)
-        self._colours = colours
-        self._weight: NDArray[np.float32] | None = None
-        self._total: NDArray[np.float32] | None = None
-
-    def add(
-        self, part: tuple[slice, slice], values: NDArray[np.uint8], mask: NDArray[np.uint8]
-    ) -> None:
-        if not mask.any():
-            return
-        if self._weight is None or self._total is None:
-            self._weight = np.zeros(self._shape, np.float32)
-            self._total = np.zeros((*self._shape, self._colours), np.float32)
-        weight = mask.astype(np.float32)
-        self._weight[part] += weight
-        self._total[part] += values * weight[..., None]
-
-    def close(self, out: NDArray[np.uint8], valid: NDArray[np.bool_]) -> None:
-        if self._weight is None or self._total is None:
-            return
-        closed = (self._weight >= WHOLLY_VALID) & ~valid
-        out[closed] = np.rint(self._total[closed] / self._weight[closed][:, None])
-        valid |= closed
 
 
 def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.caches import ByteCache
 from orthonav.core.errors import ImageryError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
@@ -35,8 +34,7 @@ except ImportError as error:
 
 Array = NDArray[np.float64]
 BLOCK_PX = 256
-"""Side of the windows that are read and cached."""
-CACHE_BYTES = 64 * 2**20
+"""Side of the windows that are read."""
 SAMPLE_PX = 512
 """Side of the overview from which units and voids are judged."""
 DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
@@ -55,7 +53,7 @@ class Dem:
     """An open terrain model; calling it gives heights above mean sea level (`TerrainHeights`).
 
     `path`: its file. `datum`: what its heights count from. `gsd_m`: its ground resolution.
-    Heights are read by windows and cached; for one thread.
+    Heights are read by windows; for one thread.
     """
 
     path: Path
@@ -64,9 +62,6 @@ class Dem:
     _data: Any = field(repr=False)
     _horizontal: pyproj.CRS = field(repr=False)
     _void: float | None = field(repr=False)
-    _blocks: ByteCache[tuple[int, int], Array] = field(
-        init=False, repr=False, default_factory=lambda: ByteCache(CACHE_BYTES, _bytes_of)
-    )
     _system_from_world: pyproj.Transformer = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -179,9 +174,6 @@ class Dem:
             yield some, first_col, first_row, self._block(left, top, first_col, first_row)
 
     def _block(self, left: int, top: int, first_col: int, first_row: int) -> Array:
-        found = self._blocks.get((left, top))
-        if found is not None:
-            return found
         last_col = min((left + 1) * BLOCK_PX + 1, self._data.width)
         last_row = min((top + 1) * BLOCK_PX + 1, self._data.height)
         window = Window(first_col, first_row, last_col - first_col, last_row - first_row)
@@ -189,9 +181,7 @@ class Dem:
             raw = self._data.read(1, window=window, masked=True)
         except (RasterioError, CPLE_BaseError) as error:
             raise _unreadable(self.path, error) from error
-        found = self._metres(_without(raw, self._void))
-        self._blocks.put((left, top), found)
-        return found
+        return self._metres(_without(raw, self._void))
 
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
@@ -281,10 +271,6 @@ def _gsd_m(data: Any, horizontal: pyproj.CRS) -> float:
     )
     middle, beside, below = LocalFrame(lat[0], lon[0]).en_from_latlon(lat, lon)
     return math.sqrt(float(np.hypot(*(beside - middle)) * np.hypot(*(below - middle))))
-
-
-def _bytes_of(heights: Array) -> int:
-    return heights.nbytes
 
 
 def _unreadable(path: Path, error: Exception) -> ImageryError:

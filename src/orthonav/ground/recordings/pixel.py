@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera, ground_en_m
+from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import TerrainHeights, sight_on_ground
 from orthonav.core.records import (
@@ -31,6 +32,8 @@ STEPS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
 Array = NDArray[np.float64]
 Relief = Callable[[Array], Array]
 """Heights (N,) above the ground under the camera at metres east and north of it (N, 2)."""
+ELLIPSE_95 = math.sqrt(5.991)
+"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,3 +152,19 @@ def _spread(slopes: Array, stds: Array) -> Array:
     """Covariance (2, 2) that standard deviations (4,) make by derivatives (2, 4)."""
     scaled = slopes * stds
     return np.asarray(scaled @ scaled.T)
+
+
+def ellipse_95(cov_en: NDArray[np.float64]) -> dict[str, float] | None:
+    """The 95 % ellipse of a (2, 2) covariance in m^2, as commands and pages write it.
+
+    Semi-axes `major_m` and `minor_m` to a millimetre, `direction_deg` of the major one to a tenth
+    of a degree clockwise from north. None where `error_ellipse` has NaN.
+    """
+    major_m, minor_m, direction_deg = error_ellipse(cov_en)
+    if math.isnan(major_m):
+        return None
+    return {
+        "major_m": round(ELLIPSE_95 * major_m, 3),
+        "minor_m": round(ELLIPSE_95 * minor_m, 3),
+        "direction_deg": round(direction_deg, 1),
+    }

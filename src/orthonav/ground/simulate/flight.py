@@ -6,7 +6,7 @@ height; the telemetry differs from these by the requested errors.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from orthonav.core.errors import AreaError, CameraError, FlightError
 from orthonav.core.files import replacing_folder, with_paths
 from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.flight.gnss import FILE as GNSS_FILE
-from orthonav.core.flight.gnss import GnssSample, write_gnss
+from orthonav.core.flight.gnss import write_gnss
 from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.geo.swapped import swapped_hint
@@ -25,27 +25,28 @@ from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA as DEFAULT_CAMERA
-from orthonav.ground.simulate.attitude import camera_attitude, horizon_errors
-from orthonav.ground.simulate.clouds import Clouds
-from orthonav.ground.simulate.imagery import Coverage, GroundImagery
-from orthonav.ground.simulate.motion import (
-    FlownPath,
-    Wind,
-    drifting,
-    rounded,
-    steady_path,
-    windy_path,
-)
-from orthonav.ground.simulate.perspective import Raster
-from orthonav.ground.simulate.receiver import Good, samples_of, solutions
-from orthonav.ground.simulate.render import ViewEffects, degraded, render_view
-from orthonav.ground.simulate.terrain import (
+from orthonav.ground.simulate.ground import (
+    Coverage,
+    GroundImagery,
     ground_below_m,
     near_ground_en_m,
     reported_heights,
     seen_over,
     surface_of,
 )
+from orthonav.ground.simulate.motion import (
+    FlownPath,
+    Wind,
+    camera_attitude,
+    drifting,
+    horizon_errors,
+    rounded,
+    steady_path,
+    windy_path,
+)
+from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.receiver import Good, samples_of, solutions
+from orthonav.ground.simulate.render import Clouds, ViewEffects, degraded, render_view
 
 MAX_VIEWS = 1_000_000
 """Sanity limit."""
@@ -99,24 +100,10 @@ class Errors:
     horizon_std_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        limits = {
-            "yaw_std_deg": 180.0,
-            "agl_std": 0.5,
-            "tilt_std_deg": 20.0,
-            "attitude_std_deg": 20.0,
-            "prior_std_m": 1e6,
-            "velocity_drift": 0.5,
-            "mount_std_deg": 20.0,
-            "horizon_std_deg": 20.0,
-        }
-        biases = {
-            "yaw_bias_deg": 180.0,
-            "agl_bias": 0.5,
-            "pitch_bias_deg": 20.0,
-            "roll_bias_deg": 20.0,
-        }
-        for name, limit in {**limits, **biases}.items():
-            value, least = getattr(self, name), -limit if name in biases else 0.0
+        limits = {"agl": 0.5, "prior": 1e6, "velocity": 0.5, "yaw": 180.0}  # tilt: 20 deg
+        for each in fields(self):
+            name, limit = each.name, limits.get(each.name.split("_")[0], 20.0)
+            value, least = getattr(self, name), -limit if "_bias" in name else 0.0
             if value is not None and not least <= value <= limit:
                 whole = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
                 hint = f" (a fraction of {whole}: 0.05 is 5 %)" if whole else ""
@@ -254,9 +241,8 @@ def simulate_flight(
         if request.in_perspective:
             posting_m = request.terrain_posting_m
             surface = surface_of(request.terrain, area.frame, area.extent_en_m, posting_m)
-        clouds = None
-        if request.cloud_share > 0:
-            clouds = Clouds(len(poses), request.cloud_share, request.seed)
+        cloudy = request.cloud_share > 0
+        clouds = Clouds(len(poses), request.cloud_share, request.seed) if cloudy else None
         note = f"simulated over {mosaic.sources[0].path.name}, seed {request.seed}"
         writer = FlightWriter(folder, request.camera, note)
         digits = max(4, len(str(len(poses))))
@@ -272,19 +258,12 @@ def simulate_flight(
                 progress((number + 1) / len(poses))
         writer.close()
         if request.gnss is not None:
-            write_gnss(folder / GNSS_FILE, _solutions(request, request.gnss, area, poses))
+            times = np.array([pose.time_s for pose in poses])
+            places = np.array([pose.position_en_m for pose in poses])
+            rng = np.random.default_rng([request.seed, 5])
+            made = solutions(request.gnss, times, places, rng)
+            write_gnss(folder / GNSS_FILE, samples_of(made, area.frame))
     return len(poses)
-
-
-def _solutions(
-    request: SimulateRequest, receiver: Good, area: Area, poses: Sequence[_Pose]
-) -> Iterator[GnssSample]:
-    """Solutions of the receiver along the poses."""
-    times = np.array([pose.time_s for pose in poses])
-    places = np.array([pose.position_en_m for pose in poses])
-    rng = np.random.default_rng([request.seed, 5])
-    made = solutions(receiver, times, places, rng)
-    return samples_of(made, area.frame)
 
 
 def _check(request: SimulateRequest) -> None:
@@ -513,18 +492,15 @@ def _picture(
 ) -> NDArray[np.uint8]:
     """The image of the camera (H, W, 3), rendered from the window of imagery under it."""
     camera, attitude = request.camera, pose.attitude
+    cover = None
+    if clouds is not None:
+        cover = clouds.before(number, camera, attitude, pose.position_en_m)
     if surface is not None:
         above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
         position = np.array([*pose.position_en_m, above_m])
         picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m, MARGIN_PX)
-        cover = None
-        if clouds is not None:
-            cover = clouds.before(number, camera, attitude, pose.position_en_m)
         return degraded(picture, request.effects, rng, cover)
     rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
-    cover = None
-    if clouds is not None:
-        cover = clouds.before(number, camera, attitude, pose.position_en_m)
     corner = corner_en_m - pose.position_en_m
     return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
 

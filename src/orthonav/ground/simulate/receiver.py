@@ -70,8 +70,7 @@ class Good:
             if not 0 <= value <= most:
                 raise FlightError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
         return track
 
 
@@ -87,8 +86,7 @@ class Step(Good):
     bearing_deg: float = 90.0
     over_s: float = 0.0
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
         towards, seconds = direction(self.bearing_deg), track.times_s - self.at_s
         if self.over_s == 0:
             return replace(track, en_m=track.en_m + (seconds >= 0)[:, None] * self.metres * towards)
@@ -109,8 +107,7 @@ class Drag(Good):
     mps: float = 1.0
     bearing_deg: float = 90.0
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
         seconds = np.maximum(track.times_s - self.at_s, 0.0)[:, None]
         towards = self.mps * direction(self.bearing_deg)
         velocity = track.vel_en_mps + (seconds > 0) * towards
@@ -123,9 +120,8 @@ class Drift(Drag):
 
     mps: float = 0.5
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
-        return replace(super().with_fault(track), vel_en_mps=track.vel_en_mps)
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
+        return replace(super()._with_fault(track), vel_en_mps=track.vel_en_mps)
 
 
 @dataclass(frozen=True)
@@ -135,8 +131,7 @@ class Frozen(Good):
     at_s: float = 60.0
     stale: int = 0
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
         last = max(int(np.searchsorted(track.times_s, self.at_s)) - 1, 0)
         source = np.minimum(np.arange(len(track.times_s)), last)
         solved = track.solved_s[source] if self.stale else track.solved_s
@@ -152,8 +147,7 @@ class Jumping(Good):
     metres: float = 40.0
     every_s: float = 5.0
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
         phase = np.floor((track.times_s - self.at_s) / max(self.every_s, 0.1))
         away = (phase >= 0) & (phase % 2 == 0)
         return replace(track, en_m=track.en_m + away[:, None] * self.metres * direction(45.0))
@@ -167,8 +161,7 @@ class Jam(Good):
     for_s: float = 1e9
     silent: int = 0
 
-    def with_fault(self, track: GnssTrack) -> GnssTrack:
-        """The track with the fault."""
+    def _with_fault(self, track: GnssTrack) -> GnssTrack:
         gone = (track.times_s >= self.at_s) & (track.times_s < self.at_s + self.for_s)
         if self.silent:
             return GnssTrack(**{name: value[~gone] for name, value in vars(track).items()})
@@ -230,7 +223,7 @@ def solutions(
         np.full(count, STATED_STD_M),
         np.full(count, SATELLITES),
     )
-    return receiver.with_fault(good)
+    return receiver._with_fault(good)
 
 
 def samples_of(track: GnssTrack, frame: LocalFrame) -> Iterator[GnssSample]:

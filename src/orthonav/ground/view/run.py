@@ -28,7 +28,7 @@ from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.calibration import is_covariance
 from orthonav.ground.evaluate.metrics import FAR_M, check_truth
 from orthonav.ground.recordings.flightlog import is_flight_log
-from orthonav.ground.recordings.pixel import locate_pixel
+from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 from orthonav.ground.report.imagery import (
     GroundWindow,
     SheetImagery,
@@ -44,7 +44,6 @@ from orthonav.ground.report.numbers import to_plain
 from orthonav.ground.view.feed import Batch, Feed, LineFeed
 from orthonav.ground.view.images import FolderImages, NoImages, Shot, ViewImages
 from orthonav.ground.view.logs import LogReader
-from orthonav.onboard.messages.estimate import ellipse_95
 
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]

@@ -15,8 +15,6 @@ from orthonav.core.errors import OrthonavError
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
 
-ELLIPSE_95 = math.sqrt(5.991)
-"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
 AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
 """Time over which the filters of autopilots average positions, s, where their claim should come to
 the standard deviation `AT_STD_M`; it grows with this power of it. Derived from the default process
@@ -180,22 +178,6 @@ def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
     """
     values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
-
-
-def ellipse_95(cov_en: NDArray[np.float64]) -> dict[str, float] | None:
-    """The 95 % ellipse of a (2, 2) covariance in m^2, as commands and pages write it.
-
-    Semi-axes `major_m` and `minor_m` to a millimetre, `direction_deg` of the major one to a tenth
-    of a degree clockwise from north. None where `error_ellipse` has NaN.
-    """
-    major_m, minor_m, direction_deg = error_ellipse(cov_en)
-    if math.isnan(major_m):
-        return None
-    return {
-        "major_m": round(ELLIPSE_95 * major_m, 3),
-        "minor_m": round(ELLIPSE_95 * minor_m, 3),
-        "direction_deg": round(direction_deg, 1),
-    }
 
 
 def _both_clocks(
