@@ -255,14 +255,6 @@ def test_empty_masks_are_dropped():
     assert list(automatic_masks(predict, (64, 64), 64, rules)) == []
 
 
-def test_suppression_keeps_the_best_of_near_duplicates():
-    corners = np.array([[0, 0, 10, 10], [0, 0, 10, 11], [0, 0, 10, 10], [30, 30, 40, 40]])
-    scores = np.array([0.8, 0.9, 0.95, 0.7])
-    assert suppressed(corners, scores, 0.7) == [2, 3]
-    assert suppressed(corners, scores, 0.95) == [2, 1, 3]
-    assert suppressed(corners, scores, 1.0) == [2, 1, 0, 3]
-
-
 def test_suppression_equals_that_of_opencv():
     rng = np.random.default_rng(1)
     first = rng.integers(0, 60, (200, 2))
@@ -363,13 +355,6 @@ def test_large_pictures_are_cut_into_windows(weights):
         expected[:, x : x + 32] = np.maximum(expected[:, x : x + 32], part)
     np.testing.assert_array_equal(whole, expected)
     assert not np.array_equal(whole, drawn(variant(weights, window=0), grey))
-
-
-def test_the_result_does_not_depend_on_the_chunk_size(weights, monkeypatch):
-    expected = drawn(variant(weights), picture())
-    for pixels in (1, 3 * SIDE * SIDE, 1 << 24):
-        monkeypatch.setattr(sam, "_CHUNK_PIXELS", {"cpu": pixels})
-        np.testing.assert_array_equal(drawn(variant(weights), picture()), expected)
 
 
 def test_a_batch_equals_single_calls(weights):
@@ -552,12 +537,6 @@ def test_is_a_frozen_value():
         made.grid = 3
     recipe = json.loads(json.dumps(variant_recipe(TABLE, made)))
     assert variant_from_recipe(TABLE, recipe) == made
-
-
-def test_defaults_are_those_of_the_original_generator():
-    made = SamBoundaries("somewhere")
-    assert (made.grid, made.prompts, made.iou) == (32, 64, 0.88)
-    assert (made.stability, made.offset, made.overlap) == (0.95, 1.0, 0.7)
 
 
 @pytest.mark.parametrize(

@@ -33,21 +33,6 @@ def test_a_tile_equals_its_part_of_the_sheet_and_is_zero_where_invalid(channels)
         np.testing.assert_allclose(made, wanted, atol=1e-7)
 
 
-def test_scale_is_the_value_of_one():
-    edges = np.ones((1, 80, 96), np.uint8)
-    assert (
-        sheet(pixels=edges, scale=1.0, valid=np.ones((80, 96), bool)).batch(np.arange(3)).min() == 1
-    )
-
-
-def test_memory_maps_are_accepted(tmp_path):
-    tiles = sheet()
-    np.save(tmp_path / "pixels.npy", tiles.pixels)
-    mapped = np.load(tmp_path / "pixels.npy", mmap_mode="r")
-    same = sheet(pixels=mapped).batch(np.arange(3))
-    np.testing.assert_array_equal(same, tiles.batch(np.arange(3)))
-
-
 def test_grey_levels_of_a_tile():
     grey = np.arange(80 * 96, dtype=np.uint32).astype(np.uint8).reshape(80, 96)
     tiles = sheet(grey=grey)

@@ -19,7 +19,7 @@ from orthonav.core.errors import OutputError
 from orthonav.core.tiles.network import AutoEncoderRecipe, TripletRecipe
 from orthonav.research import training
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.training import Means, TrainingError, learn_network, loss_picture
+from orthonav.research.training import Means, TrainingError, learn_network
 
 TILE_PX = 32
 AUTO = AutoEncoderRecipe(dims=16, width=16, epochs=3, batch=8, learning_rate=3e-3)
@@ -205,20 +205,6 @@ def test_epochs_can_be_added_to_a_finished_training_and_not_taken_away(tmp_path)
         learn(dataclasses.replace(AUTO, epochs=2), tmp_path)
 
 
-def test_long_epochs_report_progress(monkeypatch):
-    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    messages = []
-    learn(AUTO, report=lambda text, share: messages.append((text, share)))
-    assert [text.partition(", loss")[0] for text, _ in messages[:5]] == [
-        "epoch 1 of 3, batch 1 of 4",
-        "epoch 1 of 3, batch 2 of 4",
-        "epoch 1 of 3, batch 3 of 4",
-        "epoch 1 of 3",
-        "epoch 2 of 3, batch 1 of 4",
-    ]
-    assert [share for _, share in messages[:12]] == pytest.approx(np.arange(1, 13) / 12)
-
-
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
     first, second, other = (learn(AUTO, seed=seed).onnx for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, second)
@@ -245,23 +231,6 @@ def test_pictures_show_the_progress(tmp_path):
         "loss.png",
         "tiles.png",
     }
-
-
-def test_pictures_do_not_wait_for_a_long_first_epoch(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "SHOWN_AFTER_S", (0.0,))
-    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    with pytest.raises(Killed):
-        learn(AUTO, tmp_path, means=RARELY_SAVED, report=kill_at("epoch 1 of 3, batch 2"))
-    assert {path.name for path in tmp_path.iterdir()} == {"history.json", "loss.png", "tiles.png"}
-    assert losses(tmp_path) == []
-
-
-def test_the_curve_falls_where_the_loss_does():
-    dark = loss_picture([1.0, 0.1, 0.01])[40:].min(axis=2) < 128
-    rows = [np.flatnonzero(dark[:, col]).mean() for col in (22, 320, 618)]
-    assert rows[0] < rows[1] < rows[2]
-    assert loss_picture([0.5]).shape == loss_picture([0.0, 0.0]).shape
-    assert loss_picture([]).all() and loss_picture([0.5, np.nan]).all()
 
 
 @pytest.mark.parametrize("change", ["recipe", "seed", "tiles"])
@@ -327,18 +296,6 @@ def test_a_loss_that_is_not_finite_ends_the_training():
 def test_triplets_need_positives():
     with pytest.raises(ValueError, match="positives"):
         learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
-
-
-@pytest.mark.slow  # an experiment
-def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
-    recipe = dataclasses.replace(AUTO, epochs=4)
-    plain = Means(bf16=False, device="cpu")
-    fast = dataclasses.replace(QUICK, bf16=True)
-    learn(recipe, tmp_path / "plain", means=plain)
-    learn(recipe, tmp_path / "fast", means=fast)
-    exact, rounded = losses(tmp_path / "plain"), losses(tmp_path / "fast")
-    assert rounded != exact
-    np.testing.assert_allclose(rounded, exact, rtol=0.1)
 
 
 @pytest.mark.parametrize(

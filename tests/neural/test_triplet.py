@@ -6,7 +6,7 @@ import torch
 
 from orthonav.core.tiles.network import TripletRecipe
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.triplet import ResNet34, Triplets, hard_negatives, triplet_loss
+from orthonav.research.triplet import ResNet34, Triplets, triplet_loss
 
 
 def test_it_has_the_papers_number_of_parameters():
@@ -64,14 +64,6 @@ def test_the_loss_equals_the_formula(seed, semi_hard):
         made = triplet_loss(*tensors, margin=margin, semi_hard=semi_hard)
         wanted = slow_loss(anchors, positives, apart, margin, semi_hard)
         assert float(made) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
-
-
-def test_hardest_and_semi_hard_differ():
-    anchors = torch.tensor([[0.0], [1.0], [2.0]])
-    apart = ~torch.eye(3, dtype=torch.bool)
-    near = torch.full((3,), 2.0)
-    assert hard_negatives(anchors, near, apart, semi_hard=False)[0] == 1
-    assert hard_negatives(anchors, near, apart, semi_hard=True)[0] == 2
 
 
 def test_places_that_are_not_apart_are_not_negatives():
