@@ -53,9 +53,6 @@ CALIBRATION_TILES, HELD_OUT_TILES = 64, 32
 SETTLING_BATCHES = 32
 PROGRESS_EVERY_S = 2.0
 PLATEAU_FACTOR = 0.5
-SHOWN_EPOCHS = (1, 2, 5, 10, 20, 50)
-SHOWN_AFTER_S = (10.0, 60.0)
-"""Early times at which pictures are written although no checkpoint is due, seconds."""
 
 Recipe = AutoEncoderRecipe | TripletRecipe
 
@@ -192,19 +189,37 @@ class TrainingState:
         self.losses = list(parts.get("losses", []))  # absent in older checkpoints
 
 
-class CheckpointStore:
-    """Writes checkpoints and pictures of one training to a folder."""
+class Checkpoints:
+    """Reports the progress of one training and writes its checkpoints and pictures to a folder.
 
-    def __init__(self, work: Path | None, fingerprint: str, every_s: float) -> None:
-        self._work, self._fingerprint, self._every_s = work, fingerprint, every_s
-        self._saved_s = self._began_s = time.monotonic()
-        self._early_s = list(SHOWN_AFTER_S)
+    `batches`: number of batches of an epoch.
+    """
 
-    def load(self, state: TrainingState, device: torch.device, epochs: int) -> None:
-        """Restore any checkpoint.
+    def __init__(
+        self,
+        state: TrainingState,
+        tiles: SheetTiles,
+        fingerprint: str,
+        *,
+        work: Path | None,
+        epochs: int,
+        batches: int,
+        every_s: float,
+        report: Progress,
+    ) -> None:
+        self._state, self._tiles, self._fingerprint = state, tiles, fingerprint
+        self._work, self._epochs, self._batches = work, epochs, batches
+        self._every_s, self._report = every_s, report
+        self._saved_s = self._progress_s = self._start_s = time.monotonic()
+        self._start = self._share()
 
-        Raises `OutputError` if it belongs to another training, or has more than `epochs` epochs.
+    def load(self, device: torch.device) -> None:
+        """Restore any checkpoint, and remove temporary files of interrupted writes.
+
+        Raises `OutputError` if it belongs to another training, or has more epochs.
         """
+        for left in self._work.glob(".checkpoint.pt.*.tmp.pt") if self._work else ():
+            left.unlink(missing_ok=True)
         path = None if self._work is None else self._work / "checkpoint.pt"
         if path is None or not path.exists():
             return
@@ -216,45 +231,56 @@ class CheckpointStore:
             raise OutputError(f"checkpoint cannot be read; delete it: {path}") from error
         if not same:
             raise OutputError(f"folder holds another training; choose another folder: {path}")
-        if len(found["history"]) > epochs:
+        if len(found["history"]) > self._epochs:
             raise OutputError(
-                f"folder holds a training of {len(found['history'])} epochs, {epochs} are asked "
-                f"for; give as many, or choose another folder: {path}"
+                f"folder holds a training of {len(found['history'])} epochs, {self._epochs} are "
+                f"asked for; give as many, or choose another folder: {path}"
             )
-        state.take(found)
+        self._state.take(found)
+        self._start = self._share()
 
-    def clear(self) -> None:
-        """Remove temporary files of interrupted writes, which may hold gigabytes."""
-        for left in self._work.glob(".checkpoint.pt.*.tmp.pt") if self._work else ():
-            left.unlink(missing_ok=True)
-
-    def after_batch(self, state: TrainingState, tiles: SheetTiles) -> None:
-        """Write a checkpoint if one is due; write pictures with it, and early in the training."""
-        now_s = time.monotonic()
-        early = bool(self._early_s) and now_s - self._began_s >= self._early_s[0]
-        if early:
-            self._early_s.pop(0)
-        self._write(state, tiles, due=now_s - self._saved_s >= self._every_s, shown=early)
-
-    def after_epoch(self, state: TrainingState, tiles: SheetTiles, *, last: bool) -> None:
-        """Write a checkpoint if one is due, and always after the last epoch."""
-        due = last or time.monotonic() - self._saved_s >= self._every_s
-        self._write(state, tiles, due=due, shown=len(state.history) in SHOWN_EPOCHS)
-
-    def _write(self, state: TrainingState, tiles: SheetTiles, *, due: bool, shown: bool) -> None:
-        if self._work is None or not (due or shown):
+    def after_batch(self) -> None:
+        """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
+        epoch, done = len(self._state.history), len(self._state.losses)
+        if done == self._batches:
             return
-        if due:
-            with replacing(self._work / "checkpoint.pt") as temporary:
-                torch.save({"fingerprint": self._fingerprint, **state.parts()}, temporary)
-            self._saved_s = time.monotonic()
+        if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
+            at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
+            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
+        self._write(last=False)
+
+    def after_epoch(self) -> None:
+        """Report the mean loss; write if due, and always after the last epoch."""
+        history = self._state.history
+        self._say(f"epoch {len(history)} of {self._epochs}, loss {history[-1]:.5g}")
+        self._write(last=len(history) == self._epochs)
+
+    def _write(self, *, last: bool) -> None:
+        state = self._state
+        if self._work is None or not (last or time.monotonic() - self._saved_s >= self._every_s):
+            return
+        with replacing(self._work / "checkpoint.pt") as temporary:
+            torch.save({"fingerprint": self._fingerprint, **state.parts()}, temporary)
+        self._saved_s = time.monotonic()
         write_text(self._work / "history.json", json.dumps({"loss": state.history}) + "\n")
         picture = loss_picture(state.history)
         if not state.history:
             picture = loss_picture([float(loss) for loss in state.losses], "batch")
         _write_png(self._work / "loss.png", picture)
         if isinstance(state.model, AutoEncoder):
-            _write_png(self._work / "tiles.png", reconstructions(state.model, tiles))
+            _write_png(self._work / "tiles.png", reconstructions(state.model, self._tiles))
+
+    def _share(self) -> float:
+        """Share of the training that is done."""
+        batches = len(self._state.history) * self._batches + len(self._state.losses)
+        return batches / (self._epochs * self._batches)
+
+    def _say(self, text: str) -> None:
+        """Report with the time left, at the speed since this process began."""
+        self._progress_s, share = time.monotonic(), self._share()
+        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
+        left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
+        self._report(f"{text}{left}", share)
 
 
 def loss_picture(history: Sequence[float], unit: str = "epoch") -> NDArray[np.uint8]:
@@ -450,70 +476,28 @@ def train(
     task.model.to(device)
     scaler = torch.amp.GradScaler(device.type, enabled=mixed == torch.float16)
     state = TrainingState(task.model, recipe, scaler)
-    known_by = fingerprint(recipe, tiles, dates, seed, means)
-    store = CheckpointStore(work, known_by, means.save_every_s)
-    store.load(state, device, recipe.epochs)
     feed = _Feed(task, recipe.batch, seed, len(tiles), device, mixed, means)
-    store.clear()
-    pauses = _Pauses(state, tiles, recipe.epochs, feed.per_epoch, report, store)
+    checkpoints = Checkpoints(
+        state,
+        tiles,
+        fingerprint(recipe, tiles, dates, seed, means),
+        work=work,
+        epochs=recipe.epochs,
+        batches=feed.per_epoch,
+        every_s=means.save_every_s,
+        report=report,
+    )
+    checkpoints.load(device)
     # By default convolutions on a GPU are not deterministic.
     with _kept_memory(), torch.backends.cudnn.flags(enabled=True, deterministic=True):
         while len(state.history) < recipe.epochs:
             task.model.train()
-            loss = _epoch(feed, state, pauses)
+            loss = _epoch(feed, state, checkpoints)
             state.end_epoch(float(loss))
-            pauses.after_epoch()
+            checkpoints.after_epoch()
         _settle(feed)
     task.model.eval()
     return state.history
-
-
-class _Pauses:
-    """Reports progress and writes checkpoints."""
-
-    def __init__(
-        self,
-        state: TrainingState,
-        tiles: SheetTiles,
-        epochs: int,
-        batches: int,
-        report: Progress,
-        store: CheckpointStore,
-    ) -> None:
-        self._state, self._tiles = state, tiles
-        self._epochs, self._batches = epochs, batches
-        self._report, self._store = report, store
-        self._progress_s = self._start_s = time.monotonic()
-        self._start = self._share()
-
-    def after_batch(self) -> None:
-        """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
-        epoch, done = len(self._state.history), len(self._state.losses)
-        if done == self._batches:
-            return
-        if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
-            at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
-            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
-        self._store.after_batch(self._state, self._tiles)
-
-    def after_epoch(self) -> None:
-        """Report the mean loss, and write if due."""
-        history = self._state.history
-        done = len(history)
-        self._say(f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}")
-        self._store.after_epoch(self._state, self._tiles, last=done == self._epochs)
-
-    def _share(self) -> float:
-        """Share of the training that is done."""
-        batches = len(self._state.history) * self._batches + len(self._state.losses)
-        return batches / (self._epochs * self._batches)
-
-    def _say(self, text: str) -> None:
-        """Report with the time left, at the speed since this process began."""
-        self._progress_s, share = time.monotonic(), self._share()
-        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
-        left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
-        self._report(f"{text}{left}", share)
 
 
 def _duration(seconds: float) -> str:
@@ -560,7 +544,7 @@ class _Feed:
         return torch.autocast(self.device.type, kind, enabled=wanted)
 
 
-def _epoch(feed: _Feed, state: TrainingState, pauses: _Pauses) -> Tensor:
+def _epoch(feed: _Feed, state: TrainingState, checkpoints: Checkpoints) -> Tensor:
     """Mean loss of one epoch; a resumed epoch starts after its finished batches."""
     one = torch.ones((), device=feed.device)
     for tensors in feed.batches(len(state.history), len(state.losses)):
@@ -570,7 +554,7 @@ def _epoch(feed: _Feed, state: TrainingState, pauses: _Pauses) -> Tensor:
         state.losses.append(loss)
         state.scaler.step(state.optimizer)
         state.scaler.update()
-        pauses.after_batch()
+        checkpoints.after_batch()
     return torch.stack(state.losses).double().mean()
 
 
