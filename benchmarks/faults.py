@@ -64,19 +64,15 @@ HEADER = ("fault", "s", "views", "sent", "worst m", "false", "recovered s", "lea
 class Ground:
     """An orthophoto on the plane of a map.
 
-    `corner` (2,): its first pixel, metres east and north. `size_px`: columns and rows.
+    `side_m`: of a square around the origin, at 1 m; None: the raster of the map.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        localizer: Localizer,
-        *,
-        corner: tuple[float, float] = (-SIDE_M / 2, SIDE_M / 2),
-        size_px: tuple[int, int] = (SIDE_M, SIDE_M),
-        gsd_m: float = 1.0,
-    ) -> None:
-        (west_m, north_m), (cols, rows) = corner, size_px
+    def __init__(self, path: Path, localizer: Localizer, side_m: int | None = None) -> None:
+        grid = localizer.grid
+        west_m, north_m, gsd_m = grid.west_m, grid.north_m, grid.gsd_m
+        cols, rows = grid.width_px, grid.height_px
+        if side_m is not None:
+            west_m, north_m, gsd_m, cols, rows = -side_m / 2, side_m / 2, 1.0, side_m, side_m
         sheet = Mosaic.open([path]).sheet(
             localizer.sheet.frame,
             west_m=west_m,
@@ -87,7 +83,7 @@ class Ground:
         )
         with sheet as raster:
             rgb = np.asarray(raster.read(0, 0, rows, cols).rgb)
-        self._corner, self._rgb, self._gsd_m = np.array(corner), rgb, gsd_m
+        self._corner, self._rgb, self._gsd_m = np.array([west_m, north_m]), rgb, gsd_m
 
     def mirrored(self) -> "Ground":
         """The same, east and west exchanged."""
@@ -131,7 +127,7 @@ def _world(work: Path, mirrored: bool) -> tuple[World, Path]:
     past, present = (area(work, date, side_m=SIDE_M) for date in (PAST, PRESENT))
     path = map_of(middle_of(past, MAP_M, work / "middle.tif"), work)
     localizer = Localizer(open_map(path))
-    ground = Ground(present, localizer)
+    ground = Ground(present, localizer, SIDE_M)
     ground = ground.mirrored() if mirrored else ground
     frame = localizer.sheet.frame
     return World(localizer, frame, ground.picture, REACH_M, AGL_M, SPEED_MPS), path
@@ -222,14 +218,11 @@ def measure(options: argparse.Namespace) -> Section:
         say(f"{' | '.join((calm if report.fault.group == 'none' else rows)[-1])} {report.withheld}")
         wrong += len(report.wrong()) * report.fault.detectable
     notes = (
-        f"{AGL_M:g} m above generated ground of another date than the map's ({MAP_M / 1000:g} km "
-        f"square), {SPEED_MPS:g} m/s with turns and turbulence, camera of {CAMERA.width_px} x "
-        f"{CAMERA.height_px} px at {VIEWS_HZ:g} Hz; {LEAD_S:g} s (--quick: {QUICK_LEAD_S:g} s) "
-        "undisturbed before the fault, unless it is there from the start",
-        "s, views, sent: during the fault; worst: largest error of a message from its begin to the "
-        f"end of the flight; false: messages of the whole flight more than {FAR_M:g} m and "
-        f"{FAR_STD:g} standard deviations off; recovered: from the end of the fault to the next "
-        f"correct message, none: within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s)",
+        f"{AGL_M:g} m above generated ground of another date than the map's, {SPEED_MPS:g} m/s "
+        f"with turns and turbulence, {VIEWS_HZ:g} Hz; s, views, sent: during the fault; worst: "
+        "from its begin to the end of the flight; false: messages of the flight more than "
+        f"{FAR_M:g} m and {FAR_STD:g} standard deviations off; recovered: from the end of the "
+        f"fault to a correct message within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s)",
     )
     tables = [Table("Faults", HEADER, rows, notes)] if rows else []
     if calm:

@@ -46,13 +46,7 @@ def _world(pair: Pair, work: Path) -> World:
     """The map of a pair, built once, and the ground of its other date."""
     localizer = localizer_of(pair.map, work)
     grid = localizer.grid
-    ground = Ground(
-        ortho(pair.views, work),
-        localizer,
-        corner=(grid.west_m, grid.north_m),
-        size_px=(grid.width_px, grid.height_px),
-        gsd_m=grid.gsd_m,
-    )
+    ground = Ground(ortho(pair.views, work), localizer)
     reach_m = (min(grid.width_px, grid.height_px) / 2 - MARGIN_PX) * grid.gsd_m
     height_m, speed_mps = AGL_PX * grid.gsd_m, SPEED_PX_S * grid.gsd_m
     return World(localizer, localizer.sheet.frame, ground.picture, reach_m, height_m, speed_mps)

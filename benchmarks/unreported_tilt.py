@@ -35,7 +35,7 @@ from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
 from orthonav.core.records import CONFIDENT, RADIUS_SHARE, Fix, Telemetry, View
-from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors
+from orthonav.ground.simulate.flight import Errors
 from orthonav.onboard.run import SingleViews, locate_view
 
 NAME = "unreported_tilt"
@@ -171,15 +171,11 @@ def measure(options: argparse.Namespace) -> Section:
     for row in resumed(stored, measured, tasks, options.workers):
         rows.append(row)
         say("  ".join(row))
-    camera = DEFAULT_CAMERA
     notes = (
-        f"camera of {camera.width_px} x {camera.height_px} px, 65 deg wide; heading off by 10 deg "
-        "and height by 10 % (standard deviations, reported); pitch and roll reported 0 without a "
-        f"deviation; whole map, no prior, seed {options.seed}",
-        "px: root of the area of a view; tilt sd: of true pitch and roll per axis; confident: "
-        f"{CONFIDENT:g} or more, and all further columns but ms are of those; stated sd: root of "
-        "the mean eigenvalue of the covariance; NEES: 2 if the covariance is right; middle: of the "
-        f"picture; false: camera off by more than {FAR_M:g} m and {RADIUS_SHARE:.1%} of the height",
+        "heading off by 10 deg and height by 10 % (standard deviations, reported); pitch and roll "
+        f"reported 0 without a deviation; whole map, no prior, seed {options.seed}; px: root of "
+        f"the area of a view; columns after confident ({CONFIDENT:g} or more) but ms are of those; "
+        f"false: camera off by more than {FAR_M:g} m and {RADIUS_SHARE:.1%} of the height",
     )
     title = "Views with unreported tilt"
     return Section(title, [Table(title, HEADER, rows, notes)])

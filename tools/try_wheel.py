@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         work = folder / "work"
         work.mkdir()
-        shutil.copytree(ROOT / "src" / "orthonav" / "demo_data", work / "land")
+        shutil.copytree(ROOT / "src" / "orthonav" / "ground" / "demo_data", work / "land")
         try_extra("geo", wheel, folder, work)
         try_core(wheel, folder, work)
         for extra in tried:  # in the order of the table
@@ -148,10 +148,8 @@ def faults_of_wheel(wheel: Path) -> list[str]:
 
 def tracked_files() -> list[str]:
     """Paths of the files that git tracks and that are there."""
-    done = subprocess.run(
-        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return [name for name in done.stdout.split("\0") if name and (ROOT / name).is_file()]
+    listed = subprocess.check_output(["git", "ls-files", "-z"], cwd=ROOT, text=True)
+    return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
 
 
 def try_core(wheel: Path, folder: Path, work: Path) -> None:
@@ -199,14 +197,10 @@ def environment(path: Path, *requirements: str) -> Path:
 
 def report(python: Path, work: Path) -> dict[str, dict[str, dict[str, str]]]:
     """What `orthonav --version --json` says."""
-    done = subprocess.run(
-        [python, "-m", "orthonav", "--version", "--json"],
-        cwd=work,
-        capture_output=True,
-        text=True,
-        check=True,
+    command = [python, "-m", "orthonav", "--version", "--json"]
+    found: dict[str, dict[str, dict[str, str]]] = json.loads(
+        subprocess.check_output(command, cwd=work, text=True)
     )
-    found: dict[str, dict[str, dict[str, str]]] = json.loads(done.stdout)
     return found
 
 

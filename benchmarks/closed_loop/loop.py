@@ -456,7 +456,7 @@ def cells(flown: Flown) -> list[str]:
 
 def measure(options: argparse.Namespace) -> Section:
     """All scenarios of a vehicle with a filter, or only some, each with each seed."""
-    demo, rows = Demo.made(options.work), []
+    demo, rows = Demo(options.work), []
     for seed in options.seed:
         for name in options.only or SCENARIOS:
             flown = fly(
@@ -472,12 +472,10 @@ def measure(options: argparse.Namespace) -> Section:
                 rows[-1][0] += f", seed {seed}"
             say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
-        f"{options.minutes:g} minutes without GNSS after {GNSS_S:g} s with it; disturbances begin "
-        f"{BEFORE_S:g} s later; judged from 5 s after GNSS was cut on; nothing: no fixes",
-        "position, velocity, tilt: errors of the autopilot, tilt as RMS; NEES: mean, 2 is right; "
-        "fixes: those sent; tilt correlation, slope: of the errors of fixes with height times the "
-        "tangent of the autopilot's error of tilt, ahead and right; false: sent, and more than "
-        f"{FAR_M:g} m and {FAR_STD:g} stated deviations off",
+        f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; position, velocity, "
+        "tilt: errors of the autopilot; correlation, slope: of errors of fixes with height "
+        "times the tangent of the autopilot's error of tilt, ahead and right; false: sent, and "
+        f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
     title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"
     return Section("Flights in the loop", [Table(title, HEADER, rows, notes)])

@@ -8,8 +8,6 @@ exposure) and `events.csv`.
 
 import argparse
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,7 +21,8 @@ from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.faults import Ground
 from benchmarks.looped_flight import read_rows
 from benchmarks.record import Section, Table, number, quantiles, say
-from benchmarks.scenes import DATA
+from benchmarks.scenes import DATA, PAST, PRESENT, map_of
+from orthonav.cli.demo import IMAGERY
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
@@ -46,7 +45,6 @@ from orthonav.onboard.telemetry import (
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 """The camera of the recorded flights; it looks straight down the body, image top to the nose."""
 EFFECTS = ViewEffects()
-MAP, PRESENT = "area.onav", "2021-10.tif"
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 Angles = tuple[float, float, float]
@@ -54,48 +52,27 @@ Angles = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Demo:
-    """Files of `orthonav demo` in a folder."""
+    """The area of `orthonav demo`; its map lies in a folder of work."""
 
-    folder: Path
-
-    @classmethod
-    def made(cls, work: Path) -> "Demo":
-        """The demo in `work`, made where it is absent (a minute or two)."""
-        folder = work / "demo"
-        if not (folder / MAP).is_file():
-            work.mkdir(parents=True, exist_ok=True)
-            command = (sys.executable, "-m", "orthonav", "demo", "--out", str(folder))
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        return cls(folder)
+    work: Path
 
     @cached_property
     def localizer(self) -> Localizer:
-        """Places views on the map."""
-        return Localizer(open_map(self.folder / MAP))
+        return Localizer(open_map(map_of(IMAGERY / f"{PAST}.tif", self.work)))
 
     @property
     def frame(self) -> LocalFrame:
-        """The plane of the map."""
         return self.localizer.sheet.frame
 
     @cached_property
     def _ground(self) -> Ground:
-        """The ground of the later date."""
-        grid = self.localizer.grid
-        return Ground(
-            self.folder / PRESENT,
-            self.localizer,
-            corner=(grid.west_m, grid.north_m),
-            size_px=(grid.width_px, grid.height_px),
-            gsd_m=grid.gsd_m,
-        )
+        return Ground(IMAGERY / f"{PRESENT}.tif", self.localizer)
 
     def picture(
         self, place_en_m: Array, attitude_deg: Angles, agl_m: float, rng: np.random.Generator
     ) -> Grey:
         """What the camera sees at a place (2,), with heading, pitch and roll, and a height."""
-        made = self._ground.picture(place_en_m, attitude_deg, agl_m, rng, CAMERA, EFFECTS)
-        return np.asarray(made, np.uint8)
+        return self._ground.picture(place_en_m, attitude_deg, agl_m, rng, CAMERA, EFFECTS)
 
 
 GROUND_AMSL_M = 40.0
@@ -336,7 +313,7 @@ def replay(
     `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
     Without `disturbed` the flight ends before the first disturbance of the camera.
     """
-    recorded, demo = Recorded(flight), Demo.made(work)
+    recorded, demo = Recorded(flight), Demo(work)
     locators: dict[str, Locator] = {
         "single": SingleViews(demo.localizer),
         "single, no prior": SingleViews(demo.localizer, use_prior=False),

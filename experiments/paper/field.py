@@ -53,15 +53,7 @@ class Seen:
     truth_en_m: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Position (2,) in the sheet, and the evidence for it, comparable within a method."""
-
-    place_en_m: NDArray[np.float64]
-    evidence: float
-
-
-Locate = Callable[[View, Prior, NDArray[np.float64]], Answer | None]
+Locate = Callable[[View, Prior, NDArray[np.float64]], matchers.Found | None]
 
 
 def maps_of(place: Workplace, scene: Scene) -> list[Method]:
@@ -178,9 +170,8 @@ def _method(
         features = matchers.FeatureMap(matchers.LOCAL[name](), picture)
         std_m = PRIOR_STD_PX * localizer.grid.gsd_m
 
-        def match(view: View, _: Prior, prior_en_m: NDArray[np.float64]) -> Answer | None:
-            found = features.locate(view, prior_en_m, std_m)
-            return None if found is None else Answer(found.place_en_m, found.inliers)
+        def match(view: View, _: Prior, prior_en_m: NDArray[np.float64]) -> matchers.Found | None:
+            return features.locate(view, prior_en_m, std_m)
 
         return match, features.features.nbytes
     (method,) = (each for each in maps_of(place, scene) if each.key == name)
@@ -193,12 +184,12 @@ def _method(
     )
     criterion = "confidence" if method.registration else "lowe_ratio"
 
-    def place_by_map(view: View, prior: Prior, _: NDArray[np.float64]) -> Answer | None:
+    def place_by_map(view: View, prior: Prior, _: NDArray[np.float64]) -> matchers.Found | None:
         fix = flying.locate(view, prior=prior)
         if not isinstance(fix, Fix):
             return None
         known = {**fix.evidence, "confidence": fix.confidence}
         found = flying.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-        return Answer(np.asarray(found), float(known.get(criterion, math.nan)))
+        return matchers.Found(np.asarray(found), float(known.get(criterion, math.nan)))
 
     return place_by_map, path.stat().st_size

@@ -164,10 +164,10 @@ LOCAL: dict[str, Callable[[], Local]] = {
 
 @dataclass(frozen=True)
 class Found:
-    """Position east and north (2,) in the sheet, and its number of inliers."""
+    """Position east and north (2,) in the sheet, and the evidence for it: number of inliers."""
 
     place_en_m: NDArray[np.float64]
-    inliers: int
+    evidence: float
 
 
 class FeatureMap:

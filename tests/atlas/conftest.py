@@ -21,6 +21,12 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of 400 x 400 m at 1 m, all valid."""
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
+
+
+@pytest.fixture(scope="module")
 def atlas(area, made_once):
     """An atlas of the first date with its index; read-only."""
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas

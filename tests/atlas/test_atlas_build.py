@@ -48,12 +48,6 @@ def fewer_crops(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def ortho(make_ortho, tmp_path_factory):
-    """An orthophoto of 400 x 400 m at 1 m, all valid."""
-    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
-
-
-@pytest.fixture(scope="module")
 def built(ortho, tmp_path_factory):
     """An atlas of it, which nobody changes, and what building it came to."""
     place = tmp_path_factory.mktemp("built") / "atlas"

@@ -12,21 +12,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from test_atlas_build import SMALL, content, made
 
 from orthonav.core.errors import MissingExtraError, WorkerError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.sheets import WorldSheets
+from orthonav.ground.atlas.cluster import Failure, RayRunner, attempted
 
-SMALL = {
-    "sheet_km": 0.3,
-    "tile_px": 64,
-    "overlap": 0.5,
-    "calibration_views": 1,
-    "coarse": {"gsd_m": 4.0, "tile_px": 32, "overlap": 0.5},
-}
 LONGER = {**SMALL, "calibration_views": 96}
 """A sheet takes about a second."""
 START_S, END_S = 60.0, 240.0
@@ -40,32 +32,6 @@ def ray():
     logging.getLogger("ray").setLevel(logging.ERROR)
     yield ray
     ray.shutdown()
-
-
-@pytest.fixture(scope="module")
-def ortho(make_ortho, tmp_path_factory):
-    """An orthophoto of 400 x 400 m at 1 m, all valid."""
-    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
-
-
-def content(place):
-    """All files of an atlas by name."""
-    paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
-    return {str(path.relative_to(place)): path.read_bytes() for path in paths}
-
-
-def two_sheets(ortho):
-    """Bounds of two neighbouring sheets in the middle of the orthophoto."""
-    lattice = WorldSheets(1000 * SMALL["sheet_km"])
-    name = lattice.name_at(*Mosaic.open([ortho]).outline_latlon_deg.mean(axis=0))
-    west, south, east, north = lattice.bounds_deg(name)
-    return west + 1e-6, south + 1e-6, east + (east - west) / 2, north - 1e-6
-
-
-def plain(place, ortho, recipe, bounds_deg=None):
-    with SerialRunner() as runner:
-        request = AtlasRequest(str(place), [ortho], recipe, bounds_deg, index=False)
-        return build_atlas(request, runner)
 
 
 class DiedError(Exception):
@@ -139,20 +105,6 @@ def fake_ray(monkeypatch):
     return made
 
 
-@pytest.mark.long
-def test_an_atlas_built_by_tasks_of_ray_is_the_same(fake_ray, ortho, tmp_path):
-    bounds_deg = two_sheets(ortho)
-    alone = plain(tmp_path / "alone", ortho, SMALL, bounds_deg)
-    before = signal.getsignal(signal.SIGTERM)
-    with RayRunner(workers=2) as runner:
-        assert signal.getsignal(signal.SIGTERM) is before
-        request = AtlasRequest(str(tmp_path / "shared"), [ortho], SMALL, bounds_deg, index=False)
-        shared = build_atlas(request, runner)
-    assert len(shared.names("built")) == 2 and shared.names("built") == alone.names("built")
-    assert content(tmp_path / "shared") == content(tmp_path / "alone")
-    assert not fake_ray.is_initialized()
-
-
 def test_tasks_of_ray_fail_by_themselves_and_are_stopped_at_the_end(fake_ray):
     with RayRunner(workers=2) as runner:
         assert runner.at_once == 2 and fake_ray.options["num_cpus"] == 2
@@ -213,7 +165,7 @@ def two_nodes(ray):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_sheets_of_killed_workers_are_built_again(two_nodes, ortho, tmp_path):
-    alone = plain(tmp_path / "alone", ortho, LONGER)
+    alone = made(tmp_path / "alone", ortho, recipe=LONGER)
     killed = []
 
     def progress(stage, share):
@@ -258,7 +210,7 @@ def test_a_killed_driver_resumes_when_run_again(two_nodes, ortho, tmp_path, with
     )
     assert again.returncode == 0, again.stderr
     assert f"{8 - there} built, {there} unchanged" in again.stdout or there < 7
-    plain(tmp_path / "alone", ortho, LONGER)
+    made(tmp_path / "alone", ortho, recipe=LONGER)
     assert content(place) == content(tmp_path / "alone")
 
 

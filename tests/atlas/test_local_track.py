@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.core.flight.folder import open_flight
+from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import NoFix, View
 from orthonav.core.track import State
@@ -28,8 +28,7 @@ def views(flown):
 
 @pytest.fixture(scope="module")
 def places(flown):
-    lines = (flown / "truth.csv").read_text().splitlines()[1:]
-    return [tuple(map(float, line.split(",")[1:3])) for line in lines]
+    return list(read_truth(flown / "truth.csv").values())
 
 
 def found(views, places, confidence=0.95, moved_m=0.0):

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
 from orthonav.core.errors import AtlasError
-from orthonav.core.flight.folder import open_flight
+from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.records import Fix, NoFix, View
 from orthonav.ground.atlas.catalog import Atlas
@@ -62,11 +62,6 @@ def copied(atlas, tmp_path):
     return Atlas.open(shutil.copytree(atlas.url, tmp_path / "copy"))
 
 
-def _truth(flown):
-    lines = (flown / "truth.csv").read_text().splitlines()[1:]
-    return {line.split(",")[0]: tuple(map(float, line.split(",")[1:3])) for line in lines}
-
-
 @pytest.mark.long
 def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, run):
     """The whole command, once."""
@@ -78,7 +73,7 @@ def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, r
     assert (lines[0]["status"], lines[0]["reason"], lines[0]["state"]) == (
         *("no_fix", "searching", "searching"),
     )
-    truth = _truth(flown)
+    truth = read_truth(flown / "truth.csv")
     fixes = [line for line in lines if line["status"] == "fix"]
     assert len(fixes) >= len(lines) - 3
     for fix in fixes:

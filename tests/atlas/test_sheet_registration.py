@@ -22,6 +22,7 @@ from orthonav.ground.atlas.search import (
     SheetRegistrar,
     TileSearch,
     ViewMatches,
+    ViewRegistrar,
 )
 
 SIDE_M = 300.0
@@ -57,7 +58,7 @@ def _off_m(place, truth):
 def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, candidate):
     """The evidence is what confidences were fitted to."""
     seen, truth = view
-    found = registrar.of_view(seen, SIDE_M).searched(candidate)
+    found = ViewRegistrar(registrar, seen, SIDE_M).searched(candidate)
     assert _off_m(found, truth) < 10
     sheet = registrar.at(candidate, SIDE_M)[0]
     yaw_deg, std_deg = np.degrees([candidate.turn_rad, candidate.turn_std_rad]).tolist()
@@ -72,7 +73,7 @@ def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, can
 
 
 def test_a_judged_candidate_is_finished_where_its_region_is_searched(registrar, view, candidate):
-    judged = registrar.of_view(view[0], SIDE_M).judged(candidate)
+    judged = ViewRegistrar(registrar, view[0], SIDE_M).judged(candidate)
     assert distances_m([judged.latlon_deg], [view[1]])[0] < 20
     finished, searched = judged.finished(), judged.searched()
     assert distances_m([finished.latlon_deg], [searched.latlon_deg])[0] < 2

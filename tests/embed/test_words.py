@@ -96,20 +96,6 @@ def test_assignment_is_exact(words):
     np.testing.assert_array_equal(found[4090:4100], embedder.assigned(descriptors[4090:4100]))
 
 
-@pytest.mark.parametrize("tfidf", [0, 1])
-def test_similarity_says_how_vectors_are_scaled(tfidf):
-    grey = tiles(area())[3]
-    product = random_embedder(similarity="product", tfidf=tfidf)
-    cosine = random_embedder(similarity="cosine", tfidf=tfidf)
-    first, second = (e.view(maps_of(grey), everywhere(grey)) for e in (product, cosine))
-    frequencies = random_embedder().view(maps_of(grey), everywhere(grey))
-    assert frequencies.sum() == pytest.approx(1, abs=1e-6)
-    expected = frequencies * product.idf if tfidf else frequencies
-    np.testing.assert_allclose(first, expected, rtol=1e-6)
-    np.testing.assert_allclose(second, first / np.linalg.norm(first), rtol=1e-5)
-    assert np.linalg.norm(second) == pytest.approx(1, abs=1e-6)
-
-
 @pytest.mark.parametrize("similarity", ["product", "cosine"])
 @pytest.mark.parametrize("tfidf", [0, 1])
 def test_views_without_features_are_zero(similarity, tfidf):
@@ -169,15 +155,6 @@ def test_learning_gives_words_of_its_pictures(learnt):
     within = np.square(descriptors - near).sum(axis=1).mean()
     whole = np.square(descriptors - descriptors.mean(axis=0)).sum(axis=1).mean()
     assert within < 0.75 * whole
-
-
-def test_learning_is_deterministic_and_seeded():
-    shown = pictures_of(tiles(area())[:6])
-    first, same, other = (
-        learn_words(WordsRecipe(words=256), shown, seed=seed).vocabulary.tobytes()
-        for seed in (1, 1, 2)
-    )
-    assert first == same != other
 
 
 def test_rare_words_weigh_more():
@@ -273,18 +250,3 @@ print({name.partition(".")[0] for name in sys.modules} & {"torch", "faiss", "tra
 def test_impossible_parameters_are_refused(text):
     with pytest.raises(VariantError, match=text.partition("=")[0]):
         make_variant(TABLE, f"bovw:{text}")
-
-
-def test_vocabularies_that_do_not_fit_are_refused():
-    words = np.zeros((256, 128), np.uint8)
-    for recipe, vocabulary, idf in [
-        (WordsRecipe(words=300), words, NOTHING),
-        (WordsRecipe(words=256), words.astype(np.float32), NOTHING),
-        (WordsRecipe(words=256), words[:, :100], NOTHING),
-        (WordsRecipe(words=256), words, np.ones(256, np.float32)),
-        (WordsRecipe(words=256, tfidf=1), words, NOTHING),
-        (WordsRecipe(words=256, tfidf=1), words, np.full(256, np.nan, np.float32)),
-        (WordsRecipe(words=256, features="superpoint", weights="x"), words, NOTHING),
-    ]:
-        with pytest.raises(VariantError, match=r"vocabulary|idf"):
-            WordsEmbedder(recipe, vocabulary, idf)

@@ -62,7 +62,7 @@ def test_a_view_of_the_same_date_is_found_within_a_pixel(picture, sift, place_px
     """Also across the blocks in which the map's keypoints are found."""
     view, truth = seen(picture, place_px)
     found = sift.locate(view, np.add(truth, [40, -30]), 40.0)
-    assert np.hypot(*(found.place_en_m - truth)) < 1 and found.inliers > 50
+    assert np.hypot(*(found.place_en_m - truth)) < 1 and found.evidence > 50
 
 
 def test_a_mirrored_view_is_not_found(picture, sift):
@@ -105,7 +105,7 @@ def test_local_features_of_today_find_a_view_of_the_same_date(picture, name):
     view, truth = seen(small, (200, 210))
     matchers.one_thread()
     found = FeatureMap(matchers.LOCAL[name](), small).locate(view, np.add(truth, [20, 10]), 40.0)
-    assert np.hypot(*(found.place_en_m - truth)) < 1.5 and found.inliers >= 20
+    assert np.hypot(*(found.place_en_m - truth)) < 1.5 and found.evidence >= 20
 
 
 def test_the_extra_is_named_before_imagery_is_read(monkeypatch, capsys, tmp_path):

@@ -1,4 +1,4 @@
-"""Camera, height and map that suit each other; height above terrain."""
+"""Camera, height and map that suit each other; height above terrain; estimates of maps."""
 
 import math
 
@@ -10,11 +10,15 @@ from hypothesis import strategies as st
 from orthonav.core.errors import CameraError, RouteError
 from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
+from orthonav.ground.planning import spacing
+from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Height, Route
 from orthonav.ground.planning.spacing import (
     FINEST_IMAGERY_M,
     LEAST_TILE_SHARE,
     ViewPlan,
+    estimate_map,
     profile,
     rate_cautions,
     suited_map,
@@ -151,3 +155,38 @@ def test_unknown_heights_are_refused():
         profile(ellipsoid, (1.0, 1.0), None, 10.0, slope)
     with pytest.raises(RouteError, match="does not cover leg 1"):
         profile(Route(PLACES), (1.0, 1.0), 100, 10.0, lambda lat, lon: np.full(lat.shape, np.nan))
+
+
+L_ROUTE = Route(((46.5, 2.5), (46.53, 2.5), (46.53, 2.56)), leg_bands_m=(200, 900))
+
+
+def test_a_box_is_counted_exactly():
+    area = Area.from_bounds((2.48, 46.48, 2.52, 46.52))
+    made = estimate_map(area, gsd_m=1.0, tile_px=256, overlap=0.875)
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=1.0, tile_px=256, overlap=0.875)
+    assert made.tiles == grid.rows * grid.cols
+    assert made.area_km2 == pytest.approx(made.tiles * 32**2 / 1e6)
+    assert made.imagery_km2 == pytest.approx(grid.width_px * grid.height_px / 1e6)
+    low, high = (size / made.area_km2 for size in made.map_mb)
+    assert 0.267 + 0.15 <= low < 0.267 + 0.35 <= high < 0.7
+    less = estimate_map(area, gsd_m=1.0, tile_px=256, overlap=0.875, registration=False)
+    assert less.map_mb == pytest.approx((0.267 * made.area_km2,) * 2, rel=0.01)
+
+
+def test_tiles_of_a_route_are_those_that_are_built():
+    area = Area.from_route(L_ROUTE)
+    made = estimate_map(area, gsd_m=2.0, tile_px=128, overlap=0.75)
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=2.0, tile_px=128, overlap=0.75)
+    rows, cols = np.mgrid[: grid.rows, : grid.cols]
+    centres = grid.centres_en_m(np.stack([rows.ravel(), cols.ravel()], axis=1))
+    assert made.tiles == area.contains(centres, grid.stride_m * math.sqrt(0.5)).sum()
+    assert made.area_km2 < made.imagery_km2
+
+
+def test_a_sample_agrees_with_the_count(monkeypatch):
+    area = Area.from_route(L_ROUTE)
+    exact = estimate_map(area, gsd_m=1.0, tile_px=128, overlap=0.75)
+    monkeypatch.setattr(spacing, "_MOST_POINTS", 5000)
+    rough = estimate_map(area, gsd_m=1.0, tile_px=128, overlap=0.75)
+    assert rough.tiles == pytest.approx(exact.tiles, rel=0.03)
+    assert rough.imagery_km2 == pytest.approx(exact.imagery_km2, rel=0.03)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import rasterio
 from geotiffs import FRAME, LAMBERT, centres_en_m, from_local, placed, read, sheet_of, write
-from rasterio.enums import Resampling
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -168,21 +167,6 @@ def test_narrow_windows_are_as_sharp_as_wide_ones(tmp_path, turn_deg):
     assert whole.grey.std() == pytest.approx(scene.mean(axis=0).std(), rel=0.3)
 
 
-@pytest.mark.parametrize("source_gsd_m", [1.0, 0.3, 0.2])
-def test_windows_at_the_border_of_the_imagery(tmp_path, source_gsd_m):
-    """The source ends within a block of averaged pixels."""
-    size = int(151 / source_gsd_m) - 1
-    transform = placed(LAMBERT, source_gsd_m, size)
-    path = write(tmp_path / "ortho.tif", rich_scene(size, source_gsd_m), transform=transform)
-    with sheet_of(path, 200) as sheet:
-        whole, part = sheet.read(0, 0, 200, 200), sheet.read(90, 95, 110, 105)
-    window = np.s_[95:, 90:]
-    assert (part.valid != whole.valid[window]).sum() <= 5
-    both = part.valid & whole.valid[window]
-    assert both.sum() > 6000
-    assert np.abs(part.rgb.astype(int) - whole.rgb[window])[both].max() <= 2
-
-
 @pytest.mark.parametrize("coarser", [2, 3, 4, 5, 8, 2.5, 3.4])
 @pytest.mark.parametrize("deep", [False, True], ids=["8 bit", "16 bit"])
 def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
@@ -194,16 +178,6 @@ def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
     assert pixels.valid[3:-3, 3:-3].all()
     assert inner.mean() == pytest.approx(127.5, abs=3)
     assert np.abs(inner - 127.5).max() <= 127.5 / coarser**2 * 2.5 + 3
-
-
-def test_overviews_change_little(tmp_path):
-    scene = rich_scene(800, 0.25)
-    path = write(tmp_path / "ortho.tif", scene, transform=placed(gsd_m=0.25, size=800))
-    without = read(path, 180)
-    with rasterio.open(path, "r+") as data:
-        data.build_overviews([2, 4], Resampling.average)
-    with_overviews = read(path, 180)
-    assert np.abs(without.rgb.astype(int) - with_overviews.rgb)[4:-4, 4:-4].max() <= 6
 
 
 def test_across_the_antimeridian(tmp_path):

@@ -68,10 +68,11 @@ def test_with_an_unknown_heading_the_likely_scales_come_first(tiles):
     first, rest = (each for each in made if each.level == LEVELS.coarse)
     assert first.from_tiles == rest.from_tiles == bool(tiles)
     turns = {turn for turn, _ in first.directions}
-    assert turns == {turn for turn, _ in rest.directions} and len(turns) == 45
+    all_around = math.ceil(2 * math.pi / POLICY.coarse_steps[0])
+    assert turns == {turn for turn, _ in rest.directions} and len(turns) == all_around
     scales = [sorted({scale for _, scale in each.directions}) for each in (first, rest)]
     assert scales[0] == pytest.approx([-0.13, 0.0, 0.13]) and len(scales[1]) == 2
-    assert len(first.directions) + len(rest.directions) == 45 * 5
+    assert len(first.directions) + len(rest.directions) == 5 * all_around
     assert first.cost_ms / rest.cost_ms == pytest.approx(3 / 2)
 
 

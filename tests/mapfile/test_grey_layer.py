@@ -18,7 +18,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile import layer as layer_module
-from orthonav.core.mapfile.layer import part_names
+from orthonav.core.mapfile.layer import ChunkTable, part_names
 from orthonav.ground.build.layer import GreyLayerWriter
 
 SHAPE, CHUNK_PX = (150, 210), 64
@@ -109,15 +109,6 @@ def test_any_window(opened, level, row, col, size):
     np.testing.assert_array_equal(found_grey, grey[part])
     np.testing.assert_array_equal(found_valid, valid[part])
     assert found_grey.flags.writeable and found_valid.flags.writeable
-
-
-def test_windows_far_outside_are_empty(layer, decoded):
-    for row, col in ((10**12, 0), (-(10**12), 0), (0, 10**12), (0, -(10**12)), (150, 0), (0, 210)):
-        grey, valid = layer.read(0, row, col, 20, 30)
-        assert grey.shape == valid.shape == (20, 30) and not grey.any() and not valid.any()
-    assert decoded == []
-    with pytest.raises(ValueError, match="0 or more"):
-        layer.read(0, 0, 0, -1, 5)
 
 
 def test_only_the_chunks_touched_are_decoded_and_once(layer, decoded):
@@ -373,3 +364,13 @@ def test_whatever_is_done_to_a_chunk_only_our_errors_come_out(data):
     except MapFileError:
         return
     assert grey.shape == (64, 64) and (valid is None or valid.shape == (64, 64))
+
+
+def test_a_mask_without_a_picture(made, tmp_path):
+    info, parts = made
+    layer = GreyLayer.of(write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, jpeg=b"")))
+    assert not layer.read(0, 0, 130, 10, 10)[1].any()  # wholly valid, had no mask
+    number = ChunkTable(*SHAPE, info.levels, CHUNK_PX).number(0, 0, 0)
+    odd = write_layer(tmp_path / "odd.onav", info, with_chunk(parts, number, jpeg=b""))
+    with pytest.raises(MapFileError, match="damaged"):
+        GreyLayer.of(odd).read(0, 0, 0, 10, 10)

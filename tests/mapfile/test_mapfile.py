@@ -369,3 +369,10 @@ def test_a_full_disk_keeps_the_old_map(path, content, monkeypatch, fails, old):
         write_map(path, manifest(), arrays(seed=1))
     assert list(path.parent.iterdir()) == ([path] if old else [])
     assert not old or path.read_bytes() == content
+
+
+@pytest.mark.parametrize("dtype", ["F64", "I64", "U16", "BOOL", "f16", "", None, 5, ["F16"]])
+def test_wrong_types(path, dtype):
+    header, plain, data = taken_apart(path)
+    header["sheet0/embeddings"]["dtype"] = dtype
+    refused(put_together(path, header, plain, data))

@@ -330,3 +330,17 @@ def test_without_the_library(path, keys, monkeypatch):
     with pytest.raises(MissingExtraError, match=r"orthonav\[signing\]"):
         require_signature(path, keys / "ours" / "public.pem")
     assert map_digest(path)
+
+
+@pytest.mark.parametrize("share", [0, 0.1, 0.5, 0.9, 0.99])
+def test_a_signature_cut_short(path, keys, share):
+    data = signature_path(path).read_bytes().rstrip()
+    signature_path(path).write_bytes(data[: int(share * len(data))])
+    refused(path, keys, "signature of the map is broken")
+
+
+@pytest.mark.parametrize("junk", [b"", b"\xff" * 40, b"\x08" + bytes(7) + b"[[[[[[[[" * 9])
+def test_a_digest_of_what_is_no_map(tmp_path, junk):
+    (tmp_path / "a.onav").write_bytes(junk)
+    with pytest.raises(MapFileError, match=r"a\.onav"):
+        map_digest(tmp_path / "a.onav")

@@ -241,15 +241,6 @@ def test_damaged_blocks_are_recomputed(ortho, tmp_path, reads, caplog, whole):
     assert len(reads) == 3 and caplog.text.count("recomputed") == 3
 
 
-def test_few_blocks_are_not_cached(ortho, tmp_path, names_in, monkeypatch):
-    out = tmp_path / "map.onav"
-    stopped(ortho, out)
-    assert len(names_in(tmp_path)) > 2
-    monkeypatch.setattr("orthonav.ground.build.sheet.MIN_CACHED_BLOCKS", 1000)
-    stopped(ortho, out)
-    assert names_in(tmp_path) == []  # not even those of the build before
-
-
 def test_a_work_folder_that_was_named(ortho, tmp_path, names_in, monkeypatch, reads):
     monkeypatch.setattr("orthonav.ground.build.sheet.MIN_CACHED_BLOCKS", 1000)
     out, work = tmp_path / "map.onav", tmp_path / "work"

@@ -55,12 +55,6 @@ def fewer_crops(map_path, monkeypatch):
     monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
 
 
-@pytest.fixture
-def calibrated(fewer_crops, monkeypatch):
-    """More crops, where the confidence itself is looked at."""
-    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 48)
-
-
 WITH_LAYER = {"registration": True, "calibration_views": 2}
 
 
@@ -120,14 +114,6 @@ def test_the_same_request_gives_the_same_bytes(small_ortho, tmp_path, names_in, 
     assert recipe["overlap"] == 0.75 and recipe["seed"] == request_.get("seed", 0)
 
 
-@pytest.mark.parametrize("edges", ["gray", "canny", "gradient"])
-def test_one_channel_is_compared_on_finer_cells(small_ortho, tmp_path, edges):
-    chosen = built(small_ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
-    assert chosen == (8 if edges == "gradient" else 16)
-    stated = built(small_ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
-    assert stated.manifest.recipe["embed"]["cells"] == 4
-
-
 def test_the_whole_imagery_is_covered(ortho, tmp_path, frame):
     """A tile needs imagery under half of it, so corners of the imagery are left out."""
     opened = built(ortho, tmp_path)
@@ -167,14 +153,6 @@ def test_a_band_around_a_route_is_covered(ortho, tmp_path, frame):
     centres = frame.en_from_latlon(*sheet.frame.latlon_from_en(centres_en_m(opened)))
     assert inside_band(centres, a, b, 40.0 + stride_m).all()
     assert sheet.tiles == len(centres) < sheet.grid.rows * sheet.grid.cols / 2
-
-
-def test_the_finest_orthophoto_gives_the_resolution(make_ortho, tmp_path):
-    coarse = make_ortho(tmp_path / "coarse.tif", textured((200, 200)), gsd_m=2.0)
-    fine = make_ortho(tmp_path / "fine.tif", textured((300, 300)), gsd_m=0.7)
-    opened = built([coarse, fine], tmp_path, tile_px=128)
-    assert opened.manifest.sheets[0].grid.gsd_m == 0.7
-    assert [source["name"] for source in opened.manifest.imagery] == ["coarse.tif", "fine.tif"]
 
 
 def test_blocks_do_not_matter(small_ortho, tmp_path, monkeypatch):
@@ -341,12 +319,6 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     assert np.median(own) > 0.8 and np.median(false) < 0.4
     assert (false[:, None] < own).mean() > 0.97  # nearly every pair is separated
     assert np.isfinite(own).all() and own.min() >= 0 and max(own.max(), false.max()) <= 1
-
-
-def test_the_stated_error_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, calibrated):
-    for opened in (open_map(map_path), built(ortho, tmp_path)):
-        grid = opened.manifest.sheets[0].grid
-        assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
 
 
 @pytest.mark.parametrize("kind", ["bounds", "route"])

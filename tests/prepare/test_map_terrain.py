@@ -149,15 +149,6 @@ def rows(flight):
 
 
 @pytest.mark.long
-def test_a_flight_reports_heights_above_sea_and_take_off(flown):
-    reported = rows(flown)
-    assert {row["agl_m"] for row in reported} == {row["home_m"] for row in reported} == {"250"}
-    amsl = {float(row["amsl_m"]) for row in reported}
-    assert max(amsl) - min(amsl) < 0.01
-    assert max(amsl) == pytest.approx(250 + hill(-350, -250), abs=1)
-
-
-@pytest.mark.long
 def test_a_terrain_places_views_that_level_ground_does_not(
     run, flown, map_path, dem, tmp_path, monkeypatch
 ):
@@ -248,15 +239,6 @@ def test_an_unknown_place_of_take_off_is_not_taken_for_level_ground(run, flown, 
     done = run("import", flight, "--dem", path, "--dem-datum", "msl", "--out", tmp_path / "out")
     assert done.code == 0
     assert {row["agl_m"] for row in rows(tmp_path / "out")} == {"nan"}
-
-
-def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
-    path = write_dem(tmp_path / "far.tif", LocalFrame(44.0, 3.0), hill)
-    done = run(
-        "localize", map_path, flown, "--dem", path, "--dem-datum", "msl",
-        "--out", tmp_path / "fixes.jsonl",
-    )  # fmt: skip
-    assert done.code == 1 and "the terrain lies outside the map" in done.err
 
 
 def test_terrain_is_flown_without_gdal_and_proj(hill_map, flown):

@@ -66,9 +66,3 @@ def test_a_part_of_the_tiles_is_a_part_of_the_answer(rule):
     assert np.hypot(*(found - CENTRES[tile])) < 32
     if rule != "weighted":
         np.testing.assert_allclose(found, position(rule, scores), atol=1e-3)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_one_tile_alone_is_the_answer(rule):
-    rows = np.array([7], np.intp)
-    np.testing.assert_array_equal(position(rule, np.array([0.3], np.float32), rows), CENTRES[7])

@@ -4,34 +4,20 @@ import math
 
 import numpy as np
 import pytest
+from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
 from orthonav.core.errors import AreaError, FlightError
 from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Route, distance_to_polyline_m
+from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
-from orthonav.ground.simulate.render import Clouds, ViewEffects
+from orthonav.ground.simulate.render import Clouds
 
-PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
-SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 CORNERS = np.array([[-300.0, -200.0], [-300.0, 100.0], [200.0, 100.0]])
 ALL = Errors(5.0, 0.05, 1.0, 2.0, 40.0)
-
-
-def frame_of(ortho):
-    """Of the plane that simulated flights over an orthophoto use."""
-    outline = Mosaic.open([ortho]).outline_latlon_deg
-    return Area.from_outline(outline[:, 0], outline[:, 1]).frame
-
-
-def route_over(frame, corners):
-    lat, lon = frame.latlon_from_en(np.array(corners, dtype=np.float64))
-    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +28,13 @@ def ortho(make_ortho, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frame(ortho):
-    return frame_of(ortho)
+    return plane_of(ortho).frame
 
 
 @pytest.fixture
 def fly(ortho, frame, tmp_path):
     def flown(name="f", corners=CORNERS, **request):
-        route = route_over(frame, corners)
+        route = route_of(frame, *corners)
         kinds = {"route": route, "agl_m": 100.0, "camera": SMALL, "effects": PLAIN, **request}
         simulate_flight(SimulateRequest([ortho], tmp_path / name, **kinds))
         return open_flight(tmp_path / name), read_truth(tmp_path / name / "truth.csv")
@@ -69,7 +55,7 @@ def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
     request = SimulateRequest(
         [area.past],
         tmp_path / "f",
-        route=route_over(frame_of(area.past), CORNERS),
+        route=route_of(plane_of(area.past).frame, *CORNERS),
         agl_m=100.0,
         camera=SMALL,
         errors=ALL,
@@ -138,7 +124,7 @@ def test_beyond_the_imagery_the_ground_is_mirrored(fly, frame):
     assert len(views) == 8
     for view in views:
         assert view.std() > 4 and (view == 0).mean() < 0.03
-    with pytest.raises(AreaError, match="completely within"):
+    with pytest.raises(AreaError, match=r"view \d of the route, .* completely within"):
         fly("not", corners=OUT, camera=SEEN, spacing_m=90.0)
     inside, _ = fly("inside", corners=[[0.0, 0.0], [280.0, 16.0]], camera=SEEN, spacing_m=90.0)
     for a, b in zip(views, pictures(inside), strict=False):
@@ -193,7 +179,7 @@ def test_random_positions_refuse_route_options(fly, request, request_):
 
 
 def test_the_command(run, ortho, frame, tmp_path):
-    points = route_over(frame, OUT).waypoints
+    points = route_of(frame, *OUT).waypoints
     lines = ["lat_deg,lon_deg", *(f"{lat},{lon}" for lat, lon in points)]
     (tmp_path / "route.csv").write_text("\n".join(lines))
     fly = ["simulate", "--ortho", ortho, "--route", tmp_path / "route.csv", "--agl-m", "100"]

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+from test_flight import plane_of, route_of
 
 from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight.gnss import read_gnss
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.area import Area
 from orthonav.ground.simulate.receiver import RATE_HZ, RECEIVERS, receiver_of, samples_of, solutions
 
 TIMES = np.arange(0.0, 301.0)
@@ -70,11 +69,9 @@ def test_invalid_receivers_are_refused():
 
 
 def test_a_simulated_flight_has_solutions(area, tmp_path, run):
-    outline = Mosaic.open([area.past]).outline_latlon_deg
-    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
     route = tmp_path / "route.csv"
-    lat, lon = frame.latlon_from_en(np.array([[-100.0, 0.0], [100.0, 0.0]]))
-    rows = [f"{a:.8f},{b:.8f}" for a, b in zip(lat, lon, strict=True)]
+    places = route_of(plane_of(area.past).frame, [-100.0, 0.0], [100.0, 0.0]).waypoints
+    rows = [f"{lat:.8f},{lon:.8f}" for lat, lon in places]
     route.write_text("\n".join(["lat_deg,lon_deg", *rows]))
     flown = "simulate", "--ortho", area.past, "--agl-m", 100, "--out", tmp_path / "flight"
     done = run(*flown, "--route", route, "--receiver", "jam:at_s=5")

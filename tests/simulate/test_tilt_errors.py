@@ -4,18 +4,15 @@ import math
 
 import numpy as np
 import pytest
+from test_flight import SMALL, plane_of, route_of
 
 from helpers import textured
 from orthonav.core.flight import open_flight
-from orthonav.core.geo.camera import Camera, axis_on_ground_en_m
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Route
+from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.ground.simulate import flight as flight_module
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.motion import HORIZON_TIME_S, horizon_errors
+from orthonav.ground.simulate.motion import HORIZON_TIME_S
 
-SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 LEVEL = (0.0, 0.0, 0.0)
 
 
@@ -48,11 +45,8 @@ def tilts(ortho, tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def route(ortho):
     """Back and forth for 8 km."""
-    outline = Mosaic.open([ortho]).outline_latlon_deg
-    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
     corners = [((-1) ** (n // 2) * 400.0, -400.0 + 80.0 * ((n + 1) // 2)) for n in range(18)]
-    lat, lon = frame.latlon_from_en(np.array(corners))
-    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
+    return route_of(plane_of(ortho).frame, *corners)
 
 
 def test_the_mount_is_constant_and_of_the_stated_size(tilts):
@@ -84,17 +78,6 @@ def test_the_horizon_wanders_along_a_route(tilts, route):
     expected = 1.5 * math.sqrt(2 * (1 - math.exp(-step_s / HORIZON_TIME_S)))
     assert changes.std() == pytest.approx(expected, rel=0.2)
     assert {(t.pitch_deg, t.roll_deg, t.tilt_std_deg) for t in reported} == {(0.0, 0.0, None)}
-
-
-def test_the_horizon_is_forgotten_within_its_correlation_time():
-    times_s = np.arange(40_000) * 1.5
-    errors = horizon_errors(2.0, times_s, np.random.default_rng(1))
-    assert errors.std(axis=0) == pytest.approx([2.0, 2.0], rel=0.05)
-    lag = round(HORIZON_TIME_S / 1.5)
-    for axis in errors.T:
-        after = np.corrcoef(axis[lag:], axis[:-lag])[0, 1]
-        assert after == pytest.approx(math.exp(-1), abs=0.06)
-    assert abs(np.corrcoef(errors.T)[0, 1]) < 0.1
 
 
 def test_what_the_telemetry_states(tilts):

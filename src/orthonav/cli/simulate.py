@@ -93,23 +93,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="fraction of the views with clouds, 0 to 1 (default 0)",
     )
     effects.add_argument(
-        "--exposure-std",
-        type=float,
-        default=0.15,
-        metavar="FRACTION",
-        help="standard deviation of the relative exposure (default 0.15)",
-    )
-    effects.add_argument(
-        "--blur-px", type=float, default=0.6, help="standard deviation of the blur (default 0.6)"
-    )
-    effects.add_argument(
-        "--noise-std",
-        type=float,
-        default=2.0,
-        metavar="LEVELS",
-        help="standard deviation of the sensor noise in grey levels (default 2)",
-    )
-    effects.add_argument(
         "--jpeg-quality",
         type=int,
         default=90,
@@ -211,9 +194,7 @@ def run(options: argparse.Namespace) -> None:
         airspeed_mps=options.airspeed_mps,
         camera=read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
         errors=Errors(**{each.name: getattr(options, each.name) for each in fields(Errors)}),
-        effects=ViewEffects(
-            options.exposure_std, options.blur_px, options.noise_std, options.jpeg_quality
-        ),
+        effects=ViewEffects(jpeg_quality=options.jpeg_quality),
         seed=options.seed,
         wind=None if options.wind_mps is None else Wind(options.wind_mps, from_deg),
         turn_radius_m=options.turn_radius_m,

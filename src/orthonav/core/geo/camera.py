@@ -1,10 +1,14 @@
-"""The camera: lens (`orthonav.core.geo.lens`), attitude, and where it looks on flat ground.
+"""The camera: lens, attitude, and where it looks on flat ground.
 
 Camera axes: x to the right of the image, y down the image, z along the optical axis.
 Attitude: with heading, pitch and roll 0 the optical axis points straight down and the top of the
 image to the north. Heading turns clockwise from above; then, as for an aircraft (yaw, pitch, roll,
 Tait-Bryan Z-Y-X in the forward-right-down body), positive pitch makes the camera look ahead and
 positive roll makes it look left.
+
+Lenses in the camera plane, as OpenCV writes them. Brown (1966), "Decentering distortion of lenses":
+three radial and two tangential numbers. Fisheye: Kannala and Brandt (2006), "A generic camera model
+and calibration method", with four numbers of the angle off the optical axis.
 """
 
 import math
@@ -17,13 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.geo import lens
 
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
 FOV_STD = 0.05
 """Of a focal length by a stated field of view, as a share of it."""
+_STEPS = 50
+_CLOSE = 1e-9
+_EXACT = 1e-14
+"""Largest step at which the iteration of all points has converged."""
 _BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
 _HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 _BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -243,8 +250,8 @@ def distort(camera: Camera, xy: Array) -> Array:
     if camera.is_pinhole:
         return xy
     if camera.model == "fisheye":
-        return lens.fisheye_distort(camera.distortion, xy)
-    return lens.brown_distort(camera.distortion, xy)
+        return _fisheye_distort(camera.distortion, xy)
+    return _brown_distort(camera.distortion, xy)
 
 
 def undistort(camera: Camera, xy: Array) -> Array:
@@ -255,8 +262,8 @@ def undistort(camera: Camera, xy: Array) -> Array:
     if camera.is_pinhole:
         return xy
     if camera.model == "fisheye":
-        return lens.fisheye_undistort(camera.distortion, xy)
-    return lens.brown_undistort(camera.distortion, xy)
+        return _fisheye_undistort(camera.distortion, xy)
+    return _brown_undistort(camera.distortion, xy)
 
 
 def seen_px(camera: Camera, rays: Array) -> Array:
@@ -319,3 +326,108 @@ def met_by_rays_en_m(
     enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
     down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
     return np.asarray(enu[:, :2] * (agl_m / down))
+
+
+def _brown_distort(distortion: tuple[float, ...], xy: Array) -> Array:
+    """Distorted points (..., 2) of ideal ones; NaN from the radius where the model folds back."""
+    k1, k2, _, _, k3 = (*distortion, 0.0)[:5]
+    out, r2 = _brown(distortion, xy), (xy**2).sum(axis=-1)
+    out[r2 >= _fold_r2(k1, k2, k3)] = np.nan
+    return out
+
+
+def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
+    """Ideal points (..., 2) of distorted ones, by Newton's method; NaN if there is none."""
+    k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
+    ideal = np.array(xy, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        for _ in range(_STEPS):
+            x, y = ideal[..., 0], ideal[..., 1]
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+            dxx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+            dxy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+            dyy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+            error = _brown(distortion, ideal) - xy
+            if np.abs(error).max(initial=0.0) < _EXACT:
+                break  # NaN never converges: points beyond the lens take all steps
+            step = np.stack(
+                [
+                    dyy * error[..., 0] - dxy * error[..., 1],
+                    dxx * error[..., 1] - dxy * error[..., 0],
+                ],
+                axis=-1,
+            )
+            ideal = ideal - step / (dxx * dyy - dxy * dxy)[..., None]
+        found = np.abs(_brown(distortion, ideal) - xy).max(axis=-1) < _CLOSE
+        found &= (ideal**2).sum(axis=-1) < _fold_r2(k1, k2, k3)
+    ideal[~found] = np.nan
+    return ideal
+
+
+def _fisheye_distort(distortion: tuple[float, ...], xy: Array) -> Array:
+    """Distorted points (..., 2) of ideal ones; NaN from the angle where the model folds back."""
+    radius = np.hypot(xy[..., 0], xy[..., 1])
+    angle = np.arctan(radius)
+    polynomial = _angles(distortion)
+    with np.errstate(invalid="ignore"):
+        grown = np.where(angle < _fold_angle(polynomial), polynomial(angle), np.nan)
+    scale = np.where(radius > 1e-12, grown / np.maximum(radius, 1e-12), 1.0)
+    return np.asarray(xy * scale[..., None])
+
+
+def _fisheye_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
+    """Ideal points (..., 2) of distorted ones; NaN if there is none in front of the camera."""
+    radius = np.hypot(xy[..., 0], xy[..., 1])
+    polynomial = _angles(distortion)
+    slope, end = polynomial.deriv(), min(_fold_angle(polynomial), math.pi / 2)
+    low, high = np.zeros_like(radius), np.full_like(radius, end)
+    angle = np.clip(radius, 0.0, 0.9 * end)
+    with np.errstate(all="ignore"):
+        for _ in range(_STEPS):  # Newton's method inside a bracket: far out the slope may vanish
+            error = polynomial(angle) - radius
+            if np.abs(error).max(initial=0.0) < _EXACT:
+                break
+            low, high = np.where(error < 0, angle, low), np.where(error >= 0, angle, high)
+            newton = angle - error / slope(angle)
+            angle = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
+        found = (np.abs(polynomial(angle) - radius) < _CLOSE) & (angle < end)
+        scale = np.where(radius > 1e-12, np.tan(angle) / np.maximum(radius, 1e-12), 1.0)
+    return np.asarray(xy * np.where(found, scale, np.nan)[..., None])
+
+
+def _brown(distortion: tuple[float, ...], xy: Array) -> Array:
+    k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+@lru_cache(maxsize=16)
+def _fold_r2(k1: float, k2: float, k3: float) -> float:
+    """Squared radius at which the radial model stops growing; infinite if it never does."""
+    inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # of 1 / r2: the leading 1 keeps it sound
+    largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)
+    return float(1 / largest) if largest > 1e-12 else math.inf
+
+
+def _angles(distortion: tuple[float, ...]) -> np.polynomial.Polynomial:
+    """Distance from the image centre as a polynomial of the angle from the optical axis."""
+    k1, k2, k3, k4 = distortion or (0.0,) * 4
+    return np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
+
+
+def _fold_angle(polynomial: np.polynomial.Polynomial) -> float:
+    """Angle in radians at which the fisheye model stops growing; infinite if it never does."""
+    _, k1, k2, k3, k4 = polynomial.coef[1::2]
+    inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])  # of 1 / angle squared, as above
+    largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)
+    return float(1 / math.sqrt(largest)) if largest > 1e-12 else math.inf

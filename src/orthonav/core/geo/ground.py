@@ -58,22 +58,28 @@ def ground_around(
     return ground_over(terrain, lat, lon)
 
 
-def bilinear(heights: Array, col: Array, row: Array) -> Array:
+def bilinear(
+    samples: Callable[[NDArray[np.intp], NDArray[np.intp]], Array],
+    shape: tuple[int, int],
+    col: Array,
+    row: Array,
+) -> Array:
     """Heights at fractional samples (0, 0 is the first); NaN beyond half a sample outside.
 
-    A position between samples of which one is unknown is unknown.
+    `samples` gives heights by rows and columns within `shape`. A position between samples of which
+    one is unknown is unknown.
     """
-    rows, cols = heights.shape
-    beyond = ~((col >= -0.5) & (col <= cols - 0.5) & (row >= -0.5) & (row <= rows - 0.5))
-    col = np.clip(np.where(beyond, 0, col), 0, cols - 1)
-    row = np.clip(np.where(beyond, 0, row), 0, rows - 1)
+    rows, cols = shape
+    with np.errstate(invalid="ignore"):
+        inside = (col >= -0.5) & (col <= cols - 0.5) & (row >= -0.5) & (row <= rows - 0.5)
+    col = np.clip(np.where(inside, col, 0), 0, cols - 1)
+    row = np.clip(np.where(inside, row, 0), 0, rows - 1)
     left, top = np.floor(col).astype(np.intp), np.floor(row).astype(np.intp)
     right, bottom = np.minimum(left + 1, cols - 1), np.minimum(top + 1, rows - 1)
     x, y = col - left, row - top
-    found = (1 - y) * ((1 - x) * heights[top, left] + x * heights[top, right]) + y * (
-        (1 - x) * heights[bottom, left] + x * heights[bottom, right]
-    )
-    return np.where(beyond, np.nan, found)
+    upper = (1 - x) * samples(top, left) + x * samples(top, right)
+    lower = (1 - x) * samples(bottom, left) + x * samples(bottom, right)
+    return np.where(inside, (1 - y) * upper + y * lower, np.nan)
 
 
 def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:

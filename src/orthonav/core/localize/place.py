@@ -136,9 +136,14 @@ class Placer:
         """`pool`: threads that share the candidates; `ground`: None for level ground and views that
         are not compared one level finer than the final one."""
         self.templates, self.levels, self.prior = templates, levels, prior
-        self.reference, self._pool, self._ground = reference, pool, ground
+        self.reference, self._pool, self._view_over_ground = reference, pool, ground
         self.is_level = ground is None or ground.relief.is_level
         self._best_on_terrain = 0.0
+
+    @property
+    def _ground(self) -> ViewOverGround:
+        assert self._view_over_ground is not None
+        return self._view_over_ground
 
     @property
     def _exclusion_px(self) -> float:
@@ -254,7 +259,6 @@ class Placer:
 
     def _best_apart(self, places: Sequence[Place], count: int) -> list[int]:
         """Numbers of the best judged places that lie apart."""
-        assert self._ground is not None
         order = sorted(range(len(places)), key=lambda number: -self._value(places[number].judged))
         ranked = [places[number].judged for number in order]
         apart_px = EXCLUSION_SHARE * self._ground.view.side_px
@@ -263,7 +267,6 @@ class Placer:
     def _twin(self, place: Place) -> Place | None:
         """A place refined on the terrain at the judged level, once; None where level ground is as
         good."""
-        assert self._ground is not None
         if not place.tried:
             place.tried, pose = True, place.judged.pose
             if not self._ground.is_level(pose):
@@ -282,7 +285,7 @@ class Placer:
         twin = self._twin(place)
         if twin is None or place.searched:
             return place.around
-        assert self._ground is not None and twin.terrain is not None
+        assert twin.terrain is not None
         place.searched = True
         pose, level, side_px = place.judged.pose, self.levels.coarse, self._ground.view.side_px
         poses = [
@@ -376,7 +379,6 @@ class Placer:
 
     def _finish_on_terrain(self, place: Place, pose: Pose) -> None:
         """From a pose on the terrain."""
-        assert self._ground is not None
         levels = self.levels
         for _ in range(ROUNDS):
             made = self._ground.templates_at(pose, levels.final)
@@ -402,7 +404,6 @@ class Placer:
     def _finer_score(self, place: Place) -> float:
         """Score one level finer than the final one, made once."""
         if math.isnan(place.finer):
-            assert self._ground is not None
             level, made = self.levels.final - 1, None
             if place.gain is not None:
                 made = self._ground.templates_at(place.fit.pose, level)
@@ -412,7 +413,6 @@ class Placer:
 
     @cached_property
     def _finer_on_level(self) -> ViewTemplates:
-        assert self._ground is not None
         level = self.levels.final - 1
         made = self._ground.view.rectified_at(level)
         return ViewTemplates(made.grey, made.valid, level)
@@ -433,7 +433,6 @@ class Placer:
         camera."""
         for each in (best, *best.rivals):
             if each.gain is not None:
-                assert self._ground is not None
                 each.below_camera = self._ground.below_camera(each.fit.pose)
         return best
 

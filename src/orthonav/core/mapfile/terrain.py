@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.ground import bilinear
 from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
 from orthonav.core.mapfile.reader import Blobs, MapFile
@@ -65,17 +66,7 @@ class TerrainLayer:
         info, points = self.info, np.asarray(points_en_m, np.float64)
         col = (points[..., 0] - info.west_m) / info.posting_m - 0.5
         row = (info.north_m - points[..., 1]) / info.posting_m - 0.5
-        with np.errstate(invalid="ignore"):
-            inside = (col >= -0.5) & (col <= info.cols - 0.5)
-            inside &= (row >= -0.5) & (row <= info.rows - 0.5)
-        col = np.clip(np.where(inside, col, 0), 0, info.cols - 1)
-        row = np.clip(np.where(inside, row, 0), 0, info.rows - 1)
-        left, top = np.floor(col).astype(np.intp), np.floor(row).astype(np.intp)
-        right, bottom = np.minimum(left + 1, info.cols - 1), np.minimum(top + 1, info.rows - 1)
-        x, y = col - left, row - top
-        upper = (1 - x) * self._samples(top, left) + x * self._samples(top, right)
-        lower = (1 - x) * self._samples(bottom, left) + x * self._samples(bottom, right)
-        return np.where(inside, (1 - y) * upper + y * lower, np.nan)
+        return bilinear(self._samples, (info.rows, info.cols), col, row)
 
     def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
         """Heights of samples (...) by row and column."""

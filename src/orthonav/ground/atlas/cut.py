@@ -494,7 +494,7 @@ class _MapCutter:
         size = max(1, block.width // COARSER), max(1, block.height // COARSER)
         coarse = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         parts: Parts = {"means": means, "share": share}
-        parts["preview"] = self.preview.small_of(block, coarse)
+        parts["preview"] = self.preview.small(block, coarse)
         return parts | layer_parts(self.area, self.grid, block, grey, valid)
 
     def _take(self, block: Block, parts: Parts) -> None:

@@ -131,7 +131,7 @@ WHITENING_NAME = "whitening.safetensors"
 MAX_TRAINING_TILES = 40_000
 """Tiles that the whitening is learnt from: twice those of a map (`MAX_LEARNT_TILES`)."""
 SHARD_ROWS = 10_000_000
-"""Rows of a shard, at most: 1.5 GB of files (`python -m benchmarks.atlas_search`)."""
+"""Rows of a shard, at most: 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)."""
 REBUILD_SHARE = 0.3
 FEW_ROWS = 200_000
 """The index is rebuilt where more than this share of the rows is new or gone, or where it has so

@@ -36,10 +36,16 @@ from orthonav.ground.atlas.agreement import (
 )
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cut import cut_in_memory
-from orthonav.ground.atlas.search import SearchRegion, SheetRegistrar, TileSearch, ViewMatches
+from orthonav.ground.atlas.search import (
+    SearchRegion,
+    SheetRegistrar,
+    TileSearch,
+    ViewMatches,
+    ViewRegistrar,
+)
 from orthonav.ground.planning.area import Area
 
-# Values without another source: `python -m benchmarks.atlas_lost`.
+# Values without another source: `benchmarks.atlas_lost` at d63ac91.
 CANDIDATES = 40
 """Places of the whole atlas that are judged, 4 ms each."""
 TURN_STEP_DEG = 8.0
@@ -124,7 +130,7 @@ class PlaceFinder:
         time_ns = view.telemetry.time_ns
         expected = self._expected(view, coarse, time_ns)
         candidates = self._candidates(view, coarse)
-        registrar, matches = self._registrar.of_view(view, side_m), ViewMatches(side_m)
+        registrar, matches = ViewRegistrar(self._registrar, view, side_m), ViewMatches(side_m)
         matches.add_candidates(registrar, candidates)
         matches.add_expected(registrar, expected)
         places = [

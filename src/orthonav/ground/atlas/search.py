@@ -57,7 +57,7 @@ EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
 MOST_EFFORT = 0.085, 1500
 """Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
 finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
-(`python -m benchmarks.atlas_search`)."""
+(`benchmarks.atlas_search` at d63ac91)."""
 APART_STRIDES = 1.5
 """Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
 MAX_LAT_DEG = 89.8
@@ -206,10 +206,6 @@ class SheetRegistrar:
         self._lattice = atlas.recipe.sheets
         self._usable = set(atlas.sheets())
         self._sheet = functools.lru_cache(maxsize=MAX_OPEN)(self._opened)
-
-    def of_view(self, view: View, side_m: float) -> "ViewRegistrar":
-        """What registers a view `side_m` wide."""
-        return ViewRegistrar(self, view, side_m)
 
     def near(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
         """The usable sheets within reach of the middle of a view. Raises `StorageError` where a

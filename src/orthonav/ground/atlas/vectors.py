@@ -35,12 +35,12 @@ Array = NDArray[np.float32]
 
 QUANTIZERS_NAME = "quantizers.safetensors"
 MAX_TRAINING_VECTORS = 200_000
-"""Vectors that quantizers are trained on, as in `python -m benchmarks.atlas_search`."""
+"""Vectors that quantizers are trained on, as in `benchmarks.atlas_search` at d63ac91."""
 POINTS_PER_CENTRE = 4096
 """Training vectors per centre, if there are as many. FAISS's default, 256, loses 2 to 4 points of
-recall where lists or codes have few centres (2e5 vectors of `benchmarks.atlas_fields`)."""
+recall where lists or codes have few centres (2e5 of `benchmarks.atlas_fields` at d63ac91)."""
 ROUNDS = 12
-"""Iterations of k-means, as in `python -m benchmarks.atlas_search`."""
+"""Iterations of k-means, as in `benchmarks.atlas_search` at d63ac91."""
 CODE_BITS = 4
 """Bits per quantizer: what the fast scan of FAISS supports."""
 BLOCK = 32

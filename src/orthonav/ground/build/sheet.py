@@ -198,12 +198,11 @@ class Preview:
         height, width = grid.height_px * self._scale, grid.width_px * self._scale
         self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
 
-    def small(self, read: BlockPixels) -> NDArray[np.uint8]:
-        """The overview of a block: (h, w), empty if it is smaller than a pixel."""
-        return self.small_of(read.block, read.pixels.grey[read.part()])
+    def small(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The overview of a block: (h, w), empty if it is smaller than a pixel.
 
-    def small_of(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The same from an image of the block at its resolution or a coarser one."""
+        `grey`: an image of the block at its resolution or a coarser one.
+        """
         y0, y1, x0, x1 = self._edges(block)
         if y1 <= y0 or x1 <= x0:
             return np.zeros((0, 0), np.uint8)
@@ -533,7 +532,11 @@ class SheetReader:
         maps = sheet_maps(self.representation, grey, valid)
         part = read.part(self._beyond_px)
         means, share = cell_means(maps[:, part[0], part[1]], valid[part], self._layout)
-        parts: Parts = {"means": means, "share": share, "preview": self.preview.small(read)}
+        parts: Parts = {
+            "means": means,
+            "share": share,
+            "preview": self.preview.small(job.block, grey[read.part()]),
+        }
         if self.pictures is not None:
             parts |= self.pictures.parts(read, maps)
         places = np.array(job.places, np.intp).reshape(-1, 2)

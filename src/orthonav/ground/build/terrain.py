@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,12 +73,14 @@ def terrain_parts(
     table = ChunkTable(rows, cols, 1, CHUNK_PX)
     found: dict[int, NDArray[np.float32]] = {}
     inside = unknown = 0
-    for chunk_row, chunk_col in _chunks(table):
+    for chunk_row, chunk_col in np.ndindex(-(-rows // CHUNK_PX), -(-cols // CHUNK_PX)):
         shape = table.shape(0, chunk_row, chunk_col)
         west = west_m + chunk_col * CHUNK_PX * posting_m
         north = north_m - chunk_row * CHUNK_PX * posting_m
-        if not _may_matter(area, grid, west, north, shape, posting_m):
-            continue
+        middle = [west + shape[1] * posting_m / 2, north - shape[0] * posting_m / 2]
+        reach_m = math.hypot(*shape) / 2 * posting_m + grid.tile_m + grid.stride_m
+        if area.route is not None and not area.contains(np.array([middle]), reach_m)[0]:
+            continue  # too far from the route for any view
         heights = sampled(west, north, *shape).astype(np.float32)
         row, col = np.mgrid[: shape[0], : shape[1]] + 0.5
         points = np.stack([west + col * posting_m, north - row * posting_m], axis=-1)
@@ -106,29 +108,6 @@ def terrain_parts(
         west_m, north_m, posting_m, rows, cols, CHUNK_PX, low_m, high_m, unit_m, known, name, datum
     )
     return TerrainParts(info, _arrays(table, found, info))
-
-
-def _chunks(table: ChunkTable) -> Iterator[tuple[int, int]]:
-    rows, cols = table.shapes[0]
-    for chunk_row in range(-(-rows // CHUNK_PX)):
-        for chunk_col in range(-(-cols // CHUNK_PX)):
-            yield chunk_row, chunk_col
-
-
-def _may_matter(
-    area: Area,
-    grid: TileGrid,
-    west_m: float,
-    north_m: float,
-    shape: tuple[int, int],
-    posting_m: float,
-) -> bool:
-    """Whether a view of the area may show a chunk; False only far from a route."""
-    if area.route is None:
-        return True
-    middle = [west_m + shape[1] * posting_m / 2, north_m - shape[0] * posting_m / 2]
-    reach_m = math.hypot(*shape) / 2 * posting_m + grid.tile_m + grid.stride_m
-    return bool(area.contains(np.array([middle]), reach_m)[0])
 
 
 def _arrays(

@@ -207,7 +207,7 @@ def _cell_numbers(
     return grid.numbers(np.stack([east, north], axis=-1))
 
 
-# Chosen on the scenes of `python -m benchmarks.changes` (docs/changes.md).
+# Chosen on the scenes of `benchmarks.changes` at d63ac91 (docs/changes.md).
 TONE_WEIGHT, STRUCTURE_WEIGHT, BIAS = 2.0, 2.0, 3.0
 """Logit of a score: weights of the logarithm of 1 + the tone's deviation and of the correlation."""
 CHANGED_SCORE = 0.5

@@ -73,7 +73,7 @@ OTHER_SENSOR_SHIFT, OTHER_SENSOR_STD = -0.8, 0.8
 than predicted by 0.6 and 1.0 (docs/check.md)."""
 
 
-# Chosen on generated landscapes by the calibration error of `python -m benchmarks.prediction`.
+# Chosen on generated landscapes by the calibration error of `benchmarks.prediction` at d63ac91.
 PRIOR_TRIALS = 3.0
 BANDWIDTH_VIEWS = 0.4
 """Standard deviation of the distance weights, in sides of a view."""

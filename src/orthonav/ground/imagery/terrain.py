@@ -79,7 +79,12 @@ class Dem:
         found = np.full(col.shape, np.nan)
         inside = (col >= 0) & (col <= self._data.width) & (row >= 0) & (row <= self._data.height)
         for some, left, top, heights in self._blocks_of(col, row, inside):
-            found[some] = bilinear(heights, col[some] - left - 0.5, row[some] - top - 0.5)
+            found[some] = bilinear(
+                lambda rows, cols, heights=heights: heights[rows, cols],  # type: ignore[misc]
+                heights.shape,
+                col[some] - left - 0.5,
+                row[some] - top - 0.5,
+            )
         return self._above_sea(found.reshape(lat.shape), lat, lon)
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:

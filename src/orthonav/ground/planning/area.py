@@ -34,14 +34,7 @@ class Area:
 
         Raises `AreaError` for an invalid box; names swapped latitude and longitude.
         """
-        west, south, east, north = bounds_deg
-        if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
-            east += 360
-        if not (np.isfinite(bounds_deg).all() and west < east and south < north):
-            raise AreaError(
-                "bounds must be west,south,east,north in degrees with west < east and "
-                f"south < north, got {','.join(map(str, bounds_deg))}"
-            )
+        west, south, east, north = unwrapped(bounds_deg)
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
             hint = swapped_bounds_hint((west, south, east, north))
             raise AreaError(
@@ -110,6 +103,22 @@ class Area:
         bands_m = self.route.bands_m(self.band_m or None)
         assert bands_m is not None
         return self.route.points_en_m(self.frame), np.array(bands_m)
+
+
+def unwrapped(bounds_deg: Extent) -> Extent:
+    """West, south, east, north with west below east, which is above 180 across the antimeridian.
+
+    Raises `AreaError` for a box that is empty, inverted or not finite.
+    """
+    west, south, east, north = bounds_deg
+    if west > east + 180:  # as in GeoJSON (RFC 7946, 5.2)
+        east += 360
+    if not (np.isfinite(bounds_deg).all() and west < east <= west + 360 and south < north):
+        raise AreaError(
+            "bounds must be west,south,east,north in degrees with west < east and south < north, "
+            f"got {','.join(map(str, bounds_deg))}"
+        )
+    return west, south, east, north
 
 
 def require_one_area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> None:

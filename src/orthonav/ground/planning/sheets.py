@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M, WGS84_A_M
 from orthonav.core.geo.swapped import swapped_bounds_hint, swapped_hint
-from orthonav.ground.planning.area import Area, Extent
+from orthonav.ground.planning.area import Area, Extent, unwrapped
 from orthonav.ground.planning.route import Height, Route, leg_lengths_m
 
 MAX_SHEETS = 10_000
@@ -42,14 +42,7 @@ def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
     its width requires, from west to east. Raises `AreaError` for an invalid box, or for more than
     `MAX_SHEETS` boxes; names swapped latitude and longitude.
     """
-    west, south, east, north = bounds_deg
-    if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
-        east += 360
-    if not (np.isfinite(bounds_deg).all() and west < east <= west + 360 and south < north):
-        raise AreaError(
-            "bounds must be west,south,east,north in degrees with west < east and south < north, "
-            f"got {','.join(map(str, bounds_deg))}"
-        )
+    west, south, east, north = unwrapped(bounds_deg)
     if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
         hint = swapped_bounds_hint((west, south, east, north))
         raise AreaError(

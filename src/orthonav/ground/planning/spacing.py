@@ -196,7 +196,7 @@ LAYER_BYTES_PER_PX = 0.15, 0.35
 BUILD_FIXED_S = 40.0
 BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
-for a corridor of 284 million pixels (`python -m benchmarks.corridor`), 47 s for 4 million on a
+for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s for 4 million on a
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
 _PAIRS = 1_000_000_000
 """Limit on pairs of points and legs, which bounds the time of an estimate."""
