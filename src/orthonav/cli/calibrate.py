@@ -23,7 +23,6 @@ EVERYDAY = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
     parser.add_argument(
         "flight", type=Path, metavar="SOURCE", help="flight to calibrate with, as for `localize`"
@@ -62,7 +61,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Estimate the biases from the confident views of a flight, and write them."""
     from orthonav.core.errors import FlightError
     from orthonav.core.flight.mount import write_mount
 
@@ -152,7 +150,6 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
 
 
 def _run_latency(options: argparse.Namespace) -> None:
-    """Estimate the latency of the camera and write it."""
     from orthonav.core.flight.mount import write_latency
     from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
 

@@ -77,7 +77,6 @@ _HINTS = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", metavar="MAP.onav", help="map, or with --atlas an atlas")
     parser.add_argument(
         "flight",
@@ -202,7 +201,6 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Localize and write one line per view."""
     _check_destination(options)
     if options.atlas:
         _on_atlas(options)
@@ -386,7 +384,6 @@ def _print_summary(
     tried: Sequence[dict[str, Any]] = (),
     changed: "ChangedGround | None" = None,
 ) -> None:
-    """Print the summary."""
     import numpy as np
 
     from orthonav.core.files import is_stdout

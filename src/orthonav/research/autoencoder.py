@@ -106,7 +106,6 @@ class Reconstruction:
         return (self.tiles.batch(indices),)
 
     def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
-        """The L2 loss, after adding its gradients times `scale`."""
         (maps,) = tensors
         loss = reconstruction_loss(maps, self.model(maps))
         torch.autograd.backward(loss * scale)

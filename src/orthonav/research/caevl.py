@@ -224,7 +224,6 @@ class Tuning:
         return plain, seen, places
 
     def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
-        """The weighted loss, after adding its gradients times `scale`."""
         plain, seen, tile_from_view = tensors
         (first, first_maps), (second, second_maps) = self.model(plain), self.model(seen)
         loss = self.alpha * vicreg(first, second)

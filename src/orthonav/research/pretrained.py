@@ -153,7 +153,6 @@ def pretrained(folder: str, model_type: str, class_name: str) -> Any:
 
 
 def transformers() -> Any:
-    """The library `transformers`; raises `MissingExtraError` without it."""
     return needed("transformers", "train", "a neural network")
 
 

@@ -141,7 +141,6 @@ class SamBoundaries:
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return 1
 
     @property

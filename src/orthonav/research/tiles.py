@@ -64,7 +64,6 @@ class SheetTiles:
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return int(self.pixels.shape[0])
 
     def batch(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.float32]:

@@ -77,7 +77,6 @@ class Means:
 
 
 def device_of(means: Means) -> torch.device:
-    """Device on which the network is trained."""
     return torch.device(means.device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
 
@@ -98,7 +97,6 @@ def mixed_precision(means: Means, device: torch.device) -> torch.dtype | None:
 
 
 def workers_of(means: Means, device: torch.device) -> int:
-    """Threads that make batches."""
     if means.workers is not None:
         return means.workers
     return min(GPU_WORKERS, usable_cores()) if device.type == "cuda" else 2
@@ -167,7 +165,6 @@ class TrainingState:
             self.plateau.step(loss)
 
     def parts(self) -> dict[str, Any]:
-        """The state as a dictionary, for a checkpoint."""
         return {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -178,7 +175,6 @@ class TrainingState:
         }
 
     def take(self, parts: dict[str, Any]) -> None:
-        """Restore the state from `parts`."""
         self.model.load_state_dict(parts["model"])
         self.optimizer.load_state_dict(parts["optimizer"])
         if self.plateau is not None:
@@ -271,7 +267,6 @@ class Checkpoints:
             _write_png(self._work / "tiles.png", reconstructions(state.model, self._tiles))
 
     def _share(self) -> float:
-        """Share of the training that is done."""
         batches = len(self._state.history) * self._batches + len(self._state.losses)
         return batches / (self._epochs * self._batches)
 
@@ -334,9 +329,7 @@ class Task(Protocol):
     """A training task: a model, and how a batch becomes gradients."""
 
     @property
-    def model(self) -> nn.Module:
-        """The trained model."""
-        ...
+    def model(self) -> nn.Module: ...
 
     @property
     def encoder(self) -> nn.Module:
@@ -441,7 +434,6 @@ def _task(
     seed: int,
     means: Means,
 ) -> Task:
-    """Training task of a recipe, with initial weights drawn from the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if isinstance(recipe, AutoEncoderRecipe):
@@ -510,8 +502,6 @@ def _duration(seconds: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Feed:
-    """Makes batches and moves them to the device."""
-
     task: Task
     batch: int
     seed: int
@@ -522,7 +512,6 @@ class _Feed:
 
     @property
     def per_epoch(self) -> int:
-        """Number of batches of an epoch."""
         return math.ceil(self.count / self.batch)
 
     def batches(self, epoch: int, first: int = 0, end: int | None = None) -> Iterator[list[Tensor]]:
@@ -539,7 +528,6 @@ class _Feed:
         return [each.pin_memory() for each in made] if self.device.type == "cuda" else made
 
     def mixed(self) -> torch.autocast:
-        """Autocast context for mixed precision."""
         wanted, kind = self.precision is not None, self.precision or torch.bfloat16
         return torch.autocast(self.device.type, kind, enabled=wanted)
 

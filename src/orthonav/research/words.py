@@ -68,7 +68,6 @@ class _Sample:
         self._count = 0
 
     def put(self, rows: NDArray[Any]) -> None:
-        """Add rows (N, ..)."""
         self._rows.append(rows)
         self._tickets.append(self._random.random(len(rows)))
         self._count += len(rows)
@@ -76,7 +75,6 @@ class _Sample:
             self._draw()
 
     def rows(self) -> NDArray[Any]:
-        """The sample, in the order of arrival."""
         self._draw()
         return self._rows[0]
 

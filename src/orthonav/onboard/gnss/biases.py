@@ -78,7 +78,6 @@ class Biases:
 
     @property
     def stds(self) -> Array:
-        """Standard deviations (5,)."""
         return np.sqrt(np.diag(self.cov))
 
     @property
@@ -112,7 +111,6 @@ class Biases:
         return mean, cov + turning_m2 / 2 * np.eye(2)
 
     def without_displacement(self) -> "Biases":
-        """The same with no displacement, known exactly."""
         mean, cov = self.mean.copy(), self.cov.copy()
         mean[:2] = cov[:2] = cov[:, :2] = 0.0
         return replace(self, mean=mean, cov=cov)
@@ -260,7 +258,6 @@ class Difference:
 
     @cached_property
     def design(self) -> Array:
-        """Derivatives (2, 5) by the biases."""
         return design(self.heading_rad, self.agl_m, self.as_stated * self.vel_en_mps)
 
     def residual(self, known: Biases) -> Array:
@@ -313,7 +310,6 @@ class DifferenceWindow:
             self._new[-1] = self._new[-1].rolling(rolling_std_m)
 
     def clear(self) -> None:
-        """Drop all values."""
         self._old.clear()
         self._new.clear()
 
@@ -509,7 +505,6 @@ class BiasLearner:
         return self._reference
 
     def add(self, value: Difference) -> None:
-        """Add a value during agreement."""
         self._waiting.append(value)
         while self._waiting and self._waiting[0].time_s <= value.time_s - QUARANTINE_S:
             self._filter.update(self._waiting.popleft())
@@ -552,7 +547,6 @@ class _Filter:
         self._time_s: float | None = None
 
     def update(self, value: Difference) -> None:
-        """Update with a value, unless it is an outlier."""
         elapsed_s = 0.0 if self._time_s is None else value.time_s - self._time_s
         mean, cov = self._predicted(elapsed_s)
         shown = self._design(value)

@@ -225,16 +225,13 @@ class GnssMonitor:
 
     @property
     def learnt(self) -> Biases:
-        """Biases as learnt so far."""
         return self._learner.learnt
 
     @property
     def reference(self) -> Biases:
-        """See `BiasLearner.reference`."""
         return self._learner.reference
 
     def sample(self, sample: GnssSample) -> None:
-        """Add a solution of the receiver."""
         en_m = np.full(2, math.nan)
         if sample.is_valid:
             en_m = np.asarray(self._frame.en_from_latlon(sample.lat_deg, sample.lon_deg))
@@ -313,7 +310,6 @@ class GnssMonitor:
         self._bin.append(made)
 
     def _judge(self, value: Difference, now_ns: int) -> None:
-        """Test the window with a new value."""
         if value.time_s <= self._newest_s:
             self._window.clear()  # the clock went back
             self._learner.discard()
@@ -343,7 +339,6 @@ class GnssMonitor:
         self._count_agreement(recent, value, now_ns)
 
     def _count_agreement(self, recent: list[Difference], value: Difference, now_ns: int) -> None:
-        """Count the time of agreement with the anchor, and change the state."""
         anchor = self._learner.learnt if self.status.state is GnssState.GOOD else self._anchor
         limit_m = max(AGREE_M, AGREE_SIGMAS * self._std_m(value, anchor))
         if self.status.state is GnssState.WAITING and anchor.agreed_s == 0:
@@ -390,7 +385,6 @@ class GnssMonitor:
             self.status = replace(self.status, state=state, since_ns=now_ns)
 
     def _forget(self) -> None:
-        """Begin a new window."""
         self._window.clear()
         self._bin = []
 

@@ -46,8 +46,6 @@ RETURNING_CODE = len(FAULTS)
 
 
 class GnssState(Enum):
-    """State of the comparison."""
-
     WAITING = "waiting"
     """Since the start: no fault, but no agreement with the map yet."""
     GOOD = "good"

@@ -64,11 +64,9 @@ class Definitions:
         return self._store.types[name](**values)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
-        """A `std_msgs/Header`."""
         return self.new("std_msgs/msg/Header", stamp=self.time(stamp_ns), frame_id=frame)
 
     def time(self, stamp_ns: int) -> Any:
-        """A `builtin_interfaces/Time`."""
         sec, nanosec = divmod(stamp_ns, TIME_NS)
         return self.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
@@ -153,8 +151,6 @@ Handler = Callable[[Any, bytes], None]
 
 
 class Writer(Protocol):
-    """Sends messages of one topic."""
-
     def write(self, message: Any) -> None:
         """Send one message. Raises `OSError` where the middleware does not take it."""
 

@@ -87,14 +87,11 @@ class Subscription:
 
 
 class DdsWriter:
-    """Sends messages of one topic."""
-
     def __init__(self, topic: str, kind: str, definitions: Definitions, writer: Any) -> None:
         self.topic, self.kind, self.writer = topic, kind, writer
         self._definitions, self._sample = definitions, writer.topic.data_type
 
     def write(self, message: Any) -> None:
-        """See `Writer.write`."""
         sample = self._sample()
         sample.cdr = self._definitions.encoded(message)
         try:
@@ -131,7 +128,6 @@ class Node(Graph):
     def subscribe(
         self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
     ) -> None:
-        """See `Graph.subscribe`."""
         qos = self._made_qos(kind, reliable=reliable, depth=depth)
         sub = ros2_module("cyclonedds.sub")
         reader = sub.DataReader(self._participant, self._topic(f"rt{topic}", kind), qos)
@@ -145,18 +141,15 @@ class Node(Graph):
     def advertise(
         self, topic: str, kind: str, *, depth: int = 10, latched: bool = False
     ) -> DdsWriter:
-        """See `Graph.advertise`."""
         self._writers.append(self._writer(f"rt{topic}", kind, depth=depth, latched=latched))
         self._announce()
         return self._writers[-1]
 
     def spin(self, timeout_s: float) -> int:
-        """See `Graph.spin`."""
         self._waitset.wait(round(timeout_s * 1e9))
         return sum(self._taken(each) for each in self._subscriptions)
 
     def close(self) -> None:
-        """See `Graph.close`."""
         del self._publishers, self._subscribers, self._names
         for held in (self._conditions, self._subscriptions, self._writers):
             held.clear()
@@ -208,7 +201,6 @@ class Node(Graph):
         self._names.write(message)
 
     def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> DdsWriter:
-        """A writer of a topic of DDS."""
         qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
         pub = ros2_module("cyclonedds.pub")
         made = pub.DataWriter(self._participant, self._topic(name, kind), qos)
@@ -254,7 +246,6 @@ class Endpoints:
                 yield ros_type_name(kind)
 
     def update(self) -> None:
-        """Take note of what came and left."""
         try:
             changes = self._reader.take(_MOST_ENDPOINTS)
         except Exception as error:  # a policy of another vendor that the library cannot name

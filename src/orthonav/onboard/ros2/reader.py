@@ -146,7 +146,6 @@ class Ros2Reader:
         )
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         while not self._stopped():
             self._spin()
             if self._images and self._is_ready(self._images[0]):
