@@ -42,25 +42,6 @@ def test_grey_levels_of_a_tile():
     assert tiles.grey_tile(2).any(), "a copy must be given"
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"pixels": np.zeros((80, 96), np.uint8)},
-        {"pixels": np.zeros((1, 80, 96), np.float32)},
-        {"valid": np.ones((80, 95), bool)},
-        {"valid": np.ones((80, 96), np.uint8)},
-        {"grey": np.zeros((79, 96), np.uint8)},
-        {"tiles_px": np.array([[49, 0]])},
-        {"tiles_px": np.array([[0, -1]])},
-        {"tiles_px": np.zeros((0, 2), int)},
-        {"scale": 0.0},
-    ],
-)
-def test_fields_that_do_not_fit_together_are_refused(changes):
-    with pytest.raises(ValueError):
-        sheet(**changes)
-
-
 @pytest.mark.parametrize("count, batch", [(25, 8), (3, 8), (64, 32), (1, 1)])
 def test_batches_hold_every_tile_once_in_random_order(count, batch):
     plan = epoch_batches(count, batch, 0, 4)

@@ -18,7 +18,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True, eq=False)
 class SheetTiles:
-    """Tiles of one sheet picture. Raises `ValueError` if the fields do not fit together.
+    """Tiles of one sheet picture.
 
     - `pixels`: (C, H, W) uint8, an array or a memory map.
     - `valid`: (H, W) bool, pixels that are imagery.
@@ -38,26 +38,6 @@ class SheetTiles:
     scale: float = 255.0
     grey: NDArray[np.uint8] | None = None
     singles: NDArray[np.uint8] | None = None
-
-    def __post_init__(self) -> None:
-        if self.pixels.ndim != 3 or self.pixels.dtype != np.uint8:
-            raise ValueError(
-                f"pixels must be uint8 (C, H, W), got {self.pixels.dtype} {self.pixels.shape}"
-            )
-        shape = self.pixels.shape[1:]
-        if self.valid.shape != shape or self.valid.dtype != np.bool_:
-            raise ValueError(
-                f"valid must be bool {shape}, got {self.valid.dtype} {self.valid.shape}"
-            )
-        if self.grey is not None and (self.grey.shape != shape or self.grey.dtype != np.uint8):
-            raise ValueError(f"grey must be uint8 {shape}, got {self.grey.dtype} {self.grey.shape}")
-        if self.tiles_px.ndim != 2 or self.tiles_px.shape[1] != 2 or len(self.tiles_px) == 0:
-            raise ValueError(f"tiles_px must be (N, 2), N above 0, got {self.tiles_px.shape}")
-        if not self.scale > 0:
-            raise ValueError(f"scale must be above 0, got {self.scale}")
-        last = self.tiles_px.max(axis=0) + self.tile_px
-        if self.tile_px < 1 or self.tiles_px.min() < 0 or last[0] > shape[0] or last[1] > shape[1]:
-            raise ValueError(f"tiles of {self.tile_px} px reach beyond the sheet of {shape} px")
 
     def __len__(self) -> int:
         return len(self.tiles_px)

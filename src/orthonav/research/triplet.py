@@ -21,7 +21,6 @@ from orthonav.research.tiles import SheetTiles
 
 BLOCKS = (3, 4, 6, 3)
 """Blocks of two convolutions in each of the four stages: ResNet34."""
-SMALLEST_TILE_PX = 32
 
 Positive = Callable[[np.random.Generator, NDArray[np.uint8]], NDArray[Any]]
 """Function from grey levels (S, S) uint8 to a tile of another date, (S, S) or (C, S, S): uint8 in
@@ -56,16 +55,10 @@ class ResNet34(nn.Module):
     """Encoder of tiles (N, C, S, S) into vectors (N, 16 * width).
 
     `width` is the number of channels of the first stage, 64 in ResNet34; it doubles three times.
-    Raises `ValueError` for a tile below 32 px or an impossible width.
     """
 
     def __init__(self, *, tile_px: int = 256, channels: int = 1, width: int = 64) -> None:
         super().__init__()
-        if tile_px < SMALLEST_TILE_PX or channels < 1 or width < 1:
-            raise ValueError(
-                f"tile must be at least {SMALLEST_TILE_PX} px, channels and width above 0, "
-                f"got {tile_px}, {channels}, {width}"
-            )
         self.tile_px, self.channels, self.dims = tile_px, channels, 16 * width
         self.stem = nn.Sequential(
             nn.Conv2d(channels, width, 7, 2, 3, bias=False),
