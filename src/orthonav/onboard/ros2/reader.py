@@ -6,9 +6,11 @@ header stamps; for a message without a stamp the time of arrival is used.
 
 import logging
 import math
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, StoppedError
@@ -30,10 +32,44 @@ from orthonav.core.geo.attitude import (
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.graph import Graph
-from orthonav.onboard.ros2.lost import LostImages
-from orthonav.onboard.ros2.messages import TIME_NS
+from orthonav.onboard.ros2.graph import TIME_NS, Graph
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
+
+WINDOW_NS = 10 * 10**9
+LOST_SHARE, LEAST_IMAGES = 0.2, 5
+IRREGULAR = 2
+"""Steps from image to image, in messages of the camera, differ by less where a node between passes
+every n-th image on."""
+
+
+class LostImages:
+    """Stamps of the images and of the `camera_info` that arrived; a camera gives both the same.
+
+    An image is sent in many parts and lost with one of them, its `camera_info` is a single part.
+    """
+
+    def __init__(self) -> None:
+        self.images: deque[int] = deque(maxlen=1000)
+        self.infos: deque[int] = deque(maxlen=1000)
+
+    def reason(self) -> str | None:
+        """What is wrong where more than `LOST_SHARE` of the last seconds' images are missing."""
+        infos = sorted(self.infos)
+        images = sorted(self.images)
+        if not images:
+            return None
+        images = images[bisect_left(images, images[-1] - WINDOW_NS) :]
+        if len(images) < LEAST_IMAGES:
+            return None
+        steps = [bisect_right(infos, b) - bisect_right(infos, a) for a, b in pairwise(images)]
+        lost = sum(max(step - 1, 0) for step in steps)
+        if lost <= LOST_SHARE * (lost + len(images)) or max(steps) - min(steps) < IRREGULAR:
+            return None
+        return (
+            "loses images: use compressed ones, image_reliability:=reliable, or a larger "
+            "net.core.rmem_max"
+        )
+
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS
@@ -110,7 +146,6 @@ class Ros2Reader:
         )
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         while not self._stopped():
             self._spin()
             if self._images and self._is_ready(self._images[0]):
