@@ -25,16 +25,13 @@ from orthonav.ground.fetch.grid import Selection
 from orthonav.ground.fetch.options import Provenance
 from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
 
-BLOCK_PX = 512
-"""GDAL's default block of a COG."""
+BLOCK_PX = 512  # GDAL's default block of a COG
 GDAL_OPTIONS = {
     "GDAL_TIFF_INTERNAL_MASK": "YES",
     "GDAL_CACHEMAX": 128 * 2**20,
 }
-GIVE_UP_AFTER = 20
-"""Failed cells in a row after which the service counts as down."""
-_BATCH_PER_THREAD = 8
-"""Cells that may wait in memory until they are written."""
+GIVE_UP_AFTER = 20  # failed cells in a row after which the service counts as down
+_BATCH_PER_THREAD = 8  # cells that may wait in memory until they are written
 log = logging.getLogger(__name__)
 
 
@@ -124,7 +121,6 @@ def write_mosaic(
 def _write_cells(
     dataset: Any, selection: Selection, read: CellReader, parallel: int, progress: Progress
 ) -> CellCounts:
-    """Read every cell and write it. Raises `FetchError` where the service is down."""
     counts, (row0, col0) = CellCounts(), selection.first
     written: dict[bytes, list[tuple[Window, int]]] = {}
     in_a_row = 0
@@ -161,7 +157,6 @@ def _write_cells(
 def _read_cells(
     selection: Selection, read: CellReader, parallel: int
 ) -> Iterator[tuple[list[int], CellPixels | FetchError]]:
-    """Every cell and its pixels, or why it has none, as they come."""
 
     def read_one(cell: list[int]) -> tuple[list[int], CellPixels | FetchError]:
         try:

@@ -30,12 +30,9 @@ DEFAULT_MAX_TILES = 50_000
 DEFAULT_MAX_MB = 4000.0
 DEFAULT_MARGIN_M = 200.0
 """Reference tiles at the border of a map reach beyond its area by less than this."""
-_SECONDS_PER_TILE = 0.3
-"""Usual latency of a tile service; an assumption for the estimate."""
-_BYTES_PER_SECOND = 3e6
-"""Usual throughput of a connection; an assumption for the estimate."""
-_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")
-"""Names in a cache that GDAL and this program make."""
+_SECONDS_PER_TILE = 0.3  # usual latency of a tile service; an assumption for the estimate
+_BYTES_PER_SECOND = 3e6  # usual throughput of a connection; an assumption for the estimate
+_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")  # names in a cache that GDAL and this program make
 log = logging.getLogger(__name__)
 
 
@@ -211,7 +208,6 @@ def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
 
 
 def _selected(source: CellSource, request: FetchRequest) -> Selection:
-    """The cells of the area. Raises `AreaError`, which names swapped coordinates as the cause."""
     frame = request.area.frame
 
     def covered(lat_deg: float, lon_deg: float) -> bool:

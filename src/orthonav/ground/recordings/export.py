@@ -27,8 +27,7 @@ from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.records import MAP_STD_M, Fix, ViewResult
 
 _XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
-_YEAR_2000_NS = 946_684_800 * 10**9
-"""Earlier times count from something else than 1970."""
+_YEAR_2000_NS = 946_684_800 * 10**9  # earlier times count from something else than 1970
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
 
 
@@ -114,7 +113,6 @@ def _csv(positions: Sequence[CameraPosition]) -> str:
 
 
 def _geojson(positions: Sequence[CameraPosition]) -> str:
-    """Points (RFC 7946), with heights above sea where they are known."""
     features = []
     for each in positions:
         point = [round(each.fix.lon_deg, 8), round(each.fix.lat_deg, 8)]
