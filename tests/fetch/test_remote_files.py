@@ -13,7 +13,6 @@ from rasterio.transform import Affine
 
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.fetch.mosaic import Packing
 from orthonav.ground.fetch.options import ImageryOptions
 from orthonav.ground.fetch.presets import find_preset, parse_source
 from orthonav.ground.fetch.run import FetchRequest, fetch
@@ -93,8 +92,7 @@ def test_bands_are_chosen(take, tmp_path, bands, wanted, count):
         tmp_path / "b.tif", UTM, size=300, bands=bands, driver="COG"
     ).read_bytes()
     with servers.serving(servers.files({"/a.tif": body})) as server:
-        packing = Packing("jpeg")
-        _, path = take(f"cog:{server.url}/a.tif", gsd_m=None, bands=wanted, packing=packing)
+        _, path = take(f"cog:{server.url}/a.tif", gsd_m=None, bands=wanted, compress="jpeg")
         with pytest.raises(FetchError, match="different kinds"):
             take(f"cog:{server.url}/a.tif", gsd_m=None, bands=(9,))
     with rasterio.open(path) as data:
