@@ -32,7 +32,6 @@ HEIGHTS = (0.5, 0.7, 1.4, 2.0)
 
 
 def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
-    """Trials at the same places for every error of heading and height."""
     return [
         (replace(plan, yaw_off_deg=yaw, agl_off=agl), places_en_m)
         for yaw in YAW_OFF_DEG
@@ -41,7 +40,6 @@ def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
 
 
 def envelope_of(trials: Sequence[Sequence[Trial]]) -> Envelope:
-    """The envelope from the trials of `envelope_work`."""
     shares = [right_share(each) for each in trials]
     share = np.array(shares, np.float64).reshape(len(YAW_OFF_DEG), len(AGL_OFF))
     middle = AGL_OFF.index(0.0)
@@ -58,14 +56,12 @@ def _last_without_gap(tolerated: NDArray[np.bool_]) -> int:
 
 
 def heights_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
-    """Trials at the same places from other heights."""
     return [(replace(plan, agl_m=plan.agl_m * part), places_en_m) for part in HEIGHTS]
 
 
 def heights_of(
     plan: TrialPlan, planned: Sequence[Trial], others: Sequence[Sequence[Trial]]
 ) -> tuple[Alternative, ...]:
-    """Alternatives from `planned` trials at `plan.agl_m` and those of `heights_work`, by height."""
     tried = sorted({1.0: planned, **dict(zip(HEIGHTS, others, strict=True))}.items())
     return tuple(
         Alternative("agl_m", plan.agl_m * part, right_share(each), part == 1.0)
@@ -74,7 +70,6 @@ def heights_of(
 
 
 def right_share(trials: Sequence[Trial]) -> float:
-    """Fraction of trials that were confident and correct; NaN without trials."""
     return float(np.mean([each.right for each in trials])) if trials else float("nan")
 
 
@@ -133,7 +128,6 @@ def _pair(trial: Trial, far_m: float) -> _Pair | None:
 
 
 def _same(one: _Pair, two: _Pair, within_m: float) -> bool:
-    """Whether both ends of two pairs, in either order, lie near each other."""
     straight = max(math.dist(one.place, two.place), math.dist(one.other, two.other))
     swapped = max(math.dist(one.place, two.other), math.dist(one.other, two.place))
     return min(straight, swapped) <= within_m

@@ -145,7 +145,6 @@ class _Check:
         return plan
 
     def _leg_bands_m(self) -> tuple[float, ...]:
-        """Width of the band of every leg of the route, which is validated."""
         route, band_m, prior_std_m = (
             self.request.route,
             self.request.band_m,
@@ -159,7 +158,6 @@ class _Check:
         return route.bands_m(band_m) or ()
 
     def _area(self) -> Area | None:
-        """The band of the route in the plane of the map."""
         route = self.request.route
         if route is None:
             return None
@@ -171,7 +169,6 @@ class _Check:
         return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
 
     def result(self) -> CheckResult:
-        """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
         places = trial_places(
@@ -254,18 +251,15 @@ class _Check:
 
     @property
     def _least_error_m(self) -> float:
-        """Errors of a fix that trials do not show, root mean square.
-
-        How well orthophotos of two dates agree, the displacement of the map as a whole, and the
-        unreported tilt of the camera, at a height that may be off.
-        """
+        """Errors of a fix that trials do not show, root mean square: two orthophotos against each
+        other, the displacement of the map as a whole, the unreported tilt at a height that may be
+        off."""
         floor_m = self.floor_px * self.sheet.grid.gsd_m
         high_m = self.plan.agl_m * math.hypot(1.0, self.request.agl_std)
         tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
         return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
 
     def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
-        """Trials with the map's imagery, and with that of the second date."""
         other_date, plan = self.request.other_date, self.plan
         work = [(plan, places)]
         if other_date is not None:
@@ -285,7 +279,6 @@ class _Check:
     def _extra_trials(
         self, own: Sequence[Trial], rng: np.random.Generator
     ) -> tuple[Envelope | None, list[list[Trial]]]:
-        """The envelope of errors, and trials from other heights."""
         # Where views are not placed, errors of heading and height make no difference.
         placed = [each.en_m for each in own if each.right]
         order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
@@ -355,7 +348,6 @@ class _Check:
     def _alternatives(
         self, heights: list[list[Trial]], own: Sequence[Trial], cells: Cells
     ) -> tuple[Alternative, ...]:
-        """Other heights, where these were tried, and narrower bands, where all legs have one."""
         found: tuple[Alternative, ...] = ()
         if heights:
             found = heights_of(self.plan, own, heights)

@@ -20,10 +20,8 @@ MAX_HEALTH = 200_000
 class Batch:
     """What is new since the last poll.
 
-    `results`: in order.
     `health`: lines of health, each with the number of results before it.
     `restarted`: the file was replaced, so everything read before is void.
-    `problems`: messages for people.
     """
 
     results: list[ViewResult] = field(default_factory=list)
@@ -33,8 +31,6 @@ class Batch:
 
 
 class Feed(Protocol):
-    """A source of results."""
-
     def poll(self) -> Batch:
         """What is new since the last call. Raises `OrthonavError` or `OSError`."""
         ...
@@ -56,7 +52,6 @@ class LineFeed:
         self._health, self._broken = 0, 0
 
     def poll(self) -> Batch:
-        """See `Feed.poll`."""
         batch = Batch()
         if self._live and not self._path.exists():
             return batch
@@ -73,7 +68,6 @@ class LineFeed:
         return batch
 
     def _was_replaced(self) -> bool:
-        """Whether the file was replaced or truncated since the last poll."""
         found = self._path.stat()
         file = found.st_dev, found.st_ino
         replaced = self._file != (0, 0) and (file != self._file or found.st_size < self._offset)
@@ -108,7 +102,6 @@ class LineFeed:
 
 
 def _health_of(text: str) -> dict[str, Any] | None:
-    """The health in a line; None for any other line."""
     if not is_health(text):
         return None
     try:
@@ -119,7 +112,6 @@ def _health_of(text: str) -> dict[str, Any] | None:
 
 
 def checked_health(plain: Any) -> dict[str, Any]:
-    """Level, reasons, time and counts of health, validated; raises `FlightError`."""
     level = plain.get("health") if isinstance(plain, dict) else None
     if not isinstance(level, str):
         raise FlightError("health has no level")

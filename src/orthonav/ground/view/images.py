@@ -18,11 +18,7 @@ Grey = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One recorded view; its image is loaded on demand.
-
-    `telemetry`: at exposure; `camera`: calibration.
-    `load`: returns the image (H, W) uint8, perhaps reduced; raises `FlightError`.
-    """
+    """One recorded view; `load` returns the image (H, W), or raises `FlightError`."""
 
     telemetry: Telemetry
     camera: Camera
@@ -30,32 +26,23 @@ class Shot:
 
 
 class ViewImages(Protocol):
-    """A source of images."""
-
     def shot(self, frame: str) -> Shot:
         """The view `frame`; raises `FlightError` with the reason where it has no image."""
         ...
 
 
 class NoImages:
-    """No images, only results."""
-
     def shot(self, frame: str) -> Shot:
-        """See `ViewImages.shot`."""
         raise FlightError("there are no images; name the flight with --flight")
 
 
 class FolderImages:
-    """Images of a flight folder."""
-
     def __init__(self, path: Path) -> None:
-        """Raises as `open_flight` does."""
         folder = open_flight(path, images_needed=False)
         self._camera = folder.camera
         self._views = {view.frame: view for view in folder.views}
 
     def shot(self, frame: str) -> Shot:
-        """See `ViewImages.shot`."""
         view = self._views.get(frame)
         if view is None:
             raise FlightError("this view is not in the flight")
