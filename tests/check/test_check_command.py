@@ -18,10 +18,9 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.signature import map_digest
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.ground.check import run as check_run
-from orthonav.ground.check.outcome import Word
+from orthonav.ground.check.outcome import Verdict, Word
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
-from orthonav.ground.check.verdict import Verdict
 from orthonav.ground.check.write.plain import to_json
 from orthonav.ground.planning.route import Route
 
@@ -311,9 +310,7 @@ def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
 @pytest.mark.parametrize("word", list(Word), ids=lambda word: word.value)
 def test_exit_codes(run, unwritten, half_blank, tmp_path, monkeypatch, word):
     judge = check_run.verdict_of
-    monkeypatch.setattr(
-        check_run, "verdict_of", lambda *found, **more: Verdict(word, judge(*found, **more).reasons)
-    )
+    monkeypatch.setattr(check_run, "verdict_of", lambda found: Verdict(word, judge(found).reasons))
     done = run("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
     assert (done.code, done.err) == (word.exit_code, "")
     assert json.loads(done.out)["verdict"]["word"] == word.value

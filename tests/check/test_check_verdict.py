@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from orthonav.ground.check.findings import Findings, verdict_of
 from orthonav.ground.check.outcome import Along, BlindStretch, Word
-from orthonav.ground.check.verdict import verdict_of
 
 ZEROS = np.zeros(11)
 ALONG = Along(
@@ -38,7 +38,7 @@ FLOWN = FINE | {"along": ALONG}
 
 def judged(findings):
     """The verdict, and the word of each reason."""
-    verdict = verdict_of(**findings)
+    verdict = verdict_of(Findings(**findings))
     ranks = [(Word.NO_GO, Word.MARGINAL, Word.GO).index(each.word) for each in verdict.reasons]
     assert ranks == sorted(ranks) and verdict.word is verdict.reasons[0].word
     assert all(each.text and "nan" not in each.text for each in verdict.reasons)
@@ -126,7 +126,7 @@ def test_expected_drift(drift_m, prior_std_m, expected):
     along = replace(ALONG, drift_m=drift)
     findings = FINE | dict(along=along, allowed_m=prior_std_m)
     assert judged(findings) == (expected, {"fixes": Word.GO, "drift": expected})
-    assert any("at km 2.0" in each.text for each in verdict_of(**findings).reasons)
+    assert any("at km 2.0" in each.text for each in verdict_of(Findings(**findings)).reasons)
 
 
 @pytest.mark.parametrize(
@@ -135,13 +135,13 @@ def test_expected_drift(drift_m, prior_std_m, expected):
         (
             (stretch(400, 12),),
             Word.GO,
-            "One gap of 400 m without fixes (20 s), from km 1.0; dead",
+            "Gaps without fixes: 1, the longest 400 m (20 s), from km 1.0; dead",
         ),
-        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2 gaps, the longest of 900 m"),
+        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2, the longest 900 m"),
         ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts by 60 m (limit 50 m)"),
-        ((stretch(4000, 120),), Word.NO_GO, "drifts by 120 m in 4000 m (limit 50 m)"),
+        ((stretch(4000, 120),), Word.NO_GO, "drifts by 120 m (limit 50 m)"),
         ((stretch(400, 12, ends_lost=True),), Word.MARGINAL, "the route ends in a gap"),
-        ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "2 gaps"),
+        ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "fixes: 2"),
         ((stretch(9000, 270, allowed_m=float("inf")),), Word.GO, "bridges"),
     ],
     ids=["one", "two", "long", "longer", "at the end", "one of two", "whole map searched"],
@@ -150,4 +150,4 @@ def test_gaps(stretches, expected, said):
     findings = FLOWN | dict(stretches=stretches)
     word, reasons = judged(findings)
     assert word is expected and reasons["blind"] is expected
-    assert any(said in each.text for each in verdict_of(**findings).reasons)
+    assert any(said in each.text for each in verdict_of(Findings(**findings)).reasons)

@@ -19,6 +19,7 @@ from orthonav.core.records import MAP_STD_M
 from orthonav.ground.changes.record import CellGrid
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
+    Findings,
     blind_stretches,
     envelope_of,
     envelope_work,
@@ -26,6 +27,7 @@ from orthonav.ground.check.findings import (
     heights_of,
     heights_work,
     predicted_along,
+    verdict_of,
 )
 from orthonav.ground.check.outcome import (
     Along,
@@ -50,7 +52,6 @@ from orthonav.ground.check.trials import (
     require_overlap,
     run_many,
 )
-from orthonav.ground.check.verdict import verdict_of
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
@@ -195,7 +196,7 @@ class _Check:
             radius_m=self.radius_m,
             prior_std_m=request.prior_std_m,
         )
-        verdict = verdict_of(
+        findings = Findings(
             along,
             stretches,
             lookalikes,
@@ -215,7 +216,7 @@ class _Check:
             conditions=self.conditions,
             frame=self.sheet.frame,
             cells=cells,
-            verdict=verdict,
+            verdict=verdict_of(findings),
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
             mean=mean,
             second_date=bool(other),

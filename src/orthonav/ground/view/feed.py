@@ -1,14 +1,20 @@
-"""Results and health of a flight, read from a file that may still grow."""
+"""Results and health of a flight, read from a file that may still grow, and images of its views."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
+from orthonav.core.flight import open_flight
 from orthonav.core.flight.fixes import is_health, result_from_json
-from orthonav.core.records import ViewResult
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Telemetry, ViewResult
 
 MAX_LINE_BYTES = 2**20
 MAX_VIEWS = 500_000
@@ -129,3 +135,36 @@ def checked_health(plain: Any) -> dict[str, Any]:
         if isinstance(value, dict):
             known[name] = {str(k)[:40]: v for k, v in value.items() if isinstance(v, int)}
     return known
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One recorded view; `load` returns the image (H, W), or raises `FlightError`."""
+
+    telemetry: Telemetry
+    camera: Camera
+    load: Callable[[], NDArray[np.uint8]]
+
+
+class ViewImages(Protocol):
+    def shot(self, frame: str) -> Shot:
+        """The view `frame`; raises `FlightError` with the reason where it has no image."""
+        ...
+
+
+class NoImages:
+    def shot(self, frame: str) -> Shot:
+        raise FlightError("there are no images; name the flight with --flight")
+
+
+class FolderImages:
+    def __init__(self, path: Path) -> None:
+        folder = open_flight(path, images_needed=False)
+        self._camera = folder.camera
+        self._views = {view.frame: view for view in folder.views}
+
+    def shot(self, frame: str) -> Shot:
+        view = self._views.get(frame)
+        if view is None:
+            raise FlightError("this view is not in the flight")
+        return Shot(view.telemetry, self._camera, view.grey)

@@ -30,8 +30,7 @@ from orthonav.ground.recordings.flightlog import (
     logged_result,
     run_of,
 )
-from orthonav.ground.view.feed import MAX_HEALTH, MAX_VIEWS, Batch, checked_health
-from orthonav.ground.view.images import Shot
+from orthonav.ground.view.feed import MAX_HEALTH, MAX_VIEWS, Batch, Shot, checked_health
 
 RESCAN_S = 1.0
 _WHY_NONE = {

@@ -41,8 +41,15 @@ from orthonav.ground.report.imagery import (
     window_of,
 )
 from orthonav.ground.report.numbers import to_plain
-from orthonav.ground.view.feed import Batch, Feed, LineFeed
-from orthonav.ground.view.images import FolderImages, NoImages, Shot, ViewImages
+from orthonav.ground.view.feed import (
+    Batch,
+    Feed,
+    FolderImages,
+    LineFeed,
+    NoImages,
+    Shot,
+    ViewImages,
+)
 from orthonav.ground.view.logs import LogReader
 
 Array = NDArray[np.float64]
