@@ -52,81 +52,47 @@ def stretch(length_m, drift_m, *, ends_lost=False, allowed_m=50.0, start_m=1000.
     )
 
 
+def drifting(drift_m):
+    return replace(ALONG, drift_m=np.where(np.arange(11) == 4, drift_m, 3.0))
+
+
+GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
+
+
 @pytest.mark.parametrize(
-    ("allowed_m", "predicted_px", "word"),
+    ("findings", "code", "word"),
     [
-        (None, 130.0, Word.MARGINAL),
-        (None, 150.0, Word.GO),
-        (50.0, 130.0, Word.GO),
-        (None, None, Word.GO),  # tried on a second date
+        (dict(allowed_m=None, predicted_px=130.0), "narrow_views", MARGINAL),
+        (dict(allowed_m=None, predicted_px=150.0), "narrow_views", None),
+        (dict(allowed_m=50.0, predicted_px=130.0), "narrow_views", None),
+        (dict(allowed_m=None, predicted_px=None), "narrow_views", None),
+        (dict(mean=0.7, low=0.6), "fixes", GO),
+        (dict(mean=0.99, low=0.59), "few_fixes", MARGINAL),
+        (dict(mean=0.2, low=0.1), "few_fixes", MARGINAL),
+        (dict(mean=0.19, low=0.1), "few_fixes", NO_GO),
+        (dict(mean=0.0, low=0.0), "few_fixes", NO_GO),
+        (dict(calibrated=False), "no_confidence", NO_GO),
+        (dict(wrong=1, trials=10), "wrong", None),
+        (dict(wrong=2), "wrong", None),
+        (dict(wrong=5), "wrong", MARGINAL),
+        (dict(wrong=19), "wrong", MARGINAL),
+        (dict(wrong=20), "wrong", NO_GO),
+        (dict(wrong=0, trials=0), "wrong", None),
+        (dict(along=ALONG, outside=0.004), "outside_map", None),
+        (dict(along=ALONG, outside=0.05), "outside_map", MARGINAL),
+        (dict(along=ALONG, outside=0.11), "outside_map", NO_GO),
+        (dict(along=drifting(50.0)), "drift", GO),
+        (dict(along=drifting(51.0)), "drift", MARGINAL),
+        (dict(along=drifting(101.0)), "drift", NO_GO),
+        (dict(along=drifting(5000.0), allowed_m=None), "drift", GO),
+        (dict(changed=0.05), "changed_ground", GO),
+        (dict(changed=0.2), "changed_ground", MARGINAL),
     ],
+    ids=str,
 )
-def test_predictions_alone_are_no_go_for_narrow_views_without_a_prior(
-    allowed_m, predicted_px, word
-):
-    found, reasons = judged(FINE | dict(allowed_m=allowed_m, predicted_px=predicted_px))
-    assert found is word and ("narrow_views" in reasons) == (word is Word.MARGINAL)
-
-
-@pytest.mark.parametrize(
-    "mean, low, code, word",
-    [
-        (0.7, 0.6, "fixes", Word.GO),
-        (0.99, 0.59, "few_fixes", Word.MARGINAL),
-        (0.2, 0.1, "few_fixes", Word.MARGINAL),
-        (0.19, 0.1, "few_fixes", Word.NO_GO),
-        (0.0, 0.0, "few_fixes", Word.NO_GO),
-    ],
-)
-def test_go_rests_on_the_low_end(mean, low, code, word):
-    assert judged(FINE | dict(mean=mean, low=low)) == (word, {code: word})
-
-
-def test_a_map_without_confidence_is_no_go():
-    word, reasons = judged(FLOWN | dict(calibrated=False))
-    assert word is Word.NO_GO and reasons["no_confidence"] is Word.NO_GO
-
-
-@pytest.mark.parametrize(
-    "wrong, trials, expected",
-    [
-        (1, 10, None),
-        (2, 1000, None),
-        (5, 1000, Word.MARGINAL),
-        (19, 1000, Word.MARGINAL),
-        (20, 1000, Word.NO_GO),
-        (0, 0, None),
-    ],
-)
-def test_wrong_with_confidence(wrong, trials, expected):
-    word, reasons = judged(FINE | dict(wrong=wrong, trials=trials))
-    assert reasons.get("wrong") is expected and word is (expected or Word.GO)
-
-
-@pytest.mark.parametrize(
-    "outside, expected",
-    [(0.0, None), (0.004, None), (0.05, Word.MARGINAL), (0.11, Word.NO_GO), (1.0, Word.NO_GO)],
-)
-def test_a_route_beyond_the_map(outside, expected):
-    word, reasons = judged(FLOWN | dict(outside=outside))
-    assert reasons.get("outside_map") is expected and word is (expected or Word.GO)
-
-
-@pytest.mark.parametrize(
-    "drift_m, prior_std_m, expected",
-    [
-        (50.0, 50.0, Word.GO),
-        (51.0, 50.0, Word.MARGINAL),
-        (101.0, 50.0, Word.NO_GO),
-        (5000.0, None, Word.GO),
-    ],
-)
-def test_expected_drift(drift_m, prior_std_m, expected):
-    drift = np.where(np.arange(11) == 4, drift_m, 3.0)
-    along = replace(ALONG, drift_m=drift)
-    findings = FINE | dict(along=along, allowed_m=prior_std_m)
-    assert judged(findings) == (expected, {"fixes": Word.GO, "drift": expected})
-    assert any("at km 2.0" in each.text for each in verdict_of(Findings(**findings)).reasons)
+def test_every_rule(findings, code, word):
+    found, reasons = judged(FINE | findings)
+    assert reasons.get(code) is word and found is (word or GO)
 
 
 @pytest.mark.parametrize(
