@@ -37,9 +37,9 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
 from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
+from orthonav.ground.check.findings import GO_LOW, NARROW_PX
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
-from orthonav.ground.check.verdict import GO_LOW, NARROW_PX
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
 
