@@ -10,10 +10,7 @@ Value = TypeVar("Value")
 
 
 class ByteCache(Generic[Key, Value]):
-    """The values that were used last, of at most `limit_bytes` in all; threads may share it.
-
-    `size_of` returns the bytes of a value. `held_bytes`: those of all values held.
-    """
+    """The values used last, of at most `limit_bytes` in all by `size_of`; threads may share it."""
 
     def __init__(self, limit_bytes: int, size_of: Callable[[Value], int]) -> None:
         self._limit_bytes, self._size_of = limit_bytes, size_of
@@ -22,17 +19,13 @@ class ByteCache(Generic[Key, Value]):
         self.held_bytes = 0
 
     def get(self, key: Key) -> Value | None:
-        """The value of a key, or None."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
             return self._values.get(key)
 
     def put(self, key: Key, value: Value) -> None:
-        """Hold a value, unless another thread was faster; those not used for longest are dropped.
-
-        A value larger than the limit is not held, and no other one remains.
-        """
+        """Hold a value unless the key is held; a value larger than the limit empties the cache."""
         with self._lock:
             if key in self._values:
                 return

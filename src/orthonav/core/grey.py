@@ -15,12 +15,10 @@ EXPECTED = (
 
 
 def grey_levels(image: Any) -> NDArray[np.uint8]:
-    """Grey levels (H, W) uint8 of an image; an image that is that already is returned as it is.
+    """Grey levels (H, W) uint8 of a grey, BGR or BGRA image; uint8 grey is returned as it is.
 
-    Colour is in OpenCV's order, blue first, and transparency is ignored. uint16 counts to 65535.
-    Floating point counts to 1 where no value is above 1, else to 255. Other integers must be 0 to
-    255. Raises `FlightError` that says what was expected.
-    """
+    uint16 counts to 65535, floating point to 1 where no value is above 1, else to 255. Raises
+    `FlightError`."""
     if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 2 and image.size:
         return image
     if image is None:
@@ -38,7 +36,6 @@ def grey_levels(image: Any) -> NDArray[np.uint8]:
 
 
 def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """The same array as uint8, scaled by its type."""
     if array.dtype == np.uint8:
         return array
     if array.dtype == np.uint16:

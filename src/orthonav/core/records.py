@@ -1,4 +1,4 @@
-"""The records that packages exchange: telemetry, view, prior, fix, no fix."""
+"""Telemetry, view, prior, fix, no fix."""
 
 import math
 from collections.abc import Mapping
@@ -15,31 +15,26 @@ from orthonav.core.geo.ground import Ground
 from orthonav.core.grey import grey_levels
 
 CONFIDENT = 0.9
-"""A fix of at least this confidence counts as confident: the default of publishing and reports."""
+"""From this confidence on: the default of publishing and reports."""
 
 PRIOR_SIGMAS = 3.0
-"""A prior position limits the search to so many of its standard deviations: 1.1 % of a round
-Gaussian lies outside."""
+"""The search ends there: 1.1 % of a round Gaussian lies outside."""
 DEFAULT_YAW_STD_DEG = 7.0
-"""Standard deviation of a reported heading that comes without one: magnetic compasses of the
-recorded flights are off by several degrees (docs/tracking.md)."""
+"""Magnetic compasses of the recorded flights are off by several degrees (docs/tracking.md)."""
 MIN_YAW_STD_DEG = 2.0
-"""Least deviation of a reported heading that searches allow for."""
+"""The least that searches allow for."""
 TILE_YAW_STD_DEG = 5.0
-"""The same default where views are localized by their tiles alone. It differs on purpose: 5 deg
-make three headings 6 deg apart, as measured in docs/decisions/embedding.md; 7 deg would make five,
-and change every figure of the embedding alone."""
+"""Where views are localized by tiles alone: three headings 6 deg apart
+(docs/decisions/embedding.md)."""
 DEFAULT_AGL_STD = 0.08
-"""Standard deviation of a reported height that comes without one, over the height."""
+"""Over the height."""
 DEFAULT_TILT_STD_DEG = 3.0
-"""Standard deviation of reported pitch and of roll that come without one, degrees: mounts lean by 1
-to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
+"""Mounts lean by 1 to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
 RADIUS_SHARE = 0.025
-"""Least radius of the confidence over the height above ground: what an error of 1.4 deg of tilt
-makes."""
+"""Least radius of the confidence over the height: an error of 1.4 deg of tilt."""
 
 MAP_STD_M = 3.0
-"""Standard deviation, per axis, of a displacement of the map as a whole: it never averages out."""
+"""Per axis, of a displacement of the map as a whole: it never averages out."""
 
 Evidence = Mapping[str, float]
 """Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
@@ -236,7 +231,6 @@ class Fix:
 
 
 def _finite(value: float | None) -> float:
-    """The value; 0 where it is unknown."""
     return value if value is not None and math.isfinite(value) else 0.0
 
 

@@ -7,20 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLOCK_ROWS = 1024
-"""Embeddings decoded at once: half a megabyte at 128 numbers, which stays in the cache."""
+"""Decoded at once: half a megabyte at 128 numbers, which stays in the cache."""
 CACHE_BYTES = 128 * 2**20
-"""Decoded embeddings kept in memory: 260,000 tiles of 128 numbers."""
+"""Decoded embeddings kept: 260,000 tiles of 128 numbers."""
 _CONVERT_FP16 = getattr(cv2, "convertFp16", None)  # OpenCV 4, where cv2.add knows no float16
 _ZERO = np.zeros(1, dtype=np.float16)
 
 
 class ExactIndex:
-    """Scalar products of queries with stored embeddings (N, D) float16.
+    """Scalar products with stored embeddings (N, D) float16.
 
-    Storage stays as it is (a memory-mapped file, say). Up to `cache_bytes` of it are kept decoded
-    to float32 after first use; a larger map is decoded block by block at every search, so memory
-    stays bounded whatever the size of the map.
-    """
+    Up to `cache_bytes` are kept decoded to float32; larger maps are decoded at every search."""
 
     def __init__(self, embeddings: NDArray[np.float16], cache_bytes: int = CACHE_BYTES) -> None:
         if embeddings.ndim != 2 or embeddings.dtype != np.float16:
@@ -37,7 +34,7 @@ class ExactIndex:
     def scores(
         self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
     ) -> NDArray[np.float32]:
-        """Scalar products (N, Q) of queries (Q, D) with all embeddings, or with `rows` of them."""
+        """(N, Q) of queries (Q, D), with `rows` or all."""
         columns = np.ascontiguousarray(queries.T, dtype=np.float32)
         out = np.empty((self._count(rows), columns.shape[1]), dtype=np.float32)
         for part, block in self._blocks(rows):
@@ -47,10 +44,8 @@ class ExactIndex:
     def best(
         self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
     ) -> NDArray[np.float32]:
-        """Highest scalar product (N,) of each embedding, or each of `rows`, with any query (Q, D).
-
-        Memory does not grow with N times Q. Raises `ValueError` if there is no query.
-        """
+        """Highest (N,) of any query (Q, D), without memory of N times Q. Raises `ValueError` for
+        none."""
         if len(queries) == 0:
             raise ValueError("at least one query is needed, got none")
         columns = np.ascontiguousarray(queries.T, dtype=np.float32)
@@ -66,7 +61,6 @@ class ExactIndex:
         return len(self._stored) if rows is None else len(rows)
 
     def _blocks(self, rows: NDArray[np.intp] | None) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-        """Embeddings decoded to float32, `BLOCK_ROWS` at a time, and which part of all they are."""
         if self._may_cache and self._decoded is None:
             self._decoded = self._stored.astype(np.float32)
         source = self._stored if self._decoded is None else self._decoded
@@ -77,7 +71,7 @@ class ExactIndex:
 
 
 def _float32(block: NDArray[np.float16] | NDArray[np.float32]) -> NDArray[np.float32]:
-    """float32 of float16; OpenCV's conversions are several times as fast as NumPy's."""
+    """OpenCV's conversions are several times as fast as NumPy's."""
     if block.dtype == np.float32:
         return np.asarray(block, dtype=np.float32)
     halves = np.ascontiguousarray(block, dtype=np.float16)
@@ -90,6 +84,5 @@ def _float32(block: NDArray[np.float16] | NDArray[np.float32]) -> NDArray[np.flo
 def rows_within(
     centres_en_m: NDArray[np.float32], centre_en_m: NDArray[np.float64], radius_m: float
 ) -> NDArray[np.intp]:
-    """Rows of tiles whose centres (N, 2) lie within `radius_m` of a point: the prior's gate."""
     offset = centres_en_m - np.asarray(centre_en_m, dtype=np.float32)
     return np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= radius_m**2)

@@ -1,10 +1,7 @@
 """Oriented gradients as circular harmonics of the edge direction.
 
-A pixel with gradient magnitude m and direction t contributes m * exp(2ik t), k = 0..3:
-the Fourier series of a histogram of unsigned orientations (the contrast of an edge may flip between
-seasons, its orientation does not). Sums of these seven numbers over a cell are equivalent to an
-orientation histogram with soft bins, without binning.
-"""
+A pixel with gradient magnitude m and direction t contributes m * exp(2ik t), k = 0..3: the Fourier
+series of a histogram of unsigned orientations with soft bins."""
 
 from dataclasses import dataclass
 
@@ -15,21 +12,17 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 
 HARMONICS = 3
-"""Chosen on aerial imagery of two dates, see docs/decisions/embedding.md."""
+"""Chosen on imagery of two dates (docs/decisions/embedding.md)."""
 BINS = 8
-"""Bins of the equivalent histogram; its triangular bins set the weights of the harmonics."""
+"""Of the equivalent histogram; its triangular bins set the weights of the harmonics."""
 # A triangular bin of an orientation histogram passes harmonic k with the weight sinc(k / bins)^2.
 _SHARES = [np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2) for k in range(1, HARMONICS + 1)]
 
 
 @dataclass(frozen=True)
 class OrientedGradients:
-    """Harmonics 0 to 3 of the unsigned edge direction, (7, H, W).
-
-    Channel 0 is the magnitude, channels 2k-1 and 2k real and imaginary part of harmonic k,
-    weighted as in a histogram of eight triangular bins. `sigma_px` is the Gaussian before the
-    gradient.
-    """
+    """(7, H, W): magnitude, then real and imaginary part of harmonics 1 to 3, in grey levels per
+    pixel."""
 
     sigma_px: float = 1.5
 
@@ -41,16 +34,13 @@ class OrientedGradients:
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return 1 + 2 * HARMONICS
 
     @property
     def margin_px(self) -> int:
-        """Radius of influence of a pixel on the representation."""
         return int(np.ceil(4 * self.sigma_px)) + 1  # OpenCV's kernel of 4 sigma, then Scharr
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Orientation harmonics (7, H, W), in grey levels per pixel."""
         smooth = cv2.GaussianBlur(
             np.asarray(grey, dtype=np.float32), (0, 0), self.sigma_px
         ).reshape(grey.shape)
@@ -77,10 +67,8 @@ class OrientedGradients:
 def _fill_harmonics(
     out: NDArray[np.float32], cos: NDArray[np.float32], sin: NDArray[np.float32]
 ) -> None:
-    """Fill channels 1 on of `out` from channel 0 and the doubled direction's cosine and sine.
-
-    In place, each harmonic from the one before: fresh arrays would cost more than the arithmetic.
-    """
+    """In place, each harmonic from the one before: fresh arrays would cost more than the
+    arithmetic."""
     product = np.empty_like(cos)
     np.multiply(out[0], cos, out=out[1])
     np.multiply(out[0], sin, out=out[2])

@@ -1,7 +1,6 @@
 """Image representations that are compared: grey levels, edges or gradients.
 
-Every variant is called as `variant(grey, valid)` with `grey` (H, W) uint8 and `valid` (H, W) bool
-and returns float32 `(C, H, W)`, zero where not valid; its inputs stay unchanged.
+`variant(grey, valid)` with (H, W) uint8 and bool gives float32 `(C, H, W)`, zero where not valid.
 """
 
 from dataclasses import dataclass
@@ -25,30 +24,26 @@ TABLE = {
 
 @dataclass(frozen=True)
 class Gray:
-    """Grey levels scaled to 0..1, (1, H, W): the baseline of Di Piazza et al. 2024."""
+    """0..1, (1, H, W): the baseline of Di Piazza et al. 2024."""
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return 1
 
     @property
     def margin_px(self) -> int:
-        """Radius of influence of a pixel on the representation."""
         return 0
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Grey levels (1, H, W) in 0..1."""
         return np.where(valid, grey, 0).astype(np.float32)[None] / np.float32(255)
 
 
 @dataclass(frozen=True)
 class Canny:
-    """Binary edges of the Canny detector, by default as in Di Piazza et al. 2024, section 4.
+    """Binary edges, by default as in Di Piazza et al. 2024, section 4.
 
-    `low` and `high` are the hysteresis thresholds on the Sobel gradient (L1 norm, 8-bit grey),
-    `kernel` the Sobel aperture (3, 5 or 7).
-    """
+    `low`, `high`: hysteresis on the Sobel gradient (L1 norm, 8-bit grey), `kernel`: aperture (3, 5,
+    7)."""
 
     low: float = 100.0
     high: float = 200.0
@@ -62,16 +57,15 @@ class Canny:
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return 1
 
     @property
     def margin_px(self) -> int:
-        """Radius of influence of a pixel on the representation, without hysteresis."""
+        """Without hysteresis."""
         return self.kernel // 2 + 2
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Edges (1, H, W), 1 on an edge, else 0; none along the border of `valid`."""
+        """None along the border of `valid`."""
         edges = cv2.Canny(np.ascontiguousarray(grey), self.low, self.high, apertureSize=self.kernel)
         if not valid.all():
             reach = self.kernel + 2

@@ -11,33 +11,28 @@ from orthonav.core.track.model import HEADING, POSITION, STATE, VELOCITY, Array
 from orthonav.core.track.motion import Expected
 
 MAX_HYPOTHESES = 40
-"""More are dropped, the least likely first: the cost of a view grows with their number."""
+"""The least likely are dropped: the cost of a view grows with their number."""
 MIN_SHARE = 1e-7
-"""Less likely hypotheses are dropped."""
 MERGE_SIGMAS = 1.0
-"""Two hypotheses are merged where merging loses less (in nats, doubled) than this many standard
-deviations of distance, squared."""
+"""Merging loses less (in nats, doubled) than this distance in standard deviations, squared."""
 MINOR_OF_GROUP = 0.01
 """Share of a group of hypotheses below which one says nothing about the group."""
 NORTH_STEP_M = 100.0
-"""Length over which the convergence of two planes is measured."""
+"""Over which the convergence of two planes is measured."""
 COMPARED: Array = np.zeros((6, STATE))
-"""What decides whether two hypotheses are alike: position, velocity and the whole tilt."""
+"""Position, velocity and the whole tilt, by which hypotheses are compared."""
 COMPARED[range(6), [0, 1, 2, 3, 6, 7]] = COMPARED[[4, 5], [8, 9]] = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One hypothesis of the track.
+    """One hypothesis of the track, with probability `share`, `mean` (10,), `covariance` (10, 10).
 
-    `share`: its probability. `mean` (10,), `covariance` (10, 10): its state. `sighted`: new ground
-    that it recognized, in views. `number`: unique in the flight. `parent`: the number of the
-    hypothesis of the last view from which it was predicted, -1 where it was born now. `expected`:
-    that prediction, None where it was born now. `recognized`: probability, by the last view alone
-    and by how it agrees with the prediction, that this view showed the map here. `followed`:
-    whether it descends from a confirmed track or a reported position. `uncounted`: new ground, in
-    views, since the last view that counted towards `sighted`.
-    """
+    `sighted`: new ground that it recognized, in views; `uncounted`: since the last view that
+    counted. `number`: unique in the flight. `parent`, `expected`: that of the last view and its
+    prediction; -1, None where it was born now. `recognized`: probability, by the last view and its
+    agreement with the prediction, that it showed the map here. `followed`: from a confirmed track
+    or reported position."""
 
     share: float
     mean: Array
@@ -52,7 +47,7 @@ class Hypothesis:
 
 
 def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses, most likely first, with similar ones merged and the unlikely ones dropped."""
+    """Most likely first; similar ones merged, unlikely ones dropped."""
     likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
     left = likely or ordered[:1]  # the last one stays, however unlikely
     if not left:
@@ -84,10 +79,7 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
 
 
 def recognized(group: Sequence[Hypothesis]) -> float:
-    """Largest probability of having recognized the map in several hypotheses that are one place.
-
-    Only the `major` ones count.
-    """
+    """Largest probability of having recognized the map, by the `major` ones."""
     return max(each.recognized for each in major(group))
 
 
@@ -100,9 +92,8 @@ def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
 def _divergence(means: Array, covariances: Array) -> Array:
     """Kullback-Leibler divergence (nats) of each of several Gaussians from the first, (N,).
 
-    `means` (N, 6), `covariances` (N, 6, 6): of `COMPARED`. A well-known place must not
-    vanish in a wide hypothesis around it (docs/decisions/tracking.md).
-    """
+    `means` (N, 6), `covariances` (N, 6, 6): of `COMPARED`. A well-known place must not vanish in a
+    wide hypothesis around it (docs/decisions/tracking.md)."""
     inverse = np.linalg.inv(covariances[0])
     off = means - means[0]
     turned = inverse @ covariances
@@ -113,7 +104,7 @@ def _divergence(means: Array, covariances: Array) -> Array:
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """Mean (10,) and covariance (10, 10) of hypotheses as one Gaussian; not to be changed."""
+    """As one Gaussian, (10,) and (10, 10); not to be changed."""
     if len(group) == 1:
         return group[0].mean, group[0].covariance
     shares = np.array([each.share for each in group])
@@ -126,7 +117,7 @@ def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
 
 
 def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
-    """A hypothesis of one plane in another one, which is turned by the convergence of north."""
+    """In another plane, turned by the convergence of north."""
     two = each.mean[POSITION] + np.array([[0.0, 0.0], [0.0, NORTH_STEP_M]])
     place, to_north = other.en_from_latlon(*plane.latlon_from_en(two))
     east, north = (to_north - place).tolist()
@@ -143,5 +134,4 @@ def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
 
 
 def distance(one: Hypothesis, other: Hypothesis) -> float:
-    """Metres between the positions of two hypotheses."""
     return math.dist(one.mean[POSITION], other.mean[POSITION])
