@@ -1,4 +1,4 @@
-"""Optional dependencies, by the extras in the metadata of the installed orthonav (pyproject.toml)."""
+"""Optional dependencies, by the extras in the metadata of the installed orthonav."""
 
 import importlib
 import platform

@@ -19,8 +19,7 @@ def no_progress(stage: str, share: float) -> None:
     pass
 
 
-_ALMOST_NONE = 2**20
-"""With less free space, bytes, a failed write is that of a full disk."""
+_ALMOST_NONE = 2**20  # with less free space, bytes, a failed write is that of a full disk
 
 
 @contextmanager

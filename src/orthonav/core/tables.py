@@ -4,10 +4,8 @@ import csv
 from collections.abc import Iterator
 from typing import IO
 
-MAX_LINE_CHARS = 65_536
-"""A thousand columns of the longest numbers."""
-MAX_ROWS = 5_000_000
-"""Seven hours at 200 Hz."""
+MAX_LINE_CHARS = 65_536  # A thousand columns of the longest numbers
+MAX_ROWS = 5_000_000  # seven hours at 200 Hz
 
 
 class TableError(ValueError):

@@ -37,7 +37,7 @@ def enu_from_gimbal_camera(yaw_pitch_roll_deg: ArrayLike) -> Array:
 
 
 def enu_from_body_camera(ned_from_frd: Array, mount_deg: Angles = LOOKS_DOWN) -> Array:
-    """`mount_deg`: yaw, pitch, roll in the body: 0, 0, 0 looks down, top forward; pitch 90 ahead."""
+    """`mount_deg`: yaw, pitch, roll in the body: 0 looks down, top forward; pitch 90 ahead."""
     return np.asarray(_ENU_FROM_NED @ ned_from_frd @ _frd_from_camera(mount_deg))
 
 
@@ -47,7 +47,7 @@ def enu_from_ros_camera(enu_from_flu: Array, mount_deg: Angles) -> Array:
 
 
 def ned_wxyz_from_ros(wxyz: ArrayLike) -> Array | None:
-    """The attitude (4,) w, x, y, z, FRD to NED, of ROS's FLU to ENU (REP 103); None if no rotation."""
+    """w, x, y, z (4,) from FRD to NED, of ROS's FLU to ENU (REP 103); None if no rotation."""
     rotations, _ = rotations_of_wxyz(np.asarray(wxyz, dtype=np.float64).reshape(1, 4))
     if not len(rotations):
         return None
@@ -62,7 +62,7 @@ def ros_xyzw_from_ned(ned_from_frd: Array) -> Array:
 
 
 def rotations_of_wxyz(wxyz: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Rotations of the valid quaternions (N, 4), and which are valid: not zeros or NaN ("unknown")."""
+    """Of the valid quaternions (N, 4), and which are valid: not zeros or NaN ("unknown")."""
     with np.errstate(invalid="ignore"):
         sound = np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 0.1
     if not sound.any():

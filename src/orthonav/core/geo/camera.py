@@ -25,8 +25,7 @@ from orthonav.core.errors import CameraError
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
-FOV_STD = 0.05
-"""Of the focal length by a stated field of view, relative."""
+FOV_STD = 0.05  # of the focal length by a stated field of view, relative
 _STEPS = 50
 _CLOSE = 1e-9
 _EXACT = 1e-14
@@ -206,7 +205,7 @@ def _rotation(axis: int, angle_rad: float) -> Array:
 
 
 def camera_from_en(yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float) -> Array:
-    """Homography (3, 3) from flat ground (east, north, 1), m from below the camera, to camera axes."""
+    """Homography (3, 3) to camera axes from flat ground (east, north, 1), m from below it."""
     ground = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -agl_m]])
     return np.asarray(enu_from_camera(yaw_deg, pitch_deg, roll_deg).T @ ground)
 
@@ -278,7 +277,7 @@ def footprint_en_m(
 def ground_en_m(
     camera: Camera, px: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> Array:
-    """Flat ground (N, 2), m from below the camera, at image points (N, 2); NaN where there is none."""
+    """Flat ground (N, 2), m from below the camera, at image points (N, 2); NaN above it."""
     return met_by_rays_en_m(camera_rays(camera, px), yaw_deg, pitch_deg, roll_deg, agl_m)
 
 

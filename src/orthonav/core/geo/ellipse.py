@@ -5,8 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-_ROUNDING = 1e-9
-"""Negative eigenvalues up to this share of the largest are rounding errors."""
+_ROUNDING = 1e-9  # negative eigenvalues up to this share of the largest are rounding errors
 
 
 def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:

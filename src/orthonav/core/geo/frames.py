@@ -17,8 +17,7 @@ from orthonav.core.geo.swapped import swapped_hint
 WGS84_A_M = 6378137.0
 WGS84_F = 1 / 298.257223563
 WGS84_E2 = WGS84_F * (2 - WGS84_F)
-MAX_SHEET_M = 50_000.0
-"""Largest extent of a sheet: accurate to millimetres."""
+MAX_SHEET_M = 50_000.0  # largest extent of a sheet: accurate to millimetres
 
 Array = NDArray[np.float64]
 
@@ -59,7 +58,7 @@ class LocalFrame:
         )
 
     def en_from_latlon(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
-        """Local `(..., 2)`; beyond `MAX_SHEET_M` errors grow with the cube (about 0.2 m at 300 km)."""
+        """Local `(..., 2)`; beyond `MAX_SHEET_M` errors grow with the cube (0.2 m at 300 km)."""
         lat = np.radians(np.asarray(lat_deg, dtype=np.float64))
         lon = np.radians(np.asarray(lon_deg, dtype=np.float64))
         enu = (_ecef(lat, lon) - self._origin_ecef) @ self._enu_from_ecef.T
@@ -111,7 +110,7 @@ class LocalFrame:
 
 
 def distances_m(from_latlon_deg: ArrayLike, to_latlon_deg: ArrayLike) -> Array:
-    """Distances (N,) between places (N, 2) in degrees: right to 1e-6 up to 300 km, to 0.5 % beyond."""
+    """(N,) between places (N, 2) in degrees: right to 1e-6 up to 300 km, to 0.5 % beyond."""
     start = np.radians(np.asarray(from_latlon_deg, dtype=np.float64).reshape(-1, 2))
     end = np.radians(np.asarray(to_latlon_deg, dtype=np.float64).reshape(-1, 2))
     chord = _ecef(end[:, 0], end[:, 1]) - _ecef(start[:, 0], start[:, 1])

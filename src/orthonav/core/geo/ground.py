@@ -21,7 +21,7 @@ _RINGS = 5
 
 @dataclass(frozen=True)
 class Ground:
-    """Ground around a position: heights above mean sea level, `known`: share above 0 that has one."""
+    """Heights above mean sea level around a position; `known`: share above 0 that has one."""
 
     height_m: float
     std_m: float

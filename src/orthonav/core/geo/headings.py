@@ -7,8 +7,7 @@ RADIANS = (
     "all headings are within -2 pi to 2 pi, as in radians; check the unit of the heading column"
 )
 _FEWEST = 4
-_VARIED = 2.0
-"""Headings in degrees that vary by less rarely lie around 0."""
+_VARIED = 2.0  # headings in degrees that vary by less rarely lie around 0
 
 
 def seem_radians(yaw_deg: Sequence[float]) -> bool:

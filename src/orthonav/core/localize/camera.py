@@ -23,23 +23,17 @@ from orthonav.core.register.window import Reference
 
 STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Of numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
-GROUND_STEP_M = 2.0
-"""Of a point along the ground: the noise of a terrain model over its slope."""
+GROUND_STEP_M = 2.0  # of a point along the ground: the noise of a terrain model over its slope
 BLURS_PX = (2.0, 1.0, 0.0, 0.0)
 """Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
-SHARP_PX = (0.7, 0.0)
-"""The same from a correction by `SAMPLE` blocks, or from one close by."""
+SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
 SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
 """Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC, Fischler 1981).
 """
-FINAL_STEPS = 2
-"""After the blocks' information was compared with the scatter of their slopes."""
-LONGEST_STEP_PX = 3.0
-"""Of any block, per step."""
-PIXELS_PER_NUMBER = 5.0
-"""Pixels per independent number; only the odds of outliers depend on it."""
-LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9
-"""Limits of the mean correlation of a right block."""
+FINAL_STEPS = 2  # after the blocks' information was compared with the scatter of their slopes
+LONGEST_STEP_PX = 3.0  # of any block, per step
+PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
+LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9  # limits of the mean correlation of a right block
 CORRELATED, CORRELATED_PX = 2.0, 60.0
 """Errors of levels and dates correlate: least excess of the variance over the scatter of blocks,
 and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
@@ -293,10 +287,8 @@ def moved_by_camera(
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach of blocks, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide.
 """
-FITS = 3
-"""At most,"""
-SMALL_SHARE = 0.2
-"""until a correction is below this share of its standard deviations."""
+FITS = 3  # at most,
+SMALL_SHARE = 0.2  # until a correction is below this share of its standard deviations
 
 
 @dataclass(frozen=True, eq=False)

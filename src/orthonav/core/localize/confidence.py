@@ -23,20 +23,16 @@ FEATURES = (
     "log_alone_phase",
     "log_alone_gradients",
 )
-ALONE = 2
-"""The last two features say whether the view fits nowhere near as well."""
+ALONE = 2  # the last two features say whether the view fits nowhere near as well
 CHANCES = ("total", "look", "fine")
 CUT_SHORT = 0.89
 """Limit where `--budget-ms` ended the search before a place stood out. Below `CONFIDENT`."""
 USUAL_BIASES = -6.68, -8.0
 USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
 """Fitted to 1,734 views (docs/decisions/confidence.md)."""
-STAND_IN = 0.7
-"""Of the chance value: stands in for a rival where none was found."""
-LEAST_DEVIATIONS = 1.0
-"""Least height above the ground nearby that counts, in standard deviations."""
-USUAL_DETAIL = 1.4
-"""For views too small to be finished one level finer."""
+STAND_IN = 0.7  # of the chance value: stands in for a rival where none was found
+LEAST_DEVIATIONS = 1.0  # least height above the ground nearby that counts, in standard deviations
+USUAL_DETAIL = 1.4  # for views too small to be finished one level finer
 
 
 @dataclass(frozen=True)
@@ -146,10 +142,8 @@ USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)
 
 
 TILE_FEATURES = ("score", "margin")
-USUAL_SHIFT = 0.42
-"""Of the bias from map to map, under `USUAL_TILES`."""
-LIMIT = 60.0
-"""Beyond, the probability is 0 or 1 in floating point."""
+USUAL_SHIFT = 0.42  # of the bias from map to map, under `USUAL_TILES`
+LIMIT = 60.0  # Beyond, the probability is 0 or 1 in floating point
 
 
 @dataclass(frozen=True)

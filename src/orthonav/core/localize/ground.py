@@ -28,12 +28,9 @@ from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import GreyPyramid, Reference
 
-MAP_NODES = 256
-"""Of expected scales across the map, at most."""
-SLOPE_M = 10.0
-"""Half the base over which slopes are measured."""
-LARGEST_STD = 0.3
-"""Of scales searched: three are 0.41 to 2.46."""
+MAP_NODES = 256  # of expected scales across the map, at most
+SLOPE_M = 10.0  # half the base over which slopes are measured
+LARGEST_STD = 0.3  # of scales searched: three are 0.41 to 2.46
 Array = NDArray[np.float64]
 
 
@@ -124,12 +121,9 @@ class Relief:
         return self._means[key]
 
 
-REFERENCE_NODES = 9
-"""Across a window, for its mean height."""
-MIN_KNOWN = 0.5
-"""Windows of which less is known are registered on level ground."""
-LEVEL_PX = 0.2
-"""Relief that displaces less (pixels of the final level) is left out."""
+REFERENCE_NODES = 9  # across a window, for its mean height
+MIN_KNOWN = 0.5  # windows of which less is known are registered on level ground
+LEVEL_PX = 0.2  # relief that displaces less (pixels of the final level) is left out
 
 
 class SearchedSheet:
@@ -184,7 +178,7 @@ class ViewOverGround:
     def templates_at(
         self, pose: Pose, level: int, orientation: Orientation | None = None
     ) -> ViewTemplates | None:
-        """The view orthorectified under a pose; None where less than half of the window is known."""
+        """The view orthorectified under a pose; None where less than half of it is known."""
         orientation = orientation or self.orientation(pose)
         if orientation is None:
             return None

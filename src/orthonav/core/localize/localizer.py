@@ -31,8 +31,7 @@ from orthonav.core.tiles.position import PositionRule
 ERROR_VARIANCE = 1.5
 """Errors over their covariance: their tails are heavier than a Gaussian's
 (docs/decisions/camera.md)."""
-WIDEST_M = 2e7
-"""Half the Earth's circumference."""
+WIDEST_M = 2e7  # half the Earth's circumference
 
 
 class Localizer:

@@ -29,12 +29,11 @@ from orthonav.core.register.search import bank
 
 Direction = tuple[float, float]
 """Heading (rad, clockwise from north) and natural logarithm of the scale."""
-Steps = tuple[float, float]
-"""Of headings (rad) and log scales."""
+Steps = tuple[float, float]  # of headings (rad) and log scales
 
 
 class ClearMargin(NamedTuple):
-    """How far a place must stand out: score over chance (`strength`) and over the strongest rival."""
+    """How far a place must stand out: over chance (`strength`) and over the strongest rival."""
 
     strength: float
     judged_ratio: float
@@ -50,47 +49,36 @@ CLEAR_AFTER_TRIAL = ClearMargin(1.8, 1.25, 1.25)
 class SearchPolicy:
     coarse_steps: Steps = (math.radians(8.0), 0.13)
     """Of tiles too, whose candidates are refined at the coarse level."""
-    judged_steps: Steps = (math.radians(6.0), 0.09)
-    """8 deg lose 2 to 6 points of views."""
+    judged_steps: Steps = (math.radians(6.0), 0.09)  # 8 deg lose 2 to 6 points of views
     final_steps: Steps = (math.radians(3.0), 0.045)
-    bank_sigmas: float = 3.0
-    """Reach in standard deviations of the telemetry."""
+    bank_sigmas: float = 3.0  # reach in standard deviations of the telemetry
     max_nats: float = 5.5
     """Less likely directions (negative log density) are not tried: corners of the bank."""
     stages_nats: tuple[float, ...] = (-1.0, 0.4, 2.0, math.inf)
     """Bounds of the stages at the judged level."""
     likely_nats: float = 1.0
     """With an unknown heading these come first: the scales of nine views in ten."""
-    candidates: int = 24
-    """Of the coarse level, and of one stage at the judged one."""
-    far_candidates: int = 400
-    """One level above the coarse one,"""
-    far_reach_px: float = 1.5
-    """whose places are sought within so many pixels of that level."""
-    final_candidates: int = 2
-    """Each is finished."""
-    tile_candidates: tuple[int, int] = (20, 400)
-    """Least and largest number,"""
+    candidates: int = 24  # of the coarse level, and of one stage at the judged one
+    far_candidates: int = 400  # one level above the coarse one,
+    far_reach_px: float = 1.5  # whose places are sought within so many pixels of that level
+    final_candidates: int = 2  # each is finished
+    tile_candidates: tuple[int, int] = (20, 400)  # least and largest number,
     tiles_per_candidate: int = 200
     """between them one for so many: the right one ranks lower among more."""
     tile_share_per_nat: float = 0.03
     """Share of its similarity that a tile loses per nat against the telemetry."""
-    tile_reach_strides: float = 1.1
-    """Reach of the place near a tile."""
+    tile_reach_strides: float = 1.1  # reach of the place near a tile
     nearby_log_scales: tuple[float, ...] = (-0.13, 0.0, 0.13)
     """Added to the log scale of candidates from tiles and above the coarse level, hardly known."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Side of a view, in tiles, for which tiles are asked."""
-    min_candidates: int = 6
-    """Always kept, for the scores need rivals."""
-    candidate_share: float = 0.5
-    """Weaker candidates than this share of the best are dropped."""
+    min_candidates: int = 6  # always kept, for the scores need rivals
+    candidate_share: float = 0.5  # weaker candidates than this share of the best are dropped
     clear: ClearMargin = CLEAR
     """Ends the search. Views of other places reach a ratio of 1.4, rarely 1.6."""
     clear_at_judged: ClearMargin = CLEAR_AT_JUDGED
     """The same once the judged level was searched in part; and after tiles, if confident too."""
-    doubt: float = 0.01
-    """A place with a confidence above one minus this is proven,"""
+    doubt: float = 0.01  # A place with a confidence above one minus this is proven,
     trial_doubt: float = 0.002
     """in a trial, whose rivals were not all searched, above one minus this."""
     trial_clear: ClearMargin = CLEAR_AFTER_TRIAL
@@ -99,10 +87,8 @@ class SearchPolicy:
     """Best candidates finished before a search that costs more than a trial; proven ones end it."""
     finer: tuple[tuple[int, float], ...] = ((3, 25.0), (48, 90.0))
     """Candidates finished and compared one level finer until one is proven, and the cost (ms)."""
-    terrain_candidates: int = 48
-    """Placed on the terrain, at most."""
-    cheap_ms: float = 14.0
-    """Up to this cost the judged level is searched at once, and nothing else."""
+    terrain_candidates: int = 48  # placed on the terrain, at most
+    cheap_ms: float = 14.0  # up to this cost the judged level is searched at once, and nothing else
     last_ms: float = 900.0
     """A second search is left out above: about a second for a view on a large area (README)."""
     last_stage_ms: float = 60.0
@@ -146,24 +132,17 @@ def _likely_directions(
 
 @dataclass(frozen=True)
 class CostModel:
-    """Rough costs on one core of a desktop, only to choose between searches, and a limit of memory."""
+    """Rough costs on one core of a desktop, to choose between searches; a limit of memory."""
 
     fft_pose_ms: float = 0.01
-    fft_pixel_ms: float = 2.2e-7
-    """Times the logarithm (base 2) of their number."""
-    max_search_px: int = 8_000_000
-    """Larger windows (some 300 MB) are left to tiles or a prior."""
-    tile_view_ms: float = 4.0
-    """Of representing a view."""
-    tile_pose_ms: float = 0.06
-    """Of embedding it under one pose."""
-    tile_score_ms: float = 5e-8
-    """Of one number of one embedding under one pose."""
-    nearby_ms: float = 0.2
-    """Of one candidate from tiles or from above the coarse level."""
+    fft_pixel_ms: float = 2.2e-7  # times the logarithm (base 2) of their number
+    max_search_px: int = 8_000_000  # larger windows (some 300 MB) are left to tiles or a prior
+    tile_view_ms: float = 4.0  # of representing a view
+    tile_pose_ms: float = 0.06  # of embedding it under one pose
+    tile_score_ms: float = 5e-8  # of one number of one embedding under one pose
+    nearby_ms: float = 0.2  # of one candidate from tiles or from above the coarse level
     trial_ms: float = 25.0
-    terrain_trial_ms: float = 60.0
-    """On level ground and on a terrain."""
+    terrain_trial_ms: float = 60.0  # on level ground and on a terrain
 
     def fft_ms(self, poses: int, rows: int, cols: int) -> float:
         """Infinite where the window is too large."""

@@ -26,10 +26,8 @@ NODE_PX = 4
 """Spacing of heights and projections: at most one and a half postings of a usual terrain."""
 MAX_COARSER = 3.0
 """Coarser ground, over the window's pixel and the view's finest ground, does not count."""
-SIGHT_STEPS = 48
-"""Of a line of sight, at most."""
-CLEAR_M = 0.5
-"""Error of interpolation."""
+SIGHT_STEPS = 48  # of a line of sight, at most
+CLEAR_M = 0.5  # error of interpolation
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -134,13 +132,10 @@ def _behind(nodes_m: Array, position_m: Array, sight: Array) -> Mask:
 
 
 MAX_REACH = 2.0
-MAX_NEAR_NADIR_DEG = 45.0
-"""Views farther off nadir are used in part."""
-NEAR_CELLS = 32
-"""Along both sides of a picture, to find how finely it sees the ground."""
+MAX_NEAR_NADIR_DEG = 45.0  # views farther off nadir are used in part
+NEAR_CELLS = 32  # along both sides of a picture, to find how finely it sees the ground
 EDGE_PX = 1e-6
-NODE_ERROR_PX = 0.02
-"""The lens is computed at every `NODE_PX` where that errs by no more."""
+NODE_ERROR_PX = 0.02  # the lens is computed at every `NODE_PX` where that errs by no more
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,10 +29,9 @@ from orthonav.core.register.search import (
     largest_half_px,
     search,
 )
-from orthonav.core.tiles.exact import rows_within
+from orthonav.core.tiles.position import rows_within
 
-SAME_PLACE_SHARE = 1 / 8
-"""Closer candidates from tiles are one place."""
+SAME_PLACE_SHARE = 1 / 8  # closer candidates from tiles are one place
 WHOLE_WINDOW_PX = 8_000_000
 """Up to so many pixels of the coarse level one window of the whole sheet is cut (12 bytes each)."""
 

@@ -22,13 +22,18 @@ from orthonav.core.register.search import Peak
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import Representation, embed_poses
 from orthonav.core.tiles.embed import ViewEmbedder, embedder_of
-from orthonav.core.tiles.exact import ExactIndex, rows_within
-from orthonav.core.tiles.position import PositionRule, TileNeighbours, offset_en_m, parabola_peak
+from orthonav.core.tiles.position import (
+    ExactIndex,
+    PositionRule,
+    TileNeighbours,
+    offset_en_m,
+    parabola_peak,
+    rows_within,
+)
 from orthonav.core.tiles.whitened import WhitenedEmbedder
 from orthonav.core.variants import variant_from_recipe
 
-MAX_RATIO = 10.0
-"""A rival at or below zero leaves the best without any."""
+MAX_RATIO = 10.0  # A rival at or below zero leaves the best without any
 
 
 def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
@@ -70,13 +75,12 @@ def _ratio(best: float, second: float) -> float:
     return min(MAX_RATIO, best / second) if second > 0 else MAX_RATIO
 
 
-BACKGROUND_TILES = 20_000
-"""Of the whole map, evenly spread, for rivals; a narrow prior stays fast."""
+BACKGROUND_TILES = 20_000  # of the whole map, evenly spread, for rivals; a narrow prior stays fast
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """The best tile (row) for one view, offset from its centre, index of the heading, and evidence."""
+    """The best tile (row) for a view, offset from its centre, heading index, and evidence."""
 
     tile: int
     shift_en_m: tuple[float, float]

@@ -31,8 +31,7 @@ MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
 MIN_VIEW_PX = 24.0
 """Of the map: a sixth of the size that views are finished at (docs/decisions/registration.md)."""
-MIN_TILT_COS = 0.5
-"""Beyond 60 deg the footprint is cut off, not expected to grow."""
+MIN_TILT_COS = 0.5  # beyond 60 deg the footprint is cut off, not expected to grow
 MAX_COARSER = 4.0
 DARK_LEVEL = 16.0
 BRIGHT_LEVEL = 250.0
@@ -138,8 +137,7 @@ def _is_uniform(view: RectifiedView) -> bool:
     return float(std[0, 0]) < MIN_STD / 2
 
 
-MIN_AGL_STD = 0.03
-"""Of the log scale searched, whatever is reported."""
+MIN_AGL_STD = 0.03  # of the log scale searched, whatever is reported
 MAX_AGL_STD = 0.15
 """Three are 0.64 to 1.57, as far as chance was measured alike (docs/decisions/registration.md)."""
 NEAR_SHARE = 0.6

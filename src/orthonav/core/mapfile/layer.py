@@ -12,21 +12,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
 from orthonav.core.mapfile.manifest import GreyInfo
-from orthonav.core.mapfile.reader import Blobs, MapFile
+from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
-CACHE_BYTES = 64 * 2**20
-"""64 km2 at 1 m without masks."""
+CACHE_BYTES = 64 * 2**20  # 64 km2 at 1 m without masks
 MAX_PREVIEW_PX = 384
 MAX_CHUNK_BYTES_PER_PX = 4
 _CHUNK_HEADER_BYTES = 4096
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
-_START_OF_FRAME = 0xC0
-"""Baseline JPEG: decoding takes one pass over the pixels."""
-_BEFORE_FRAME = (0xE0, 0xDB, 0xC4)
-"""APP0, quantization tables, Huffman tables."""
+_START_OF_FRAME = 0xC0  # Baseline JPEG: decoding takes one pass over the pixels
+_BEFORE_FRAME = (0xE0, 0xDB, 0xC4)  # APP0, quantization tables, Huffman tables
 _DECODE = int(cv2.IMREAD_GRAYSCALE) | int(cv2.IMREAD_IGNORE_ORIENTATION)
 
 Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
@@ -129,7 +125,7 @@ class GreyLayer:
         return grey, valid
 
     def jpeg(self, level: int, chunk_row: int, chunk_col: int) -> bytes | None:
-        """The stored JPEG of a chunk, checked; None unless all of it is valid. Raises `IndexError`."""
+        """The JPEG of a chunk, checked; None unless all of it is valid. Raises `IndexError`."""
         rows, cols = self.shape(level)
         side = self._table.chunk_px
         if not (0 <= chunk_row * side < rows and 0 <= chunk_col * side < cols):

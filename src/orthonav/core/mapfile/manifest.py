@@ -21,12 +21,10 @@ MAX_TOP_PX = 8192
 """Of the coarsest level, read as a whole: ten levels of the largest sheet at 5 cm. Usually 64."""
 CODEC = "jpeg"
 TERRAIN_CODEC = "delta-zlib"
-MAX_CODE = 65_535
-"""Of heights above the lowest one of a layer."""
+MAX_CODE = 65_535  # of heights above the lowest one of a layer
 MAX_POSTING_M = 1000.0
 MAX_NAME = 200
-MAX_DIGITS = 20
-"""More than any number needs, few enough for a float."""
+MAX_DIGITS = 20  # more than any number needs, few enough for a float
 MIN_HEADING_STEP_DEG = 0.5
 """Finer than any method needs; every heading tried takes an image in memory."""
 

@@ -8,11 +8,13 @@ import hashlib
 import json
 import os
 import re
+import threading
 import weakref
-from collections.abc import Iterator, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, Generic, TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +26,7 @@ from orthonav.core.mapfile.writer import METADATA_KEY
 
 MAX_HEADER_BYTES = 16 * 2**20
 MIN_FILE_BYTES = 10
-BLOCK_BYTES = 16 * 2**10
-"""Unit of verification of ranges, about one chunk (docs/map-format.md)."""
+BLOCK_BYTES = 16 * 2**10  # unit of verification of ranges, about one chunk (docs/map-format.md)
 _BLOCK_DIGEST_BYTES = 16
 _PIECE_BYTES = 64 * BLOCK_BYTES
 _IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|terrain/)bytes")
@@ -359,3 +360,33 @@ def _block_digests(data: bytes) -> bytes:
         hashlib.blake2b(view[at : at + BLOCK_BYTES], digest_size=_BLOCK_DIGEST_BYTES).digest()
         for at in range(0, len(data), BLOCK_BYTES)
     )
+
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+class ByteCache(Generic[Key, Value]):
+    """The values used last, of at most `limit_bytes` in all by `size_of`; threads may share it."""
+
+    def __init__(self, limit_bytes: int, size_of: Callable[[Value], int]) -> None:
+        self._limit_bytes, self._size_of = limit_bytes, size_of
+        self._values: OrderedDict[Key, Value] = OrderedDict()
+        self._lock = threading.Lock()
+        self.held_bytes = 0
+
+    def get(self, key: Key) -> Value | None:
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+            return self._values.get(key)
+
+    def put(self, key: Key, value: Value) -> None:
+        """Hold a value unless the key is held; a value larger than the limit empties the cache."""
+        with self._lock:
+            if key in self._values:
+                return
+            self._values[key] = value
+            self.held_bytes += self._size_of(value)
+            while self.held_bytes > self._limit_bytes:
+                self.held_bytes -= self._size_of(self._values.popitem(last=False)[1])

@@ -17,8 +17,7 @@ from orthonav.core.mapfile.reader import MapFile
 
 MAX_PX = 4096
 OUTLINE_PX = 1024
-_FINER = 4
-"""Outlines run through the middles of pixels, which are made so many times finer."""
+_FINER = 4  # outlines run through the middles of pixels, which are made so many times finer
 Grey = NDArray[np.uint8]
 
 

@@ -40,8 +40,7 @@ ALGORITHM = "ed25519"
 MAX_SIGNATURE_BYTES = 4096
 MAX_KEY_BYTES = 4096
 PRIVATE_NAME, PUBLIC_NAME = "private.pem", "public.pem"
-MAX_SERIAL = 2**53 - 1
-"""Largest integer that every JSON reader keeps exact."""
+MAX_SERIAL = 2**53 - 1  # largest integer that every JSON reader keeps exact
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 

@@ -5,16 +5,14 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import bilinear
 from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
-from orthonav.core.mapfile.reader import Blobs, MapFile
+from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
-CACHE_BYTES = 16 * 2**20
-"""400 km2 at 10 m."""
+CACHE_BYTES = 16 * 2**20  # 400 km2 at 10 m
 _MAX_BYTES_PER_SAMPLE = 4
 _CHUNK_HEADER_BYTES = 1024
 Array = NDArray[np.float64]

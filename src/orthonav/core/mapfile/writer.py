@@ -20,7 +20,7 @@ METADATA_KEY = "orthonav"
 
 
 def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> Manifest:
-    """The manifest with its `parts` filled in. Raises `OutputError`; then nothing is left behind."""
+    """The manifest with its `parts` filled in. Raises `OutputError` and leaves nothing behind."""
     parts = {name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())}
     described = {
         name: {

@@ -17,8 +17,7 @@ from orthonav.core.register.window import MapWindow, Reference
 
 GREY_SHARE = 0.25
 """Grey over gradients: less than in the search, seasons mislead (docs/decisions/camera.md)."""
-MIN_SEEN = 0.4
-"""Blocks of which less is seen on valid map do not count."""
+MIN_SEEN = 0.4  # blocks of which less is seen on valid map do not count
 MIN_ENERGY = 0.1
 """Nor those below this share of the median energy: edges brought in would count too much."""
 Array = NDArray[np.float32]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
-CHANNELS = 4
-"""Cosine and sine of the doubled edge direction, grey, valid."""
+CHANNELS = 4  # cosine and sine of the doubled edge direction, grey, valid
 GROUPS = (slice(0, 2), slice(2, 3))
 
 

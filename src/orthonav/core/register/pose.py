@@ -59,12 +59,9 @@ def even_scale(log_scale: float) -> float:
     return math.exp(log_scale / 2)
 
 
-NAT_SCORE = 1.0
-"""Units of the score per nat of the prior (docs/decisions/registration.md)."""
-SIGMAS = 3.0
-"""Scales compared at a place, in standard deviations,"""
-HALF_STEP = 0.07
-"""and half a step of the bank farther."""
+NAT_SCORE = 1.0  # units of the score per nat of the prior (docs/decisions/registration.md)
+SIGMAS = 3.0  # scales compared at a place, in standard deviations,
+HALF_STEP = 0.07  # and half a step of the bank farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +114,7 @@ class PosePrior:
     def nats(
         self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
     ) -> float:
-        """Negative log density, 0 at its peak; of the likeliest `within` (rad, log scale) around."""
+        """Negative log density, 0 at its peak; the least `within` (rad, log scale) around."""
         parts = [(log_scale, self.log_scale_std, within[1])]
         if self.turn_rad is not None:
             off = math.remainder(turn_rad - self.turn_rad, 2 * math.pi)

@@ -28,23 +28,15 @@ from orthonav.core.register.window import (
 )
 
 Array = NDArray[np.float32]
-STEPS = 6
-"""At most. Values here without a source: by `python -m benchmarks.real_imagery`."""
-SLACK_PX = 6
-"""Two steps of `MAX_STEP_PX`."""
-SMALL_STEP_PX = 0.03
-"""Ends the refinement."""
-MAX_STEP_PX = 3.0
-"""The basin of convergence (docs/decisions/registration.md)."""
-DAMPING = 1e-3
-"""Relative (Levenberg and Marquardt)."""
-MIN_CORRELATION = 0.08
-"""Least in the gain, so that steps do not vanish."""
-WHOLE_OVERLAP = 0.97
-"""Above, the Gauss-Newton matrix of the whole view is used."""
+STEPS = 6  # At most. Values here without a source: by `python -m benchmarks.real_imagery`.
+SLACK_PX = 6  # two steps of `MAX_STEP_PX`
+SMALL_STEP_PX = 0.03  # ends the refinement
+MAX_STEP_PX = 3.0  # the basin of convergence (docs/decisions/registration.md)
+DAMPING = 1e-3  # relative (Levenberg and Marquardt)
+MIN_CORRELATION = 0.08  # least in the gain, so that steps do not vanish
+WHOLE_OVERLAP = 0.97  # Above, the Gauss-Newton matrix of the whole view is used
 BLOCK_SUMS = 7
-MIN_CURVATURE = 0.05
-"""Of a direction in the covariance, as a share of the Gauss-Newton matrix."""
+MIN_CURVATURE = 0.05  # of a direction in the covariance, as a share of the Gauss-Newton matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +269,7 @@ class Comparison:
 
 
 class _Pixels:
-    """`map` (3, H, W), `counts` (H, W): both valid, `residual`: gain * map - correlation^2 * view."""
+    """`map` (3, H, W), `counts` (H, W), `residual`: gain * map - correlation^2 * view."""
 
     def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
         planes, valid = sampled_planes(template, window, pose)

@@ -24,18 +24,14 @@ from orthonav.core.register.template import Template, energy_of, turn_planes
 from orthonav.core.register.window import Reference, cut, thread_memory
 
 Array = NDArray[np.float32]
-ENERGY_FLOOR = 0.3
-"""Of the typical energy, so that blank ground is not amplified."""
+ENERGY_FLOOR = 0.3  # of the typical energy, so that blank ground is not amplified
 
 
 POSES_AT_ONCE = 6
 PLACES_AT_ONCE = 50
-MAX_KEPT_WINDOWS = 4
-"""Of whole sheets in the cache."""
-WIDE = 8
-"""Columns or rows that the kernel transforms together."""
-LONGEST_PX = 32768
-"""Of a window that the kernel takes."""
+MAX_KEPT_WINDOWS = 4  # of whole sheets in the cache
+WIDE = 8  # columns or rows that the kernel transforms together
+LONGEST_PX = 32768  # of a window that the kernel takes
 
 
 def bank(

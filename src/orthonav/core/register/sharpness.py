@@ -23,11 +23,9 @@ REACH_SHARE, MIN_REACH_PX = 0.125, 8
 PEAK_SHARE = 0.06
 """Moves below this share of the view's side, or so many pixels, belong to the place itself."""
 MIN_PEAK_PX = 3.0
-NEAR_PX = 3.0
-"""The place itself is the best within so many pixels."""
+NEAR_PX = 3.0  # the place itself is the best within so many pixels
 MAX_RATIO = 10.0
-PHASE_FLOOR = 1e-3
-"""Share of the mean power below which frequencies count less."""
+PHASE_FLOOR = 1e-3  # share of the mean power below which frequencies count less
 
 
 class Sharpness(NamedTuple):

@@ -19,10 +19,8 @@ from orthonav.core.register.channels import (
 from orthonav.core.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
-JUDGED_PX = 72.0
-"""Across, at the judged level (docs/decisions/registration.md)."""
-BLOCKS = 6
-"""Along one side of a view, in which residuals are taken as one (see `refine`)."""
+JUDGED_PX = 72.0  # Across, at the judged level (docs/decisions/registration.md)
+BLOCKS = 6  # along one side of a view, in which residuals are taken as one (see `refine`)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,10 +29,8 @@ def thread_memory(name: str, size: int) -> NDArray[np.float32]:
 
 
 Array = NDArray[np.float32]
-LONGEST_PX = 32768
-"""That the kernel and OpenCV sample."""
-WHOLE_LEVEL_PX = 2_000_000
-"""Smaller levels are made ready whole, once (16 bytes each)."""
+LONGEST_PX = 32768  # that the kernel and OpenCV sample
+WHOLE_LEVEL_PX = 2_000_000  # smaller levels are made ready whole, once (16 bytes each)
 
 
 class GreyPyramid(Protocol):
@@ -108,8 +106,7 @@ def cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
     return out
 
 
-LARGEST_LOG_SCALE = 1.0
-"""Beyond, the map counts as missing: more than twice what is searched."""
+LARGEST_LOG_SCALE = 1.0  # Beyond, the map counts as missing: more than twice what is searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +166,7 @@ class MapWindow:
         return cos, -sin, column, sin, cos, row
 
 
-FULLY_VALID = 0.99
-"""A pixel counts where the sampled map is valid by more."""
+FULLY_VALID = 0.99  # A pixel counts where the sampled map is valid by more
 
 
 class Sums(NamedTuple):

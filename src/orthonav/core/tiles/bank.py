@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedEmbedder, WhitenedRecipe
 
-CHUNK_POSES = 64
-"""Few enough for the processor's cache."""
-_PLANES = 4
-"""Channels that OpenCV resamples at once."""
+CHUNK_POSES = 64  # few enough for the processor's cache
+_PLANES = 4  # channels that OpenCV resamples at once
 
 Array = NDArray[np.float32]
 Poses = NDArray[np.float64]

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError
 
-MICRO = 32
-"""Along one side of a tile."""
+MICRO = 32  # along one side of a tile
 
 
 @dataclass(frozen=True)

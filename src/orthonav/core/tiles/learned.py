@@ -21,8 +21,7 @@ from orthonav.core.files import require_file
 
 VARIABLE = "ORTHONAV_EDGES"
 PROBE_PX, LARGEST_MARGIN_PX = 96, 32
-LARGEST_BYTES = 64 << 20
-"""Larger networks are not meant for an aircraft."""
+LARGEST_BYTES = 64 << 20  # larger networks are not meant for an aircraft
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from orthonav.core.extras import needed
 SIMILARITIES = ("product", "cosine")
 PRECISIONS = ("float32", "float16", "int8")
 MININGS = ("hardest", "semihard")
-CHUNK_TILES = 16
-"""Enough to keep a core busy, few enough for a small machine's memory."""
+CHUNK_TILES = 16  # enough to keep a core busy, few enough for a small machine's memory
 OPERATORS = frozenset(
     [
         "Add",

@@ -21,19 +21,15 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 
-CHUNK_TILES = 512
-"""0.9 MB of features, which stays in the cache."""
-MAX_LEARNT_TILES = 20_000
-"""44 for each of 448 features."""
+CHUNK_TILES = 512  # 0.9 MB of features, which stays in the cache
+MAX_LEARNT_TILES = 20_000  # 44 for each of 448 features
 PART_NOISE = 2.0
 """Where cells are missing, over the smallest variance kept (docs/decisions/embedding.md)."""
-SOLVER_STEPS = 6
-"""Of conjugate gradients for the same, over many poses."""
+SOLVER_STEPS = 6  # of conjugate gradients for the same, over many poses
 SHARE_ROUNDING = 1e-3
 """A cell seen to this much less than the whole counts as whole: resampling rounds."""
 TINY = np.float32(1e-30)
-SPARSE_BYTES = 32 * 2**20
-"""Larger arrays of a sheet take memory only where they are written."""
+SPARSE_BYTES = 32 * 2**20  # larger arrays of a sheet take memory only where they are written
 Made = TypeVar("Made")
 Features = NDArray[np.float32]
 Work = Callable[[Features, Features], Made]
@@ -98,7 +94,7 @@ class CellSheet:
     def micro_cells(
         self, samples: NDArray[np.float32], tiles_px: NDArray[np.intp]
     ) -> NDArray[np.float32]:
-        """Those of samples (h, w, C) that are a tile's (N, MICRO, MICRO, C). Raises `IndexError`."""
+        """Of samples (h, w, C) a tile's (N, MICRO, MICRO, C). Raises `IndexError`."""
         step = self.layout.step
         height, width = (size - (MICRO - 1) * step for size in samples.shape[:2])
         down, right, deep = samples.strides

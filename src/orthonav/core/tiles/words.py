@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 
-CHUNK_FEATURES = 4096
-"""16 MB for 1,024 words."""
-DIMS = {"sift": 128, "superpoint": 256}
-"""Numbers per descriptor."""
+CHUNK_FEATURES = 4096  # 16 MB for 1,024 words
+DIMS = {"sift": 128, "superpoint": 256}  # numbers per descriptor
 
 Grey = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -21,17 +21,12 @@ from orthonav.core.track.model import (
 
 TRUSTED = (0.1, 0.5)
 """Views with less probability of their own do not count, above the second fully."""
-MOST_OF_ONE = 0.75
-"""Of a single view: less than `CONFIRMED`."""
+MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
-SEARCHED_SIGMAS = 6.0
-"""Width of the search over heading and scale, from end to end."""
-MAX_LOG_ODDS = 7.0
-"""Of a single view."""
-WORTH_LOG_ODDS = -12.0
-"""Less likely places are left out."""
-LEAST_PLACE = 1e-12
-"""Least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds."""
+SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
+MAX_LOG_ODDS = 7.0  # of a single view
+WORTH_LOG_ODDS = -12.0  # less likely places are left out
+LEAST_PLACE = 1e-12  # least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds
 
 
 def places_of(
@@ -119,7 +114,7 @@ def measurement(
 def updated(
     mean: Array, covariance: Array, innovation: Array, spread: Array
 ) -> tuple[Array, Array]:
-    """Kalman update (.., 10), (.., 10, 10) by an innovation (.., 6) and its covariance (.., 6, 6)."""
+    """Kalman update (.., 10), (.., 10, 10) by an innovation (.., 6), covariance (.., 6, 6)."""
     gain = np.linalg.solve(spread, SEEN @ covariance).swapaxes(-1, -2)
     after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
     moved = mean + (gain @ innovation[..., None])[..., 0]

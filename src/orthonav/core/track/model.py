@@ -28,8 +28,7 @@ SEEN: Array = np.zeros((6, STATE))
 """What a sighting measures: position, heading, log scale, and the whole tilt."""
 SEEN[range(6), [0, 1, 4, 5, 6, 7]] = SEEN[[4, 5], [8, 9]] = 1.0
 SEEN.flags.writeable = False
-WHITE_SHARE = 0.2
-"""Share of the error of a reported tilt that is independent at every view."""
+WHITE_SHARE = 0.2  # share of the error of a reported tilt that is independent at every view
 
 
 @dataclass(frozen=True)
@@ -37,54 +36,37 @@ class Model:
     """Standard deviations and probabilities; those without a source are by the flights of
     docs/tracking.md."""
 
-    speed_mps: float = 30.0
-    """Of an unknown velocity, per axis."""
-    accel_mps2: float = 4.0
-    """While no velocity is reported, per axis."""
+    speed_mps: float = 30.0  # of an unknown velocity, per axis
+    accel_mps2: float = 4.0  # while no velocity is reported, per axis
     reported_velocity_s: float = 120.0
     """Correlation time of the error of a reported velocity (docs/decisions/tracking.md)."""
     coasting_walk: float = 1.3
     """Of its drift while views do not show the map, m/s per root of a second: 9 m after 5 s, 24 m
     after 10."""
-    heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)
-    """Of the constant error,"""
-    heading_noise_rad: float = math.radians(2.0)
-    """from view to view, without `yaw_std_deg`,"""
+    heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)  # of the constant error,
+    heading_noise_rad: float = math.radians(2.0)  # from view to view, without `yaw_std_deg`,
     heading_walk: float = math.radians(0.05)
     """and of the drift of the constant one, rad per root of a second."""
-    log_scale: float = DEFAULT_AGL_STD
-    """Of the constant error (height and focal length),"""
-    log_scale_noise: float = 0.02
-    """from view to view, without `agl_std_m`,"""
-    log_scale_walk: float = 5e-4
-    """and of the drift, per root of a second."""
-    tilt_rad: float = math.radians(0.5)
-    """Of a good mount, in pitch and roll; see `at_height`."""
-    off_tilt_rad: float = math.radians(6.0)
-    """Of a bad mount (docs/decisions/tracking.md),"""
-    off_mount: float = 0.03
-    """and its probability."""
+    log_scale: float = DEFAULT_AGL_STD  # of the constant error (height and focal length),
+    log_scale_noise: float = 0.02  # from view to view, without `agl_std_m`,
+    log_scale_walk: float = 5e-4  # and of the drift, per root of a second
+    tilt_rad: float = math.radians(0.5)  # of a good mount, in pitch and roll; see `at_height`
+    off_tilt_rad: float = math.radians(6.0)  # of a bad mount (docs/decisions/tracking.md),
+    off_mount: float = 0.03  # and its probability
     horizon_rad: float = math.radians(1.5)
     """Of the autopilot's horizon, in pitch and roll, without `tilt_std_deg`."""
-    horizon_s: float = 15.0
-    """Its correlation time: 10 to 30 s in real autopilots."""
-    tilt_walk: float = math.radians(0.01)
-    """Of the misalignment, rad per root of a second."""
-    sighting_noise_m: float = 2.0
-    """Of two dates beyond the covariance of a registration, per axis."""
-    map_m: float = MAP_STD_M
-    """Of the map as a whole, per axis: added to the covariance of a fix."""
+    horizon_s: float = 15.0  # its correlation time: 10 to 30 s in real autopilots
+    tilt_walk: float = math.radians(0.01)  # of the misalignment, rad per root of a second
+    sighting_noise_m: float = 2.0  # of two dates beyond the covariance of a registration, per axis
+    map_m: float = MAP_STD_M  # of the map as a whole, per axis: added to the covariance of a fix
     bias_jump: float = 0.01
     """Per view: a gimbal that moved (by `off_tilt_rad`), a compass that was reset."""
     odometry_outlier: float = 0.01
     """A displacement that fits well and is wrong: clouds, fields that repeat
     (docs/decisions/tracking.md)."""
-    turn: float = 0.03
-    """Per second: the velocity changes by more than `accel_mps2` allows."""
-    miss: float = 0.5
-    """A view of ground on the map cannot be found on it."""
-    wide_m: float = 50.0
-    """Per axis: less certain positions are confirmed again after a while."""
+    turn: float = 0.03  # per second: the velocity changes by more than `accel_mps2` allows
+    miss: float = 0.5  # A view of ground on the map cannot be found on it
+    wide_m: float = 50.0  # per axis: less certain positions are confirmed again after a while
     most_agreement: float = 25.0
     """Largest factor on the odds by agreement: a view below 1 % by itself does not show the map."""
     lost: float = 3e-3
@@ -106,7 +88,7 @@ class Model:
 
     @property
     def telemetry_noise(self) -> Array:
-        """Variances (3,) of heading (rad), log scale from view to view, and of the horizon (rad)."""
+        """Variances (3,) of heading (rad), log scale from view to view, horizon (rad)."""
         return np.square([self.heading_noise_rad, self.log_scale_noise, self.horizon_rad])
 
     def drift(self, seconds: float) -> Array:

@@ -22,12 +22,10 @@ from orthonav.core.track import CameraDisplacement
 VIEW_PX = 160
 """Across: half the resolution of a fix. Values without a source: by the flights of
 docs/tracking.md."""
-LEVELS = 3
-"""Of a view that serves as the map of the next one."""
+LEVELS = 3  # of a view that serves as the map of the next one
 TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
 """Of the search from a coarse level: about that of `policy.SearchPolicy`."""
-MAX_SPEED_MPS = 80.0
-"""For which a displacement is sought."""
+MAX_SPEED_MPS = 80.0  # for which a displacement is sought
 MIN_SCORE_RATIO = 2.5
 """Over the strongest rival: right ones have at least 4 on Arroio and generated land, wrong ones
 1.7."""
@@ -35,8 +33,7 @@ MIN_CORRELATION = 0.4
 """Right ones have at least 0.56, wrong ones at most 0.11 (docs/decisions/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
 """An expected displacement that fits this well ends the search (docs/decisions/tracking.md)."""
-NOISE_PX, NOISE_SHARE = 0.4, 0.01
-"""Per axis: in pixels, and as a share of its length."""
+NOISE_PX, NOISE_SHARE = 0.4, 0.01  # per axis: in pixels, and as a share of its length
 CANDIDATES = 8
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
 """Of the expected displacement at each level: most steps, and the step that ends it."""
@@ -44,12 +41,10 @@ TILT_SHARE = 0.6
 """Left of an independent error of the tilt in a sum: the next displacement cancels most of it."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 """Changes of heading, log scale, pitch, roll up to which a view is not rectified again."""
-LEVER_STEP_DEG = 0.05
-"""Of numerical derivatives by pitch and roll."""
+LEVER_STEP_DEG = 0.05  # of numerical derivatives by pitch and roll
 UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
 """Of ground without a known slope, and the share of it that a terrain leaves."""
-LEAST_SCALED = 0.5
-"""Least height or distance over the one expected: the rest is an error."""
+LEAST_SCALED = 0.5  # least height or distance over the one expected: the rest is an error
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
 

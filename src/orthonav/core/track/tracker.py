@@ -62,32 +62,22 @@ from orthonav.core.track.smooth import History, Smoothed
 LOCAL_SHARE = 0.75
 """Belief from which on only its surroundings are searched. Values without a source:
 docs/tracking.md."""
-LOCAL_SIGMAS = 4.0
-"""Half width of that search,"""
-MIN_LOCAL_M = 30.0
-"""and its least."""
+LOCAL_SIGMAS = 4.0  # half width of that search,
+MIN_LOCAL_M = 30.0  # and its least
 LEAST_NEW = 0.15
 """Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
-LIKELY_NATS = 5.0
-"""Places so much less likely than the best one are not examined for their tilt."""
-UNSEEN_TILT_RAD = math.radians(20.0)
-"""Standard deviation of a tilt that a view does not show."""
-LEAST_TILT_STD_DEG = 0.1
-"""Least that a track expects of a view."""
+LIKELY_NATS = 5.0  # places so much less likely than the best one are not examined for their tilt
+UNSEEN_TILT_RAD = math.radians(20.0)  # standard deviation of a tilt that a view does not show
+LEAST_TILT_STD_DEG = 0.1  # least that a track expects of a view
 UNAIDED_STD_MPS, UNAIDED_S = 3.0, 15.0
 """A reported velocity with at least this deviation errs for so long: an autopilot without aids."""
-LEARNT_S = 10.0
-"""Over which the error of a reported velocity is learnt from odometry."""
+LEARNT_S = 10.0  # over which the error of a reported velocity is learnt from odometry
 LONGEST_GAP_S = 600.0
 """As which longer gaps are predicted: the position is then known to no more than the map."""
-UNKNOWN_STEP_S = 1.0
-"""Where the clock stands still or jumps back."""
-NEAR_SHARE = 0.05
-"""Of the side of a view: closer places are one."""
-KNOWN_MPS = 5.0
-"""Least certainty of an estimated velocity that predicts the next displacement."""
-KNOWN_PLACE_M = 50.0
-"""Least certainty of a position whose ground is known."""
+UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
+NEAR_SHARE = 0.05  # of the side of a view: closer places are one
+KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
+KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
 SIGHT_STEPS = 4
 """To the ground that a view shows: each leaves a share of the error, slope over that of the line.
 """
