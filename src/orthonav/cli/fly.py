@@ -32,8 +32,6 @@ HEIGHTS = ("distance", "terrain", "amsl", "home", "relative")
 
 
 def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
-    """An argument type: `count` numbers, separated by commas."""
-
     def parse(text: str) -> tuple[float, ...]:
         try:
             values = tuple(float(part) for part in text.split(","))
@@ -55,14 +53,12 @@ def _number(
     *,
     kind: type[float] = float,
 ) -> None:
-    """Add an option that is a number."""
     if default is not None:
         meaning += f" (default {default:g})"
     group.add_argument(name, type=kind, default=default, metavar=unit, help=meaning)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
     parser.add_argument(
         "source",
@@ -370,7 +366,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Raise `VariantError` where images or telemetry have no source, or two."""
     from orthonav.core.errors import VariantError
 
     if options.ros2 and (options.source or options.autopilot):

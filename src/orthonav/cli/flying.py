@@ -91,7 +91,6 @@ flight that comes from there gives the place where it reaches the map, or a larg
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
-    """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
     console = opened_console(options, clocks, stack)
     opened = _opened(options)
@@ -174,7 +173,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
 
 
 def _min_agl_m(options: argparse.Namespace, camera: Camera, localizer: Localizer) -> float:
-    """Height from which views are located: as given, else where they cover enough of the map."""
     if options.min_agl_m is not None:
         return float(options.min_agl_m)
     across, along = camera.extent
@@ -182,7 +180,6 @@ def _min_agl_m(options: argparse.Namespace, camera: Camera, localizer: Localizer
 
 
 def _opened(options: argparse.Namespace) -> MapFile:
-    """The map, its signature checked first where that is asked for."""
     signature = checked_signature(options)
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
     if signature is not None and options.state is not None:
@@ -204,7 +201,6 @@ def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMoni
 
 
 def _stated(text: str | None) -> CameraLatency | None:
-    """Latency of `--camera-latency-ms`: a number or a file."""
     if text is None:
         return None
     try:
@@ -226,7 +222,6 @@ def _inputs(
     localizer: Localizer,
     least: float,
 ) -> tuple[Any, PositionOutput | None]:
-    """Source of images, and the output that belongs to it, if any."""
     if camera is not None and not options.ros2:
         return _source(options, clocks, link, camera, stopping), None
     ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
@@ -236,7 +231,6 @@ def _inputs(
 
 
 def _camera(options: argparse.Namespace) -> Camera | None:
-    """Camera of a file; None for that of a ROS 2 topic."""
     if options.camera is not None:
         return read_camera_file(options.camera)
     if options.ros2:
@@ -360,7 +354,6 @@ def _publisher(
 
 
 def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
-    """Warn of local messages at a rate at which PX4 does not fuse them."""
     local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
     if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
         log.warning(
@@ -383,10 +376,7 @@ def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLo
 
 
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
-    """Options for a replay of the log, and the whole command line.
-
-    Files are logged by name: the contents of a key file are written nowhere.
-    """
+    """Options for a replay, and the command line; the contents of a key file are never logged."""
     line = {
         name: [str(each) for each in value] if isinstance(value, list | tuple) else str(value)
         for name, value in vars(options).items()
@@ -420,7 +410,6 @@ def awaited(options: argparse.Namespace) -> str | None:
 
 
 def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> list[str]:
-    """What the flight uses and sends, one line each. `least`: confidence from which it sends."""
     lines = [
         f"map: {_map_text(options.map, opened)}",
         f"autopilot: {_telemetry_text(options)}",
@@ -534,11 +523,8 @@ def gnss_watch(
 def _learnt_before(
     options: argparse.Namespace, digest: str, clocks: Clocks
 ) -> tuple[Mapping[str, Biases], Resumed | None]:
-    """What was learnt before this flight, and by it, where it was interrupted.
-
-    A state is that of this flight if the program that saved it stopped no longer than
-    `--state-max-age-s` ago, or at an unknown time because a clock was set back.
-    """
+    """What was learnt before this flight, and by it, where it was interrupted: the saving program
+    stopped at most `--state-max-age-s` ago, or at an unknown time."""
     if options.state is None:
         return {}, None
     saved = load(options.state)
@@ -552,10 +538,7 @@ def _learnt_before(
 def start_of(
     options: argparse.Namespace, clocks: Clocks, localizer: Localizer
 ) -> Callable[[], Prior | None]:
-    """Function that gives the prior of the first view.
-
-    It is the saved position if that is recent, but once only, else `--start`, else None.
-    """
+    """Gives the first prior: a recent saved position, but once only, else `--start`, else None."""
     given = given_start(options, localizer)
     saved = [load(options.state)] if options.state else []
 

@@ -58,7 +58,6 @@ def joined(
 
 
 def _log_as_asked(node: Graph, stack: ExitStack) -> None:
-    """The log on `/rosout`, at the level of `--log-level` and where it is wanted, until the end."""
     own, arguments = logging.getLogger("orthonav"), node.arguments
     level, propagates = own.level, own.propagate
     handler = logging.NullHandler() if "rosout" in arguments.silenced else Rosout(node)

@@ -195,14 +195,8 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.run import (
-        Locator,
-        MountCorrected,
-        SingleViews,
-        localize_flight,
-        model_of,
-        smoothed_track,
-    )
+    from orthonav.ground.recordings.localize import localize_flight, smoothed_track
+    from orthonav.onboard.run import Locator, MountCorrected, SingleViews, model_of
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
@@ -287,7 +281,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.ground.atlas.locate import AtlasLocator
     from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.run import localize_flight
+    from orthonav.ground.recordings.localize import localize_flight
 
     asked = [
         name

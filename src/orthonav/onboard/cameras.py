@@ -74,16 +74,10 @@ class CameraGoneError(CameraError):
 
 
 class ImageSource(Protocol):
-    """A source of images."""
-
     def read(self) -> CameraImage | None:
-        """Wait for the next image; None at the end, or when stopped.
+        """The next image; None at the end. Raises `CameraGoneError`: call again later."""
 
-        Raises `CameraGoneError` where the camera is gone for now: call again later.
-        """
-
-    def close(self) -> None:
-        """Release the device."""
+    def close(self) -> None: ...
 
 
 class LiveCamera:
@@ -108,7 +102,6 @@ class LiveCamera:
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         if self._capture is None:  # first image, or after the camera was gone
             self._capture = self._open()
         if not self._capture.grab():
@@ -131,7 +124,6 @@ class LiveCamera:
         )
 
     def close(self) -> None:
-        """See `ImageSource.close`."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None
@@ -158,8 +150,6 @@ class LiveCamera:
 
 
 class Playback:
-    """Images of a recording, each at its time."""
-
     def __init__(
         self,
         images: Iterator["RecordedImage"],
@@ -173,7 +163,6 @@ class Playback:
         self._number = 0
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         entry = next(self._images, None)
         if entry is None:
             return None
@@ -185,8 +174,7 @@ class Playback:
             self._clocks.sleep(min(left_s, 0.05))
         return None
 
-    def close(self) -> None:
-        """See `ImageSource.close`."""
+    def close(self) -> None: ...
 
     def _picture(self, entry: "RecordedImage", due_ns: int) -> CameraImage:
         self._number += 1
@@ -204,8 +192,6 @@ class Playback:
 
 @dataclass(frozen=True, eq=False)
 class RecordedImage:
-    """An image of a recording; `load` decodes it."""
-
     frame: str
     time_ns: int
     load: Callable[[], Grey]
@@ -227,10 +213,7 @@ def own_pace(clocks: Clocks, pace: float) -> Callable[[int], int]:
 def autopilot_pace(
     boot_ns: Callable[[int], int | None], clocks: Clocks, pace: float
 ) -> Callable[[int], int | None]:
-    """Playback of a recording whose times are those of the autopilot's clock, as in a simulation.
-
-    `boot_ns` converts our clock to the autopilot's; it returns None while the offset is unknown.
-    """
+    """Playback by the autopilot's clock, which `boot_ns` gives; None: not yet known."""
 
     def due_ns(time_ns: int) -> int | None:
         now_ns = clocks.mono_ns()
@@ -241,7 +224,6 @@ def autopilot_pace(
 
 
 def is_live(name: str) -> bool:
-    """Whether `name` is a device or a stream, not a recording."""
     return name.isdigit() or name.startswith(("/dev/", *STREAMS))
 
 
@@ -252,10 +234,7 @@ def live_name(name: str) -> int | str:
 
 
 def recorded_images(path: Path) -> Iterator[RecordedImage]:
-    """Images of a flight folder or a video at their times, or of a folder at `FOLDER_RATE_HZ`.
-
-    Raises `FlightError` or `MissingFileError` at once where `path` is none of these.
-    """
+    """Images of a flight folder, a video or a folder. Raises `FlightError`, `MissingFileError`."""
     if (path / "telemetry.csv").is_file():
         views = open_flight(path).views
         return iter(
@@ -323,8 +302,6 @@ def _capture(name: int | str) -> Any:
 
 
 class NewestImage:
-    """Hands the newest image from the reading thread to the consumer."""
-
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._picture: CameraImage | None = None
@@ -333,7 +310,6 @@ class NewestImage:
         self.ended = False
 
     def put(self, image: CameraImage) -> None:
-        """Store a new image; one that was not taken is replaced and counted."""
         with self._condition:
             self.replaced += self._picture is not None
             self.taken += 1
@@ -343,7 +319,6 @@ class NewestImage:
             self._condition.notify()
 
     def end(self) -> None:
-        """Signal that no more images will come."""
         with self._condition:
             self.ended = True
             self._condition.notify()
@@ -358,7 +333,6 @@ class NewestImage:
 
     @property
     def is_over(self) -> bool:
-        """Whether the last image of a recording was taken."""
         with self._condition:
             return self.ended and self._picture is None
 
@@ -407,7 +381,6 @@ class CameraThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop; does not wait for a device that does not answer."""
         self._stopping.set()
         self._thread.join(2.0)
 
@@ -421,7 +394,6 @@ class FrozenCheck:
         self.repeats = 0
 
     def is_repeat(self, grey: Grey) -> bool:
-        """Whether this image equals the previous one, exactly or nearly."""
         step = max(1, min(grey.shape) // FROZEN_SIDE_PX)
         sample = np.ascontiguousarray(grey[step // 2 :: step, step // 2 :: step])
         total = zlib.crc32(sample.tobytes())

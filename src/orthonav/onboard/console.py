@@ -67,7 +67,6 @@ class Console:
     """
 
     def __init__(self, stream: TextIO | None, clocks: Clocks, *, quiet: bool = False) -> None:
-        """`stream`: usually stderr; None where it is closed."""
         self._clocks, self.quiet = clocks, quiet
         self._begun_ns = clocks.mono_ns()
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_LINES)
@@ -80,22 +79,18 @@ class Console:
         self._thread.start()
 
     def say(self, text: str) -> None:
-        """Write a line, unless quiet."""
         if not self.quiet:
             self.put(text)
 
     def warn(self, text: str) -> None:
-        """Write a warning."""
         self.put(f"WARNING: {text}")
 
     def put(self, text: str) -> None:
-        """Write a line with the time since the start."""
         seconds = (self._clocks.mono_ns() - self._begun_ns) / 1e9
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(f"{seconds:8.1f} s  {text}\n")
 
     def close(self) -> None:
-        """Write the waiting lines, for at most `CLOSE_S`."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
         self._thread.join(CLOSE_S)
@@ -132,14 +127,11 @@ class Console:
 
 
 class _Records(logging.Handler):
-    """Passes log records on as text."""
-
     def __init__(self, put: Callable[[str], None]) -> None:
         super().__init__()
         self._put = put
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler.emit`."""
         self._put(self.format(record))
 
 
@@ -162,8 +154,6 @@ class Inputs:
 
 
 class Narrator:
-    """Turns views and health into lines on a console. Mutable; for one thread."""
-
     def __init__(self, console: Console, clocks: Clocks, inputs: Inputs) -> None:
         self._console, self._clocks, self._inputs = console, clocks, inputs
         self._interval_ns = round((TERMINAL_S if console.is_terminal else FILE_S) * 1e9)
@@ -184,7 +174,6 @@ class Narrator:
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
     ) -> None:
-        """Note one view, and say where the state of the track changed."""
         now_ns = self._clocks.mono_ns()
         self._watch(now_ns)
         self._begun_ns = self._begun_ns or now_ns
@@ -201,7 +190,6 @@ class Narrator:
             self._say_state(None if before is None else before.state, result)
 
     def health(self, plain: Mapping[str, Any]) -> None:
-        """Say what changed since the last second, and the status where it is due."""
         now_ns = self._clocks.mono_ns()
         self._watch(now_ns)
         self._say_faults(plain, now_ns)
@@ -212,11 +200,9 @@ class Narrator:
             self._console.say(self._status(plain))
 
     def close(self) -> None:
-        """Say the summary of the flight."""
         self._console.say(self._summary())
 
     def _reason(self, result: ViewResult, sent: Sequence[str], withheld: str | None) -> str | None:
-        """Why a view gave no position; None where it gave one."""
         if sent:
             return None
         if isinstance(result.outcome, NoFix) and withheld in (None, "no_fix"):
@@ -224,7 +210,6 @@ class Narrator:
         return withheld or ("not_sent" if self._inputs.sends else None)
 
     def _explain(self, result: ViewResult) -> None:
-        """Say the reason of a view without a position in full, once for each reason."""
         outcome = result.outcome
         if isinstance(outcome, NoFix) and outcome.reason not in {*self._explained, "searching"}:
             self._explained.add(outcome.reason)
@@ -243,13 +228,11 @@ class Narrator:
         self._remind(self._camera.waits(self._inputs, now_ns), now_ns)
 
     def _remind(self, waits: str | None, now_ns: int) -> None:
-        """Say what is missing, and again while it is."""
         if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
             self._reminded[waits] = now_ns + round(REMIND_S * 1e9)
             self._console.say(f"waiting for {waits}")
 
     def _say_faults(self, plain: Mapping[str, Any], now_ns: int) -> None:
-        """Say a change of the health, apart from what other lines say."""
         hidden = _SAID_BY_OTHERS
         if self._inputs.link is not None and not self._autopilot.is_heard:
             hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
@@ -299,8 +282,6 @@ class Narrator:
 
 
 class _CameraWatch:
-    """Says when a camera comes and goes. Mutable."""
-
     def __init__(self, console: Console) -> None:
         self._console = console
         self._taken = self._outages = self._seen_ns = 0
@@ -330,8 +311,6 @@ class _CameraWatch:
 
 
 class _AutopilotWatch:
-    """Says when an autopilot comes and goes. Mutable."""
-
     def __init__(self, console: Console) -> None:
         self._console, self.is_heard, self._others = console, False, 0
 
@@ -376,7 +355,6 @@ def _place_text(outcome: Fix | NoFix) -> str:
 
 
 def _counted(counts: Counter[str], sends: bool) -> str:
-    """Views, and what became of them."""
     reasons = {name[9:]: n for name, n in counts.most_common() if name.startswith("withheld ")}
     good = f"{counts['']} sent" if sends else f"{counts['']} with a position (none is sent)"
     text = f"{counts['views']} view{'' if counts['views'] == 1 else 's'}, {good}"
@@ -387,7 +365,6 @@ def _counted(counts: Counter[str], sends: bool) -> str:
 
 
 def _descriptor(stream: TextIO | None) -> int | None:
-    """Descriptor of a stream; None where it has none."""
     try:
         return None if stream is None else stream.fileno()
     except (OSError, ValueError):  # closed, or replaced by an object in memory

@@ -120,9 +120,8 @@ class Runner:
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
-        """`start` gives the prior of the first view; it is called when that view is located.
-        `fresh` makes another locator when recorded time goes back, and a flight begins again.
-        `latency`: that of a live camera; None where images carry the time of their exposure."""
+        """`start` gives the prior of the first view; `fresh` makes a locator where time goes back.
+        `latency`: of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
         self._link, self._sink, self._diagnosis = link, sink, diagnosis
@@ -153,7 +152,6 @@ class Runner:
         self._boot_id = states.boot_id()
 
     def run(self, stopping: threading.Event) -> None:
-        """Fly until `stopping` is set, or until a recording ends."""
         self._log(lambda sink: sink.options(dict(self.options.logged_options)))
         self._notifier.notify("READY=1", "STATUS=waiting for images")
         try:
@@ -172,7 +170,6 @@ class Runner:
             self._log(lambda sink: sink.close())
 
     def step(self, timeout_s: float) -> ViewResult | None:
-        """Process the newest image, waiting `timeout_s` for it; None without a result."""
         image = self._newest.take(timeout_s)
         result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
@@ -182,7 +179,6 @@ class Runner:
         return result
 
     def _process(self, image: CameraImage) -> ViewResult | None:
-        """Result of one image; None where it is too old."""
         now_ns = self._image_taken_ns = self._clocks.mono_ns()
         self._count("taken")
         latency = None
@@ -223,7 +219,6 @@ class Runner:
             self._observe(image.grey, camera, latency)
 
     def _restart_after_jump(self, time_ns: int) -> None:
-        """Forget the track where time goes back: a bag or a simulation that begins again."""
         before_ns, self._time_ns = self._time_ns, time_ns
         if self._fresh is None or not self.options.recorded or time_ns > before_ns - JUMP_NS:
             return
@@ -234,7 +229,6 @@ class Runner:
             self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
 
     def _refused(self, image: CameraImage, reason: NoFix, vehicle: VehicleState) -> ViewResult:
-        """Log and publish an image that cannot be located."""
         result = self._result(image, reason, math.nan)
         self._log(lambda sink: sink.result(result))
         self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
@@ -276,7 +270,6 @@ class Runner:
     def _located(
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency | None
     ) -> ViewResult:
-        """Log, locate and publish a view."""
         view = self._from_start(view)
         self._say_heights(view.telemetry)
         known = self._above_ground(view.telemetry)
@@ -386,7 +379,6 @@ class Runner:
         return fix if result.state in (None, "tracking") else None
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
-        """Keep a confident position, and its difference from the reported heading and height."""
         fix = self._confident_fix(result)
         if fix is None:
             return
@@ -413,23 +405,20 @@ class Runner:
         return self._gnss.view(result, image.exposed_ns)
 
     def _accepts(self, fix: Fix) -> bool:
-        """Whether a fix meets the criterion of this flight."""
         accept = self.options.accept
         return fix.confidence >= self.options.min_confidence and (
             accept is None or accept.accepts(fix)
         )
 
     def _map_changed(self) -> NoFix | None:
-        """Reason to give no position where the map file was changed in place; None if it was not.
+        """Reason to give no position where the map file was changed in place.
 
-        Parts of the map that are in memory would still give positions; they stop all the same, so
-        that the fault shows at once and not where the aircraft leaves these parts.
+        Parts in memory would still give positions; stopping shows the fault at once.
         """
         change = self.options.map_change()
         return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
     def _bad_image(self, image: CameraImage) -> NoFix | None:
-        """Reason why an image cannot be used; None if it can."""
         if image.grey is None:
             self._count("bad_image")
             return image.problem or NoFix("bad_image", "image could not be decoded")
@@ -444,7 +433,6 @@ class Runner:
         return None
 
     def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
-        """Telemetry at the exposure; waits a little for the samples that follow it."""
         if self.options.recorded or self._link is None:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
             return image.vehicle or VehicleState(None), image.telemetry or nothing
@@ -466,7 +454,6 @@ class Runner:
             return self._refusal("internal_error", MAP_DAMAGED, str(error))
 
     def _say_heights(self, telemetry: Telemetry) -> None:
-        """Log once what is assumed about heights."""
         if self._heights_said:
             return
         self._heights_said = True
@@ -476,7 +463,6 @@ class Runner:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
     def _unusable(self, telemetry: Telemetry) -> NoFix | None:
-        """Reason not to locate a view by its telemetry."""
         known = self._above_ground(telemetry)
         if isinstance(known, NoFix):
             return known
@@ -500,7 +486,6 @@ class Runner:
         self.counter.add(self._clocks.mono_ns(), name)
 
     def _log(self, call: "Callable[[FlightLog], None]") -> None:
-        """Write to the log; a failure is counted for the health."""
         if self._sink is None:
             return
         try:
@@ -511,7 +496,6 @@ class Runner:
             self._count("log_failed")
 
     def _tick(self, now_ns: int) -> None:
-        """Once a second: judge and publish the health, and save the state."""
         self._count_changes()
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
@@ -542,7 +526,6 @@ class Runner:
                 self._link.send(each)
 
     def _count_changes(self) -> None:
-        """Count what the link, the camera, the outputs and the log counted since the last call."""
         messenger = self._publisher.messenger
         now = {
             "clock_jump": 0 if self._link is None else self._link.sync.jumps,
@@ -606,7 +589,6 @@ class Runner:
         return check.off_m(now_ns)
 
     def _latency_reason(self) -> str | None:
-        """Reason why the latency of the camera cannot be used."""
         if self._latency is None or self._image_taken_ns is None:
             return None
         return self._latency.reason
@@ -686,7 +668,6 @@ def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
 
 
 def _file_id(path: Path | None) -> tuple[int, int] | None:
-    """Device and inode of the file of that name; None where there is none."""
     try:
         found = path.stat() if path is not None else None
     except OSError:

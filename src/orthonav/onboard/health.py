@@ -58,19 +58,15 @@ class Level(Enum):
 
     @property
     def severity(self) -> int:
-        """MAV_SEVERITY of the STATUSTEXT."""
         return {Level.OK: 6, Level.DEGRADED: 4, Level.FAILED: 3}[self]
 
 
 @dataclass(frozen=True)
 class Health:
-    """Level and reasons, those of FAILED first."""
-
     level: Level
     reasons: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """Text for a ground station."""
         text = f"orthonav {self.level.name}"
         return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
 
@@ -118,7 +114,6 @@ class Snapshot:
 
 
 def judge(seen: Snapshot) -> Health:
-    """Level and reasons."""
     count = Counter(seen.counts)
     many = SHARE * max(count["taken"], 1)
     settled = seen.running_s > GRACE_S
@@ -165,8 +160,6 @@ def judge(seen: Snapshot) -> Health:
 
 
 class EventCounter:
-    """Counts of events, and latencies, within the last `window_s` seconds. Mutable."""
-
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
         self._events: deque[tuple[int, str]] = deque()
@@ -175,17 +168,14 @@ class EventCounter:
         self.total: Counter[str] = Counter()
 
     def add(self, now_ns: int, name: str) -> None:
-        """Count an event."""
         self._events.append((now_ns, name))
         self._counts[name] += 1
         self.total[name] += 1
 
     def add_latency(self, now_ns: int, seconds: float) -> None:
-        """Add the time of one view from exposure to the last message."""
         self._latencies.append((now_ns, seconds))
 
     def counts(self, now_ns: int) -> Counter[str]:
-        """Counts within the window, by name."""
         begin = now_ns - self._window_ns
         while self._events and self._events[0][0] < begin:
             self._counts[self._events.popleft()[1]] -= 1
@@ -207,7 +197,6 @@ class HealthReporter:
         self._reported_ns: int | None = None
 
     def due(self, health: Health, now_ns: int) -> bool:
-        """Whether to send `health` now."""
         if health == self._reported:
             return False
         if self._reported_ns is not None and now_ns - self._reported_ns < STATUSTEXT_INTERVAL_NS:
@@ -220,7 +209,6 @@ class Notifier:
     """Notifies systemd: datagrams to the socket that it names, as `sd_notify(3)` sends them."""
 
     def __init__(self, address: str | None = None) -> None:
-        """`address`: by default `NOTIFY_SOCKET` of the environment; empty: send nothing."""
         address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
         self._address = "\0" + address[1:] if address.startswith("@") else address
 
@@ -246,12 +234,11 @@ def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:
 
 
 class TelemetryDiagnosis:
-    """Finds out whether a wrong heading, height or start is the reason that no position is found.
+    """Finds out whether a wrong heading, height or start is why no position is found.
 
-    While a track finds nothing, a view is located again on the whole map: with any heading, with
-    half the height and with twice the height, one hypothesis at a time. A confident fix shows which
-    value is wrong; it is never used as a position. It takes seconds on a large map, so it runs in a
-    thread. Mutable.
+    While a track finds nothing, a view is located again on the whole map with any heading and half
+    and twice the height. A confident fix shows which value is wrong; it is never used as a
+    position. It takes seconds, so it runs in a thread. Mutable.
     """
 
     HYPOTHESES = ((False, 1.0), (True, 0.5), (True, 2.0))  # heading known, factor of the height
@@ -275,7 +262,6 @@ class TelemetryDiagnosis:
         self._found: tuple[int, Fix, Telemetry] | None = None
 
     def observe(self, view: View, found: bool, now_ns: int) -> None:
-        """Pass every view and whether the track has a position; some views are tried again."""
         if found or self._since_ns is None:
             self._since_ns = now_ns
             self._found = None if found else self._found
@@ -304,7 +290,6 @@ class TelemetryDiagnosis:
         self._start(locate)
 
     def mismatch(self, now_ns: int) -> tuple[float, float]:
-        """Recent finding as `mismatch` gives it; zeros where there is none."""
         if self._found is None or now_ns - self._found[0] > DIAGNOSIS_VALID_S * 1e9:
             return 0.0, 0.0
         return mismatch(*self._found[1:])
@@ -320,8 +305,6 @@ def _in_a_thread(work: Callable[[], None]) -> None:
 
 
 class StartCheck:
-    """Compares the places where a flight was recognized with its start. Mutable."""
-
     def __init__(self, start: Prior, time_ns: int) -> None:
         """`time_ns`: time of the first view, for which the start holds."""
         self._start, self._time_ns = start, time_ns
@@ -330,7 +313,6 @@ class StartCheck:
         self._confirmed: _Place | None = None
 
     def moved(self, telemetry: Telemetry) -> None:
-        """Pass the telemetry of every view."""
         seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
         self._time_ns = max(telemetry.time_ns, self._time_ns)
         velocity = telemetry.vel_en_mps
@@ -342,7 +324,6 @@ class StartCheck:
         self._free_m += SIGMAS * std_mps * seconds
 
     def diagnosed(self, fix: Fix, seen_ns: int, now_ns: int) -> None:
-        """Pass the last place that the diagnosis found, in a view taken at `seen_ns`."""
         if self._diagnosed is None or self._diagnosed.fix is not fix:
             self._diagnosed = self._place(fix, seen_ns, now_ns)
 
@@ -352,8 +333,7 @@ class StartCheck:
             self._confirmed = self._place(fix, now_ns, now_ns)
 
     def off_m(self, now_ns: int) -> float:
-        """Distance of the start from that which the last place implies, metres; 0 where it is
-        within the deviations, and `SHOWN_S` after that place."""
+        """Distance by which the last place contradicts the start, m; 0 within the deviations."""
         last = self._confirmed or self._diagnosed
         return last.off_m if last is not None and now_ns - last.seen_ns < SHOWN_S * 1e9 else 0.0
 
@@ -378,7 +358,6 @@ class _Place:
     off_m: float
 
     def reaches(self, fix: Fix, seen_ns: int) -> bool:
-        """Whether the aircraft can have flown from here to a later fix."""
         free_m = SPEED_MPS * (seen_ns - self.seen_ns) / 1e9
         return float(np.hypot(*_from(fix, self.fix))) <= free_m + self.fix.radius_m + fix.radius_m
 

@@ -129,10 +129,7 @@ class AutopilotLink:
         self._sequence, self._packed, self._resign_ns = 0, 0, 0
 
     def poll(self, timeout_s: float = 0.0) -> int:
-        """Read incoming messages, waiting at most `timeout_s`, and send what is due.
-
-        Returns the number of messages from the autopilot.
-        """
+        """Read, waiting at most `timeout_s`, and send what is due; the number of messages."""
         transport = self._opened()
         if transport is None:
             return 0
@@ -152,7 +149,6 @@ class AutopilotLink:
         return understood
 
     def send(self, message: Message) -> bool:
-        """Pack and send one message; whether the port was open."""
         with self._lock:
             if self._silent or self._transport is None:
                 return False
@@ -164,13 +160,11 @@ class AutopilotLink:
             return True
 
     def covers(self, exposed_ns: int) -> bool:
-        """Whether the attitude at a time of our clock is known."""
         covered_ns = self.covered_ns
         return covered_ns is not None and covered_ns >= exposed_ns
 
     @property
     def covered_ns(self) -> int | None:
-        """Time of our clock up to which the attitude is known; None without any."""
         with self._lock:
             newest = self.buffer.covered_ns
             return None if newest is None else self.sync.mono_ns(newest)
@@ -191,7 +185,6 @@ class AutopilotLink:
             return self.sync.boot_ns(mono_ns)
 
     def status(self) -> LinkStatus:
-        """Status of the link."""
         with self._lock:
             now_ns = self._clocks.mono_ns()
             return LinkStatus(
@@ -208,12 +201,10 @@ class AutopilotLink:
             )
 
     def signing_now(self) -> int | None:
-        """Timestamp of the last signature; None without signing."""
         with self._lock:
             return None if self._signing is None else self._signing.timestamp_10us + self._packed
 
     def close(self) -> None:
-        """Close the port."""
         with self._lock:
             if self._transport is not None:
                 self._transport.close()
@@ -235,7 +226,6 @@ class AutopilotLink:
         return opened
 
     def _lost(self, error: OSError) -> None:
-        """Close the port after a failure; it is opened again after a pause."""
         with self._lock:
             if self.counts["error"] == 0 or self._transport is not None:
                 log.warning("link to the autopilot: %s", error)
@@ -306,7 +296,6 @@ class AutopilotLink:
             handler(self, message, now_ns)
 
     def _timed(self, boot_ms: int, now_ns: int) -> int:
-        """Time of a message in ns; updates the clock offset."""
         boot_ns = int(boot_ms) * 1_000_000
         if self.sync.heard(now_ns, boot_ns):
             self._restarted()
@@ -453,8 +442,6 @@ _HANDLERS: dict[str, Callable[[AutopilotLink, Message, int], None]] = {
 
 
 class LinkThread:
-    """Polls a link in a thread until it is stopped."""
-
     def __init__(self, link: AutopilotLink) -> None:
         self._link, self._stop = link, threading.Event()
         self._thread = threading.Thread(target=self._run, name="autopilot link", daemon=True)
@@ -470,7 +457,6 @@ class LinkThread:
                 self._stop.wait(0.1)
 
     def stop(self) -> None:
-        """Stop and close the port."""
         self._stop.set()
         self._thread.join(2.0)
         self._link.close()

@@ -101,10 +101,9 @@ class MessageOptions:
 
 
 class Messenger:
-    """Builds the messages of a view and sends those that are due. Mutable.
+    """Builds and sends the messages of a view that are due. Mutable.
 
-    `incomplete`: number of messages that could not be built. `too_slow`: number of local messages
-    that followed the one before too late for PX4.
+    `incomplete`: messages that could not be built; `too_slow`: those too late for PX4.
     """
 
     def __init__(
@@ -128,11 +127,7 @@ class Messenger:
         kind: Autopilot | None,
         origin: Origin | None,
     ) -> tuple[str, ...]:
-        """Names of the messages that were sent.
-
-        `exposed_ns` is the time of exposure by our clock, `boot_ns` by the autopilot's. `vehicle`,
-        `target`, `kind` and `origin` are what the autopilot reported.
-        """
+        """Names of the messages sent. `exposed_ns`: by our clock; `boot_ns`: the autopilot's."""
         sent = []
         for name in self.options.kinds:
             if estimate.dead_reckoned and name != "global-position":
@@ -172,17 +167,13 @@ class Messenger:
 
     @property
     def needs_origin(self) -> bool:
-        """Whether messages are in the autopilot's local frame."""
         return any(kind in LOCAL for kind in self.options.kinds)
 
     def find_origin(
         self, known: Origin | None, target: Target | None, *, armed: bool | None
     ) -> None:
-        """Ask the autopilot for the origin of its local frame until it reports one (`known`).
-
-        One that has none gets that of the options, unless it is `armed`: an origin that moves in
-        flight moves the aircraft.
-        """
+        """Ask for the origin of the local frame until it is `known`. Where there is none, set that
+        of the options, unless `armed`: an origin that moves in flight moves the aircraft."""
         now_ns, origin = self._clocks.mono_ns(), self.options.origin
         if known is not None:
             self._requests = 0
@@ -248,13 +239,9 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
 
 
 class Sink(Protocol):
-    """Output for bytes that never blocks. `write` raises `OSError` where it fails."""
+    def write(self, data: bytes) -> None: ...
 
-    def write(self, data: bytes) -> None:
-        """Send `data`."""
-
-    def close(self) -> None:
-        """Close the output."""
+    def close(self) -> None: ...
 
 
 class TcpSink:
@@ -267,11 +254,9 @@ class TcpSink:
 
     @property
     def port(self) -> int:
-        """Port of the server."""
         return int(self._listening.getsockname()[1])
 
     def write(self, data: bytes) -> None:
-        """Send to each client, all of `data` or nothing."""
         try:
             while len(self._clients) < _MOST_CLIENTS:
                 client, _ = self._listening.accept()
@@ -290,7 +275,6 @@ class TcpSink:
                 self._clients.remove(client)
 
     def close(self) -> None:
-        """See `Sink.close`."""
         for each in (*self._clients, self._listening):
             each.close()
 
@@ -303,7 +287,6 @@ class SerialSink:
         self._port: Descriptor | None = open_serial(device, baud)
 
     def write(self, data: bytes) -> None:
-        """See `Sink.write`."""
         if self._port is None:
             self._port = open_serial(self._device, self._baud)
         try:
@@ -313,7 +296,6 @@ class SerialSink:
             raise
 
     def close(self) -> None:
-        """See `Sink.close`."""
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -343,13 +325,11 @@ class NmeaOut:
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
-        """Write one view; `utc_ns` is its time where there is no estimate. Raises `OSError`."""
         options: dict[str, Any] = {"utc_ns": utc_ns, "min_confidence": min_confidence}
         sentences = [make(estimate, quality=self._quality, **options) for make in (gga, rmc)]
         self._sink.write(b"".join([*sentences, gst(estimate, **options)]))
 
     def close(self) -> None:
-        """Close the sink."""
         self._sink.close()
 
 
@@ -370,18 +350,15 @@ class JsonOut:
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
     ) -> None:
-        """Write one view. Raises `OSError`."""
         more = {"age_ms": round(age_ms, 3), "sent": list(sent), "withheld": withheld}
         line = result_to_json(result)[:-1] + ", " + json.dumps(more)[1:]
         self._write(self._identity.added_to(line))
         self._identity = UNKNOWN
 
     def health(self, plain: dict[str, object]) -> None:
-        """Write one line of health. Raises `OSError`."""
         self._write(json.dumps(plain, allow_nan=False))
 
     def close(self) -> None:
-        """Close the file."""
         if self._path is not None and self._stream is not None:
             self._stream.close()
 
@@ -407,14 +384,11 @@ class ViewOutput(Protocol):
 
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
-    ) -> None:
-        """Take one view: its age at the end, the messages sent, why none was."""
+    ) -> None: ...
 
-    def health(self, plain: dict[str, Any]) -> None:
-        """Take the health."""
+    def health(self, plain: dict[str, Any]) -> None: ...
 
-    def close(self) -> None:
-        """Close the output."""
+    def close(self) -> None: ...
 
 
 class PositionOutput(Protocol):
@@ -427,14 +401,11 @@ class PositionOutput(Protocol):
 
     def position(
         self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
-    ) -> tuple[str, ...]:
-        """Send one position; returns the names of messages. `stamp_ns`: time of the image."""
+    ) -> tuple[str, ...]: ...
 
-    def health(self, plain: dict[str, Any]) -> None:
-        """Send the health."""
+    def health(self, plain: dict[str, Any]) -> None: ...
 
-    def close(self) -> None:
-        """Close the output."""
+    def close(self) -> None: ...
 
 
 class Publisher:
@@ -470,12 +441,8 @@ class Publisher:
         judged: bool,
         withheld: str | None = None,
     ) -> tuple[str, ...]:
-        """Send the position of a view where the gate admits it; the names of the messages.
-
-        Only views that the locator processed (`judged`) can give a position: the prediction of a
-        track is not a measurement. `withheld`: reason why a view was not located, which the gate
-        counts.
-        """
+        """Send a position that the gate admits; the names of the messages. Only a view that was
+        processed (`judged`) gives one: the prediction of a track is not a measurement."""
         estimate: NavigationEstimate | None = None
         sent: tuple[str, ...] = ()
         if withheld is not None:
@@ -498,11 +465,9 @@ class Publisher:
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
-        """Send the health to the outputs that carry it."""
         self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
-        """Close all outputs."""
         self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
 
     def _send(

@@ -136,7 +136,6 @@ def _maps_of(path: Path) -> dict[str, Any]:
 
 
 def _plain_of(path: Path) -> dict[str, Any]:
-    """Content of the file; empty where it is missing or damaged."""
     try:
         if path.stat().st_size > MAX_BYTES:
             return {}
@@ -147,7 +146,6 @@ def _plain_of(path: Path) -> dict[str, Any]:
 
 
 def load(path: Path) -> SavedState | None:
-    """Saved state; None where the file is missing or damaged."""
     plain = _plain_of(path)
     if plain.get("version") != VERSION:
         return None
@@ -168,16 +166,14 @@ def load(path: Path) -> SavedState | None:
 
 
 def serials_path(state: Path) -> Path:
-    """The file of the newest serial number flown with each signing key, beside a state file. It is
-    separate because it outlives flights."""
+    """File of the newest serial number flown with each key; it outlives the state of a flight."""
     return state.with_name(f"{state.name}.serials")
 
 
 def require_newest(state: Path, signature: Signature, map_path: Path) -> None:
     """Refuse a map older than the newest flown with its key; else remember its serial number.
 
-    A file that is damaged or cannot be written is a warning: it must not keep a flight from being
-    resumed. Raises `MapFileError`.
+    A damaged or unwritable file is a warning: it must not keep a flight from being resumed.
     """
     path = serials_path(state)
     known = _read(path)

@@ -121,7 +121,6 @@ class VehicleState:
         return roll, pitch, yaw
 
     def telemetry(self, time_ns: int, mount_deg: Angles = LOOKS_DOWN) -> Telemetry:
-        """Heading, tilt and height of a camera mounted at `mount_deg`, with the time `time_ns`."""
         yaw = pitch = roll = math.nan
         if self.ned_from_body is not None:
             yaw, pitch, roll = attitude_of(enu_from_body_camera(self.ned_from_body, mount_deg))
@@ -142,8 +141,6 @@ class VehicleState:
 
 
 class _Samples:
-    """Samples of one quantity at increasing times."""
-
     def __init__(self, gap_s: float, hold_s: float) -> None:
         self.gap_ns, self.hold_ns = round(gap_s * 1e9), round(hold_s * 1e9)
         self.times: list[int] = []
@@ -196,8 +193,6 @@ class _Samples:
 
 
 class TelemetryBuffer:
-    """Samples of the last seconds by the autopilot's clock. Mutable; not to be shared."""
-
     def __init__(self, heights: Sequence[str] = HEIGHT_SOURCES) -> None:
         """`heights` are those of `HEIGHT_SOURCES` that may be used, the best first."""
         self._order = tuple(heights)
@@ -205,7 +200,6 @@ class TelemetryBuffer:
         self.clear()
 
     def clear(self) -> None:
-        """Discard all samples, as after a restart of the autopilot."""
         slow = SLOW_GAP_S, SLOW_HOLD_S
         self._attitude = _Samples(ATTITUDE_GAP_S, ATTITUDE_HOLD_S)
         self._heights = {name: _Samples(*slow) for name in self._order}
@@ -227,10 +221,7 @@ class TelemetryBuffer:
         self._attitude.add(time_ns, quaternion, self._keep_ns)
 
     def add_height(self, source: str, time_ns: int, height_m: float) -> None:
-        """Add a height from one of `HEIGHT_SOURCES`; values that are not finite are dropped.
-
-        `altitude` is a second height above sea level, for messages that come beside the first.
-        """
+        """Add a height from one of `HEIGHT_SOURCES`; `altitude` is a second one above sea level."""
         if source in self._heights and math.isfinite(height_m):
             self._heights[source].add(time_ns, np.array([height_m]), self._keep_ns)
 
@@ -243,7 +234,6 @@ class TelemetryBuffer:
                 self.add_height("distance", time_ns, distance_m * float(down))
 
     def add_local(self, time_ns: int, velocity_ned_mps: Triple, down_m: float) -> None:
-        """Add velocity and down position of the autopilot's local frame."""
         values = np.array([*velocity_ned_mps, down_m, 0.0, 0.0, 0.0])
         if not np.isfinite(values).all():
             return
@@ -260,11 +250,9 @@ class TelemetryBuffer:
 
     @property
     def covered_ns(self) -> int | None:
-        """Time up to which the attitude is known, extrapolation included; None without any."""
         return self._attitude.covered_ns(self._ahead_ns) if self._attitude.times else None
 
     def at(self, time_ns: int) -> VehicleState:
-        """State at a time; attitudes are interpolated by slerp, other values linearly."""
         found = self._attitude.around(time_ns)
         if found is not None and time_ns > self._attitude.times[-1]:
             found = self._attitude.ahead(time_ns, self._ahead_ns) or found
@@ -300,7 +288,6 @@ class TelemetryBuffer:
         return Travelled(round(part), north + seconds * mean_n, east + seconds * mean_e)
 
     def _height(self, names: Sequence[str], time_ns: int) -> float:
-        """The first of these heights that is known at a time, else NaN."""
         found = (self._heights[name].at(time_ns) for name in names if name in self._heights)
         return next((float(value[0]) for value in found if value is not None), math.nan)
 
@@ -366,7 +353,6 @@ class ClockSync:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all samples."""
         self._offset_ns: int | None = None
         self._at_ns, self._rate = 0, 0.0
         self._exact: deque[_Exchange] = deque(maxlen=self.WINDOW)
@@ -375,17 +361,14 @@ class ClockSync:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the offset comes from TIMESYNC exchanges, not from times of arrival."""
         return bool(self._exact)
 
     def boot_ns(self, mono_ns: int) -> int | None:
-        """Time of the autopilot's clock at one of ours; None while it is not known."""
         if self._offset_ns is None:
             return None
         return mono_ns + self._offset_ns + round(self._rate * (mono_ns - self._at_ns))
 
     def mono_ns(self, boot_ns: int) -> int | None:
-        """Time of our clock at one of the autopilot's; None while it is not known."""
         if self._offset_ns is None:
             return None
         since_ns = boot_ns - self._offset_ns - self._at_ns
@@ -474,10 +457,7 @@ class _Exchange(NamedTuple):
 
 
 class Aiding:
-    """What the autopilot reported about its filter and its receivers. Mutable.
-
-    Times are those of our clock.
-    """
+    """What the autopilot reported about its filter and receivers, by our clock. Mutable."""
 
     def __init__(self, own_receiver: int | None = None) -> None:
         """`own_receiver`: number of the receiver in whose place orthonav sends GPS_INPUT."""
@@ -501,11 +481,9 @@ class Aiding:
             self._fixed_ns = now_ns
 
     def velocity(self, std_mps: float, now_ns: int) -> None:
-        """Take the standard deviation that the filter claims for its velocity."""
         self._vel = (now_ns, std_mps) if math.isfinite(std_mps) else None
 
     def is_aided(self, now_ns: int) -> bool:
-        """Whether GNSS holds the filter; False where that is not known."""
         return (
             _is_recent(self._absolute_ns, now_ns, STATUS_NS)
             and _is_recent(self._fixed_ns, now_ns, FIX_NS)

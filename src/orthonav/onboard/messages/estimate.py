@@ -101,26 +101,19 @@ class NavigationEstimate:
         return time_ns
 
     def sent_ns(self, clock: Clock) -> int:
-        """Time of sending: exposure plus `processing_s`."""
         return self.exposed_ns(clock) + round(self.processing_s * 1e9)
 
     def horizontal_std_m(self, min_std_m: float = 0.0) -> float:
-        """Horizontal standard deviation as one number: that along the worst direction.
+        """Standard deviation along the worst direction; NaN where the covariance is invalid.
 
-        The square root of the larger eigenvalue of the covariance, at least `min_std_m`. Filters
-        that take one number use it for both axes (PX4 squares it into the variance of each), so a
-        smaller value would be too optimistic along the long axis. NaN where the covariance is
-        unknown or invalid.
+        Filters that take one number use it for both axes (PX4 squares it into both variances), so a
+        smaller one would be too optimistic along the long axis.
         """
         major = error_ellipse(self.cov_en_m2)[0]
         return major if math.isnan(major) else max(major, min_std_m)
 
     def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
-        """Whether this can be reported as a valid position.
-
-        It needs a confidence of at least `min_confidence`, a valid covariance, and the state
-        "tracking" if it comes from a track.
-        """
+        """Whether it is confident, with a valid covariance, and of no track or one that tracks."""
         return (
             self.confidence >= min_confidence  # False for NaN
             and self.state in (None, "tracking")
@@ -172,10 +165,7 @@ def estimate_from_result(
 
 
 def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
-    """Symmetric covariance with a standard deviation of at least `min_std` in every direction.
-
-    `cov`: covariance (N, N). `min_std`: in the square root of its unit.
-    """
+    """Symmetric covariance (N, N) with a standard deviation of at least `min_std` everywhere."""
     values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
 
@@ -235,16 +225,12 @@ def for_filter(
 
 @dataclass
 class FilterCovariance:
-    """Prepares the estimates of several messages, each by its own rate. Mutable.
-
-    `min_std_m`: see `for_filter`.
-    """
+    """Prepares the estimates of several messages, each by its own rate. Mutable."""
 
     min_std_m: float = 0.0
     _sent_ns: dict[str, int] = field(default_factory=dict)
 
     def interval_s(self, message: str, exposed_ns: int) -> float:
-        """Time from the exposure of the last `message` sent, s; infinite for the first."""
         before = self._sent_ns.get(message)
         return math.inf if before is None else (exposed_ns - before) / 1e9
 
@@ -255,5 +241,4 @@ class FilterCovariance:
         return for_filter(estimate, self.interval_s(message, exposed_ns), self.min_std_m)
 
     def sent(self, message: str, exposed_ns: int) -> None:
-        """Note that `message` was sent."""
         self._sent_ns[message] = exposed_ns

@@ -97,11 +97,9 @@ class Gate:
         self._due_ns: dict[str, int] = {}
 
     def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
-        """Return the estimate with its reset counter set, or None where it must not be sent.
+        """The estimate with its reset counter set, or None where it must not be sent.
 
-        `estimate` is None for a view without a fix. Pass every view, also those that cannot be
-        sent: they show that a track was lost. Raises `EstimateError` where the exposure is not
-        known by the gate's clock.
+        Pass every view, also without a fix: it shows that a track was lost.
         """
         reason = self._reason(estimate, now_ns)
         self._watch(estimate)
@@ -130,11 +128,8 @@ class Gate:
         return len(self._jumped_to) >= self.rules.jump_views
 
     def due(self, message: str, now_ns: int) -> bool:
-        """Whether the rate of `message` allows sending now; counts it as sent or withheld.
-
-        The long-term rate never exceeds the limit. `now_ns` may be of any steady clock; after a
-        jump back the next message passes.
-        """
+        """Whether the rate of `message` allows sending now; counts it. The next one passes after a
+        clock was set back."""
         interval_s = self.rules.min_interval_s.get(message)
         if interval_s is not None:
             interval_ns = round(interval_s * 1e9)
@@ -150,7 +145,6 @@ class Gate:
         return True
 
     def _reason(self, estimate: NavigationEstimate | None, now_ns: int) -> str | None:
-        """Reason why the estimate must not be sent; None if it can be sent."""
         if estimate is None:
             return "no_fix"
         exposed_ns, std_m = estimate.exposed_ns(self.clock), estimate.horizontal_std_m()
@@ -179,7 +173,6 @@ class Gate:
             self._interrupted = True
 
     def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:
-        """Whether two positions differ by more than their errors and the motion allow."""
         seconds = (now.exposed_ns(self.clock) - before.exposed_ns(self.clock)) / 1e9
         if seconds <= 0:
             return True
@@ -199,7 +192,6 @@ class Gate:
 
 
 def _moved_en_m(before: NavigationEstimate, now: NavigationEstimate) -> Array:
-    """Metres east and north from one position to another."""
     limited = min(max(before.lat_deg, -_MOST_NORTH_DEG), _MOST_NORTH_DEG)
     frame = LocalFrame(limited, before.lon_deg)
     start = frame.en_from_latlon(before.lat_deg, before.lon_deg)

@@ -124,7 +124,6 @@ class Packer:
             self._mav.signing.sign_outgoing = True
 
     def pack(self, message: Message) -> bytes:
-        """MAVLink 2 frame of one message, signed if the packer has a key."""
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
@@ -302,7 +301,6 @@ def dialect() -> Any:
 
 
 def deg_e7(degrees: float) -> int:
-    """Angle in 1e-7 degrees, rounded to the nearest."""
     return round(degrees * 1e7)
 
 
@@ -312,7 +310,6 @@ def microseconds(time_ns: int) -> int:
 
 
 def clamped(value: float, low: int, high: int) -> int:
-    """`value` clamped to `low` and `high`, rounded to the nearest integer."""
     return round(min(max(value, low), high))
 
 

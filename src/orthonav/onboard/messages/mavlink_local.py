@@ -196,11 +196,8 @@ def _position(
     min_std_m: float,
     message: str,
 ) -> tuple[Triple, Array]:
-    """North, east, down in metres and their (3, 3) covariance, all of them known.
-
-    ArduPilot makes one standard deviation of the covariance; it gets the one that comes out as the
-    horizontal standard deviation.
-    """
+    """North, east, down in metres and their covariance (3, 3), all known. ArduPilot makes one
+    standard deviation of it: it gets the one that comes out as the horizontal one."""
     north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
     down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
     if not math.isfinite(down):
