@@ -34,8 +34,8 @@ from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
-from orthonav.onboard.cameras import CameraThread, NewestImage
-from orthonav.onboard.console import Console, Inputs, Narrator
+from orthonav.onboard.cameras import NewestImage, read_in_thread
+from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.learner import Resumed
@@ -61,9 +61,7 @@ from orthonav.onboard.outputs import (
     MessageOptions,
     Messenger,
     NmeaOut,
-    PositionOutput,
     Publisher,
-    ViewOutput,
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
@@ -80,6 +78,7 @@ from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0
@@ -124,8 +123,16 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     newest = NewestImage()
     sends = not options.dry_run and (link is not None or graph is not None)
     is_live = options.ros2 or cameras.is_live(options.source)
-    inputs = Inputs(newest, awaited(options), is_live, link, options.autopilot, sends)
-    narrator = Narrator(console, clocks, inputs)
+    narrator = Narrator(
+        console,
+        clocks,
+        newest,
+        awaited(options),
+        link,
+        options.autopilot,
+        is_live=is_live,
+        sends=sends,
+    )
     publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
@@ -134,8 +141,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         source.log_gnss = sink.gnss
     if gnss is not None and sink is not None and not options.ros2:
         gnss.log = sink.gnss  # with ROS 2 messages are logged as received
-    thread = CameraThread(source, stopping, newest)
-    stack.callback(thread.stop)
+    stack.callback(read_in_thread(newest, source, stopping))
     fly = FlyOptions(
         mount_deg=tuple(options.mount_deg),
         mount=mount,
@@ -143,7 +149,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
         min_agl_m=_min_agl_m(options, camera, localizer),
-        telemetry_wait_s=options.telemetry_wait_ms / 1e3,
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
@@ -221,7 +226,7 @@ def _inputs(
     stack: ExitStack,
     localizer: Localizer,
     least: float,
-) -> tuple[Any, PositionOutput | None]:
+) -> tuple[Any, "Ros2Publisher | None"]:
     if camera is not None and not options.ros2:
         return _source(options, clocks, link, camera, stopping), None
     ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
@@ -302,7 +307,7 @@ def _publisher(
     clocks: Clocks,
     link: AutopilotLink | None,
     least: float,
-    graph: PositionOutput | None,
+    graph: "Ros2Publisher | None",
     narrator: Narrator,
     digest: str,
 ) -> Publisher:
@@ -333,7 +338,7 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        lines: list[ViewOutput] = [
+        lines: list[Any] = [
             JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl
         ]

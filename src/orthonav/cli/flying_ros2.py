@@ -39,7 +39,6 @@ def joined(
         clocks,
         stopping.is_set,
         mount_deg=tuple(options.mount_deg),
-        wait_s=options.telemetry_wait_ms / 1e3,
     )
     origin = LocalFrame(*options.origin[:2]) if options.origin else frame
     publisher = Ros2Publisher(

@@ -6,10 +6,10 @@ carries its time of exposure by our monotonic clock.
 
 import logging
 import threading
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Protocol
@@ -37,7 +37,6 @@ as large."""
 FROZEN_SIDE_PX = 64
 FOLDER_RATE_HZ = 2.0
 """Rate at which a folder of images without times is played."""
-_OPEN_MS, _READ_MS = 5000.0, 3000.0
 Grey = NDArray[np.uint8]
 
 
@@ -45,17 +44,11 @@ Grey = NDArray[np.uint8]
 class CameraImage:
     """One image with its time of exposure.
 
-    `number`: counts up from 1.
-    `frame`: name of the image in logs and results.
-    `exposed_ns`: time of exposure by our monotonic clock; of a live camera that of the arrival,
-    from which the flight loop subtracts the latency.
-    `time_ns`: time written to results: UTC of a live camera, else the time of the recording.
-    `grey`: grey levels (H, W), None where the image could not be decoded.
-    `problem`: reason why it could not be decoded.
-    `telemetry`: telemetry that came with the image, from a recording or from ROS.
-    `vehicle`: state of the aircraft that `telemetry` was made of, from ROS.
-    `interruptions`: of a live camera: how often images stopped for a while, or the camera was
-    opened again; the latency may have changed. None where the time of exposure is known.
+    `exposed_ns`: by our monotonic clock; of a live camera the arrival, from which the flight loop
+    subtracts the latency. `time_ns`: written to results: UTC of a live camera, else that of the
+    recording. `grey`: (H, W), None where the image could not be decoded. `telemetry`, `vehicle`:
+    that came with it, from a recording or ROS. `interruptions`: of a live camera: how often images
+    stopped for a while, or it was opened again; the latency may have changed.
     """
 
     number: int
@@ -157,7 +150,7 @@ class Playback:
         clocks: Clocks,
         stopped: Callable[[], bool],
     ) -> None:
-        """`due_ns` converts a time of the recording to our clock; None: not known yet."""
+        """`due_ns`: from times of the recording to our clock; None: not known yet."""
         self._images, self._due_ns = images, due_ns
         self._clocks, self._stopped = clocks, stopped
         self._number = 0
@@ -256,11 +249,11 @@ def _images(folder: Path) -> Iterator[RecordedImage]:
     if not paths:
         raise FlightError(f"no images ({', '.join(SUFFIXES)}) in the folder: {folder}")
 
-    def loader(path: Path) -> Callable[[], Grey]:
-        return lambda: decode_image(path.read_bytes(), str(path))
+    def load(path: Path) -> Grey:
+        return decode_image(path.read_bytes(), str(path))
 
     return iter(
-        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), loader(path))
+        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), partial(load, path))
         for number, path in enumerate(paths)
     )
 
@@ -272,19 +265,16 @@ def _video(capture: Any) -> Iterator[RecordedImage]:
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             found, frame = capture.retrieve()
             grey = _grey(frame) if found else None
-            yield RecordedImage(f"{number:06d}", time_ns, _loaded(grey, number))
+            yield RecordedImage(f"{number:06d}", time_ns, partial(_loaded, grey, number))
             number += 1
     finally:
         capture.release()
 
 
-def _loaded(grey: Grey | None, number: int) -> Callable[[], Grey]:
-    def load() -> Grey:
-        if grey is None:
-            raise FlightError(f"frame {number} of the video cannot be decoded")
-        return grey
-
-    return load
+def _loaded(grey: Grey | None, number: int) -> Grey:
+    if grey is None:
+        raise FlightError(f"frame {number} of the video cannot be decoded")
+    return grey
 
 
 def _grey(frame: NDArray[Any]) -> Grey:
@@ -295,8 +285,8 @@ def _grey(frame: NDArray[Any]) -> Grey:
 def _capture(name: int | str) -> Any:
     if isinstance(name, int):
         return cv2.VideoCapture(name, cv2.CAP_V4L2)
-    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
-    capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, [int(number) for number in limits])
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 3000]
+    capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the camera describes the sensor
     return capture
 
@@ -367,22 +357,19 @@ def read_into(
         newest.end()
 
 
-class CameraThread:
-    """Reads a source into a `NewestImage` until it is stopped."""
+def read_in_thread(
+    newest: NewestImage, source: ImageSource, stopping: threading.Event
+) -> Callable[[], None]:
+    """The function that stops it; it does not wait for a device that does not answer."""
+    arguments = newest, source, stopping.is_set, stopping.wait
+    thread = threading.Thread(target=read_into, args=arguments, name="camera", daemon=True)
+    thread.start()
 
-    def __init__(
-        self, source: ImageSource, stopping: threading.Event, newest: NewestImage | None = None
-    ) -> None:
-        self.newest, self._stopping = newest or NewestImage(), stopping
-        arguments = self.newest, source, stopping.is_set, stopping.wait
-        self._thread = threading.Thread(
-            target=read_into, args=arguments, name="camera", daemon=True
-        )
-        self._thread.start()
+    def stop() -> None:
+        stopping.set()
+        thread.join(2.0)
 
-    def stop(self) -> None:
-        self._stopping.set()
-        self._thread.join(2.0)
+    return stop
 
 
 class FrozenCheck:
@@ -390,18 +377,15 @@ class FrozenCheck:
 
     def __init__(self) -> None:
         self._before: Grey | None = None
-        self._sum = 0
         self.repeats = 0
 
     def is_repeat(self, grey: Grey) -> bool:
         step = max(1, min(grey.shape) // FROZEN_SIDE_PX)
         sample = np.ascontiguousarray(grey[step // 2 :: step, step // 2 :: step])
-        total = zlib.crc32(sample.tobytes())
         before, self._before = self._before, sample
-        same = before is not None and before.shape == sample.shape and self._sum == total
-        if before is not None and before.shape == sample.shape and not same:
+        same = False
+        if before is not None and before.shape == sample.shape:
             off = np.abs(before.astype(np.int16) - sample)
-            same = float(off.mean()) < FROZEN_LEVELS and sample.std() > 0
-        self._sum = total
+            same = not off.any() or (off.mean() < FROZEN_LEVELS and sample.std() > 0)
         self.repeats = self.repeats + 1 if same else 0
         return bool(same)

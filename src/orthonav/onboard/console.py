@@ -13,7 +13,6 @@ import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TextIO
 
 import numpy as np
@@ -31,8 +30,6 @@ REMIND_S = 10.0
 """Interval of lines about a missing input."""
 RATE_S = 2.0
 """The rate of a camera is counted over so much time."""
-LOST_S = IMAGE_AGE_S
-"""A camera without an image for so long is lost."""
 _MOST_AGES = 100_000
 _KINDS = {Autopilot.PX4: " PX4", Autopilot.ARDUPILOT: " ArduPilot", None: ""}
 _STATES = {
@@ -60,11 +57,7 @@ CLOSE_S = 1.0
 
 
 class Console:
-    """Takes lines and never blocks. Thread-safe.
-
-    `is_terminal`: whether a person may be reading. `is_open`: whether there is a stream at all.
-    `quiet`: warnings only.
-    """
+    """Takes lines and never blocks. Thread-safe. `quiet`: warnings only."""
 
     def __init__(self, stream: TextIO | None, clocks: Clocks, *, quiet: bool = False) -> None:
         self._clocks, self.quiet = clocks, quiet
@@ -135,27 +128,24 @@ class _Records(logging.Handler):
         self._put(self.format(record))
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """What a flight waits for.
-
-    `newest`: images of the camera. `images`: where they come from; None: their source says itself
-    what it waits for. `is_live`: whether they come from a camera, which can be lost.
-    `link`, `url`: connection to the autopilot, where there is one.
-    `sends`: whether positions are sent to an autopilot or to ROS 2.
-    """
-
-    newest: NewestImage
-    images: str | None
-    is_live: bool
-    link: AutopilotLink | None
-    url: str | None
-    sends: bool
-
-
 class Narrator:
-    def __init__(self, console: Console, clocks: Clocks, inputs: Inputs) -> None:
-        self._console, self._clocks, self._inputs = console, clocks, inputs
+    def __init__(
+        self,
+        console: Console,
+        clocks: Clocks,
+        newest: NewestImage,
+        images: str | None,
+        link: AutopilotLink | None,
+        url: str | None,
+        *,
+        is_live: bool,
+        sends: bool,
+    ) -> None:
+        """`images`: where they come from; None: their source says what it waits for. `is_live`:
+        from a camera, which can be lost. `sends`: positions, to an autopilot or to ROS 2."""
+        self._console, self._clocks, self._sends = console, clocks, sends
+        self._newest, self._images, self._is_live = newest, images, is_live
+        self._link, self._url = link, url
         self._interval_ns = round((TERMINAL_S if console.is_terminal else FILE_S) * 1e9)
         self._status_ns = clocks.mono_ns() + self._interval_ns
         self._reminded: dict[str, int] = {}
@@ -207,7 +197,7 @@ class Narrator:
             return None
         if isinstance(result.outcome, NoFix) and withheld in (None, "no_fix"):
             return result.outcome.reason
-        return withheld or ("not_sent" if self._inputs.sends else None)
+        return withheld or ("not_sent" if self._sends else None)
 
     def _explain(self, result: ViewResult) -> None:
         outcome = result.outcome
@@ -222,10 +212,10 @@ class Narrator:
         say(f"{change}: {text}")
 
     def _watch(self, now_ns: int) -> None:
-        """Say which inputs came or went, and which are missing."""
-        if self._inputs.link is not None:
-            self._remind(self._autopilot.waits(self._inputs.link, self._inputs.url), now_ns)
-        self._remind(self._camera.waits(self._inputs, now_ns), now_ns)
+        if self._link is not None:
+            self._remind(self._autopilot.waits(self._link, self._url), now_ns)
+        is_here = self._camera.delivers(self._newest, now_ns, is_live=self._is_live)
+        self._remind(None if is_here else self._images, now_ns)
 
     def _remind(self, waits: str | None, now_ns: int) -> None:
         if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
@@ -234,7 +224,7 @@ class Narrator:
 
     def _say_faults(self, plain: Mapping[str, Any], now_ns: int) -> None:
         hidden = _SAID_BY_OTHERS
-        if self._inputs.link is not None and not self._autopilot.is_heard:
+        if self._link is not None and not self._autopilot.is_heard:
             hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
         shown = tuple(each for each in plain["reasons"] if each not in hidden)
         if self._is_faulty and plain["health"] == Level.OK.name:
@@ -262,13 +252,13 @@ class Narrator:
             return f"no view yet; health {plain['health']}"
         outcome, is_place = self._result.outcome, self._result.state in ("tracking", "coasting")
         place = f" {_place_text(outcome)}" if is_place and isinstance(outcome, Fix) else ""
-        parts = [f"{plain['state']}{place}", _counted(since, self._inputs.sends)]
+        parts = [f"{plain['state']}{place}", _counted(since, self._sends)]
         if plain["age_p50_ms"]:
             parts.append(f"latency {plain['age_p50_ms']:.0f} ms, p95 {plain['age_p95_ms']:.0f} ms")
         return "; ".join([*parts, f"health {plain['health']}"])
 
     def _summary(self) -> str:
-        parts = [_counted(self._counts, self._inputs.sends)]
+        parts = [_counted(self._counts, self._sends)]
         if self._dropped:
             parts.append(f"images dropped as too late: {self._dropped}")
         if self._ages_ms:
@@ -288,17 +278,15 @@ class _CameraWatch:
         self._since: tuple[int, int] | None = None
         self._size: tuple[int, int] | None = None
 
-    def waits(self, inputs: Inputs, now_ns: int) -> str | None:
-        """Note the images so far; what is waited for, None where images come."""
-        newest = inputs.newest
+    def delivers(self, newest: NewestImage, now_ns: int, *, is_live: bool) -> bool:
         taken, outages, size = newest.taken, newest.outages, newest.size_px
-        is_gone = outages > self._outages or now_ns - self._seen_ns > LOST_S * 1e9
-        if self._since is not None and is_gone and inputs.is_live:
+        is_gone = outages > self._outages or now_ns - self._seen_ns > IMAGE_AGE_S * 1e9
+        if self._since is not None and is_gone and is_live:
             self._console.warn("camera lost: no image any more")
             self._since = self._size = None
         self._outages = outages
         if taken == self._taken:
-            return inputs.images if self._since is None else None
+            return self._since is not None
         self._taken, self._seen_ns = taken, now_ns
         if self._since is None:
             self._since = now_ns, taken
@@ -307,7 +295,7 @@ class _CameraWatch:
             rate_hz = (taken - self._since[1]) / seconds
             self._console.say(f"camera {size[0]}x{size[1]}, {rate_hz:.1f} Hz")
             self._size = size
-        return None
+        return True
 
 
 class _AutopilotWatch:
@@ -339,7 +327,6 @@ class _AutopilotWatch:
 
 
 def _meaning(reason: str, plain: Mapping[str, Any]) -> str:
-    """What a reason of the health means; empty where its name says so."""
     if reason == "start_mismatch":
         return f"{_FAULTS[reason]}, {plain['start_off_m']:,.0f} m from the place found"
     of_camera = str(plain.get("latency"))

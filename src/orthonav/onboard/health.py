@@ -75,23 +75,12 @@ class Health:
 class Snapshot:
     """Input of `judge`. Ages are in seconds, infinite for "never".
 
-    `running_s`: time since the start.
-    `counts`: events within the window by name: `taken` (by the runner), `processed`, `late`,
-    `frozen`, `bad_image`, `no_telemetry`, `internal_error`, `wrong_camera`, `camera_lost`,
-    `clock_jump`, `output_failed`, `log_failed`, `state_failed`; seconds in which a local message
-    came too late for PX4 (`slow_vision`) or a message could not be built (`incomplete`).
-    `image_age_s`, `telemetry_age_s`, `link_age_s`: time since the last image, attitude, message.
-    `low_confidence_s`: time since the last confident position.
-    `latency_s`: 95th percentile of the time from exposure to message.
-    `state`: state of the track; None for views that are located one by one.
-    `synced`: whether TIMESYNC is answered.
-    `map_unchanged`: whether the file of the map's name is still the one that was opened.
-    `map_intact`: whether the open map file was neither truncated nor rewritten.
-    `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
-    `start_off_m`: distance by which the ground contradicts the start position, 0 if it does not.
-    `gnss`: reasons of the GNSS monitor.
-    `has_origin`: whether the origin of the local frame is known, where messages need it.
-    `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
+    `counts`: events within the window by name; `slow_vision` and `incomplete` are seconds in which
+    a local message came too late for PX4 or a message could not be built. `latency_s`: 95th
+    percentile from exposure to message. `map_unchanged`: the file of the map's name is the one that
+    was opened; `map_intact`: the open file was not changed. `start_off_m`: distance by which the
+    ground contradicts the start. `gnss`, `latency`: reasons of the monitors. `has_origin`: of the
+    local frame, where messages need it.
     """
 
     running_s: float
@@ -160,8 +149,7 @@ def judge(seen: Snapshot) -> Health:
 
 
 class EventCounter:
-    def __init__(self, window_s: float = WINDOW_S) -> None:
-        self._window_ns = round(window_s * 1e9)
+    def __init__(self) -> None:
         self._events: deque[tuple[int, str]] = deque()
         self._latencies: deque[tuple[int, float]] = deque()
         self._counts: Counter[str] = Counter()
@@ -176,7 +164,7 @@ class EventCounter:
         self._latencies.append((now_ns, seconds))
 
     def counts(self, now_ns: int) -> Counter[str]:
-        begin = now_ns - self._window_ns
+        begin = now_ns - round(WINDOW_S * 1e9)
         while self._events and self._events[0][0] < begin:
             self._counts[self._events.popleft()[1]] -= 1
         while self._latencies and self._latencies[0][0] < begin:
@@ -190,7 +178,7 @@ class EventCounter:
 
 
 class HealthReporter:
-    """Decides when a change of health is sent as text: at most once in five seconds. Mutable."""
+    """Decides when a change of health is sent as text. Mutable."""
 
     def __init__(self) -> None:
         self._reported: Health | None = None
@@ -268,7 +256,7 @@ class TelemetryDiagnosis:
             return
         if self._busy or now_ns - self._since_ns < DIAGNOSIS_INTERVAL_S * 1e9:
             return
-        self._since_ns = now_ns
+        self._since_ns, self._busy = now_ns, True
         heading_known, factor = self._hypotheses[self._number % len(self._hypotheses)]
         self._number += 1
         telemetry = view.telemetry
@@ -286,7 +274,6 @@ class TelemetryDiagnosis:
             finally:
                 self._busy = False
 
-        self._busy = True
         self._start(locate)
 
     def mismatch(self, now_ns: int) -> tuple[float, float]:
@@ -296,7 +283,6 @@ class TelemetryDiagnosis:
 
     @property
     def place(self) -> tuple[Fix, int] | None:
-        """The last position found and the time of its view, for comparison with the start only."""
         return None if self._found is None else (self._found[1], self._found[0])
 
 
@@ -306,7 +292,6 @@ def _in_a_thread(work: Callable[[], None]) -> None:
 
 class StartCheck:
     def __init__(self, start: Prior, time_ns: int) -> None:
-        """`time_ns`: time of the first view, for which the start holds."""
         self._start, self._time_ns = start, time_ns
         self._moved_en_m, self._free_m = np.zeros(2), 0.0
         self._diagnosed: _Place | None = None
@@ -328,7 +313,7 @@ class StartCheck:
             self._diagnosed = self._place(fix, seen_ns, now_ns)
 
     def confirmed(self, fix: Fix, now_ns: int) -> None:
-        """Pass the confident fixes of the track; the first one decides."""
+        # The first one decides.
         if self._confirmed is None:
             self._confirmed = self._place(fix, now_ns, now_ns)
 

@@ -59,22 +59,15 @@ is not within this of sea level."""
 class LinkStatus:
     """Status of a link. Ages are in seconds, infinite for "never".
 
-    `is_open`: whether the port is open.
-    `heard_age_s`, `attitude_age_s`: time since the last message and the last attitude.
-    `synced`: whether TIMESYNC is answered.
-    `jumps`: number of clock jumps since the start.
-    `errors`: number of failures of the port since the start.
-    `target`, `kind`: ids and type of the autopilot; None until its first heartbeat.
-    `others`: autopilots that were heard and are not used.
-    `damaged`: number of messages that could not be decoded, or were not signed as asked.
+    `synced`: whether TIMESYNC is answered. `target`, `kind`: None until the first heartbeat.
+    `others`: autopilots that were heard and are not used. `damaged`: number of messages that could
+    not be decoded, or were not signed as asked.
     """
 
     is_open: bool
     heard_age_s: float
     attitude_age_s: float
     synced: bool
-    jumps: int
-    errors: int
     target: Target | None
     kind: Autopilot | None
     others: tuple[Target, ...]
@@ -96,12 +89,10 @@ class AutopilotLink:
         stamp: Clock = Clock.UTC,
         own_receiver: int | None = None,
     ) -> None:
-        """`system_id`: that of the autopilot, by default of the first one heard. `signing`: sign
-        outgoing messages and require incoming ones to be signed with the same key. `silent`: send
-        nothing. `stamp`: clock of the timestamps of messages, with which TIMESYNC is answered.
-        `own_receiver`: number of the GNSS receiver that orthonav stands for, if any.
-
-        Raises `MissingExtraError` where pymavlink is missing or too old.
+        """`system_id`: by default that of the first autopilot heard. `signing`: sign outgoing
+        messages and require incoming ones to be signed with the same key. `stamp`: clock of the
+        timestamps, with which TIMESYNC is answered. `own_receiver`: number of the GNSS receiver
+        that orthonav stands for. Raises `MissingExtraError` where pymavlink is missing or old.
         """
         dialect()
         self._opener, self._clocks = opener, clocks
@@ -192,8 +183,6 @@ class AutopilotLink:
                 heard_age_s=_age_s(now_ns, self._heard_ns),
                 attitude_age_s=_age_s(now_ns, self._attitude_ns),
                 synced=self.sync.is_exact,
-                jumps=self.sync.jumps,
-                errors=self.counts["error"],
                 target=self.target,
                 kind=self.kind,
                 others=tuple(self._others),
@@ -306,9 +295,6 @@ class AutopilotLink:
         self.buffer.clear()
         self.origin = None
 
-    def _arrived(self, now_ns: int) -> int | None:
-        return self.sync.boot_ns(now_ns)
-
     def _heartbeat(self, message: Message, now_ns: int) -> None:
         self.kind = _KINDS.get(message.autopilot, self.kind)
         self.armed = bool(message.base_mode & _ARMED)
@@ -343,7 +329,7 @@ class AutopilotLink:
 
     def _altitude(self, message: Message, now_ns: int) -> None:
         """Its timestamp may be UTC instead of time since boot; then the time of arrival is used."""
-        arrived_ns, reported_ns = self._arrived(now_ns), int(message.time_usec) * 1000
+        arrived_ns, reported_ns = self.sync.boot_ns(now_ns), int(message.time_usec) * 1000
         if arrived_ns is None:
             return
         time_ns = reported_ns if abs(reported_ns - arrived_ns) < _FAR_NS else arrived_ns
@@ -365,7 +351,7 @@ class AutopilotLink:
             self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
 
     def _rangefinder(self, message: Message, now_ns: int) -> None:
-        arrived_ns = self._arrived(now_ns)
+        arrived_ns = self.sync.boot_ns(now_ns)
         if arrived_ns is not None and message.distance > 0:
             self.buffer.add_distance(arrived_ns, message.distance)
 
@@ -392,7 +378,7 @@ class AutopilotLink:
     def _gnss(self, message: Message, now_ns: int) -> None:
         number = 0 if message.get_type() == "GPS_RAW_INT" else 1
         self.aiding.receiver(number, message.fix_type, now_ns)
-        self.gnss.append(gnss_sample(message, now_ns, self._arrived(now_ns)))
+        self.gnss.append(gnss_sample(message, now_ns, self.sync.boot_ns(now_ns)))
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages

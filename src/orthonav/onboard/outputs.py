@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
@@ -45,6 +45,10 @@ from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
 from orthonav.onboard.ports import Descriptor, Udp, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
+if TYPE_CHECKING:
+    from orthonav.onboard.console import Narrator
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
+
 log = logging.getLogger(__name__)
 KINDS = {
     "global-position": "GLOBAL_POSITION_SENSOR",
@@ -70,17 +74,10 @@ _MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
 
 @dataclass(frozen=True)
 class MessageOptions:
-    """Messages to send and their fields; docs/autopilots.md describes each message.
+    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md).
 
-    `kinds`: names of messages, keys of `KINDS`.
-    `clock`: clock of the timestamps.
-    `sensor_id`: id of GLOBAL_POSITION_SENSOR, 1 to 255; PX4's `EKF2_AGP0_ID`.
-    `gps_id`, `satellites`: fields of GPS_INPUT.
-    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored.
-    `min_std_m`: lower bound of the reported standard deviation, metres.
-    `min_confidence`: confidence (0 to 1) from which a position is reported as valid.
-    `autopilot`: whose conventions local messages follow; None: those of the autopilot heard.
-    `origin`: origin of the local frame to set, on the ground, where the autopilot has none.
+    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored. `origin`: of the
+    local frame, set on the ground where the autopilot has none.
     """
 
     kinds: tuple[str, ...] = ("global-position",)
@@ -91,7 +88,6 @@ class MessageOptions:
     hdop_m: float | None = None
     min_std_m: float = 0.0
     min_confidence: float = CONFIDENT
-    autopilot: Autopilot | None = None
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
@@ -109,7 +105,6 @@ class Messenger:
     def __init__(
         self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
     ) -> None:
-        """`gate` limits the rates; `send` returns whether the port was open."""
         self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
         self._covariance = FilterCovariance(options.min_std_m)
         self.incomplete = self.too_slow = 0
@@ -149,12 +144,8 @@ class Messenger:
         """Note that a message was sent, and whether it was too late for PX4."""
         interval_s = self._covariance.interval_s(name, exposed_ns)
         self._covariance.sent(name, exposed_ns)
-        if name in LOCAL and self._convention(kind) is Autopilot.PX4:
+        if name in LOCAL and kind is not Autopilot.ARDUPILOT:
             self.too_slow += PX4_VISION_S <= interval_s < math.inf
-
-    def _convention(self, kind: Autopilot | None) -> Autopilot:
-        """Whose conventions local messages follow; `kind` is the autopilot heard."""
-        return self.options.autopilot or kind or Autopilot.PX4
 
     def _not_made(self, name: str, error: EstimateError) -> None:
         """Count a message that could not be built, and log why, once for each reason."""
@@ -221,7 +212,7 @@ class Messenger:
             )
         make = odometry if name == "odometry" else vision_position_estimate
         pose = _pose(vehicle, origin)
-        return make(estimate, pose, self._convention(kind), clock=clock, min_confidence=least)
+        return make(estimate, pose, kind or Autopilot.PX4, clock=clock, min_confidence=least)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -238,12 +229,6 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
     )
 
 
-class Sink(Protocol):
-    def write(self, data: bytes) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class TcpSink:
     """TCP server that sends the same data to all clients; one that does not read is dropped."""
 
@@ -251,10 +236,6 @@ class TcpSink:
         self._listening = socket.create_server(address)
         self._listening.setblocking(False)
         self._clients: list[socket.socket] = []
-
-    @property
-    def port(self) -> int:
-        return int(self._listening.getsockname()[1])
 
     def write(self, data: bytes) -> None:
         try:
@@ -299,6 +280,9 @@ class SerialSink:
         if self._port is not None:
             self._port.close()
             self._port = None
+
+
+Sink = Udp | TcpSink | SerialSink
 
 
 def open_sink(url: str) -> Sink:
@@ -379,35 +363,6 @@ class JsonOut:
             raise
 
 
-class ViewOutput(Protocol):
-    """Takes every view, and the health: lines of JSON, the console. Raises `OSError`."""
-
-    def view(
-        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
-    ) -> None: ...
-
-    def health(self, plain: dict[str, Any]) -> None: ...
-
-    def close(self) -> None: ...
-
-
-class PositionOutput(Protocol):
-    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`.
-
-    `for_filter`: whether it gets covariances for a filter instead of those of the fixes.
-    """
-
-    for_filter: bool
-
-    def position(
-        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
-    ) -> tuple[str, ...]: ...
-
-    def health(self, plain: dict[str, Any]) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class Publisher:
     """Publishes results to all outputs. Mutable."""
 
@@ -419,8 +374,8 @@ class Publisher:
         messenger: Messenger | None = None,
         link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
-        lines: Sequence[ViewOutput] = (),
-        graph: PositionOutput | None = None,
+        lines: "Sequence[JsonOut | Narrator]" = (),
+        graph: "Ros2Publisher | None" = None,
         min_confidence: float = CONFIDENT,
         min_std_m: float = 0.0,
     ) -> None:
@@ -428,7 +383,7 @@ class Publisher:
         self.gate, self._clocks = gate, clocks
         self.messenger, self._link = messenger, link
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
-        self._graph = [graph] if graph is not None else []
+        self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
         self.failed = 0
 

@@ -34,13 +34,13 @@ _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
 TRAVELLED = slice(4, 7)
 """The displacement in a sample of the local frame, after velocity and down position."""
-KEEP_S = 20.0
+KEEP_NS = 20 * 10**9
 """Samples are kept for so long: the longest latency of a camera, and some more."""
 ATTITUDE_GAP_S, SLOW_GAP_S = 0.5, 2.0
 """Longest interval that is interpolated: of attitudes, which change fast, and of the rest."""
 ATTITUDE_HOLD_S, SLOW_HOLD_S = 0.1, 1.5
 """Time for which the last sample holds."""
-ATTITUDE_AHEAD_S = 0.03
+ATTITUDE_AHEAD_NS = 30_000_000
 """Longest extrapolation of the attitude."""
 FASTEST_MPS = 300.0
 """A faster velocity is an error and is not integrated."""
@@ -93,14 +93,10 @@ class Travelled(NamedTuple):
 class VehicleState:
     """State of the aircraft that the autopilot reported for one time of its clock.
 
-    `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known.
-    `height_m`: height above ground; NaN where not known, as the rest. It equals `home_m` where only
-    that is known: then level ground is assumed.
-    `velocity_ned_mps`: velocity north, east, down.
-    `down_m`: distance below the origin of the autopilot's local frame.
-    `home_m`, `amsl_m`: height above the place of take-off, and above mean sea level.
-    `travelled`: displacement by the velocity; None where that is not known.
-    `vel_std_mps`, `tilt_std_deg`: standard deviations of velocity and attitude; NaN: as usual.
+    `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known. The rest is NaN
+    where not known. `height_m`: above ground; it equals `home_m`, the height above the take-off,
+    where only that is known: level ground is assumed. `down_m`: below the origin of the autopilot's
+    local frame. `vel_std_mps`, `tilt_std_deg`: NaN: as usual.
     """
 
     ned_from_body: Array | None
@@ -179,7 +175,7 @@ class _Samples:
         return self.values[-2], self.values[-1], 1 + (time_ns - self.times[-1]) / interval
 
     def covered_ns(self, most_ns: int) -> int:
-        """Time up to which values are known, extrapolation included where samples are dense."""
+        """Time up to which values are known; extrapolated where samples are dense."""
         close = len(self.times) > 1 and self.times[-1] - self.times[-2] <= 2 * most_ns
         return self.times[-1] + (most_ns if close else 0)
 
@@ -218,12 +214,12 @@ class TelemetryBuffer:
         before = self._attitude.values
         if before and float(before[-1] @ quaternion) < 0:
             quaternion = -quaternion  # the same attitude, for the shorter interpolation
-        self._attitude.add(time_ns, quaternion, self._keep_ns)
+        self._attitude.add(time_ns, quaternion, KEEP_NS)
 
     def add_height(self, source: str, time_ns: int, height_m: float) -> None:
         """Add a height from one of `HEIGHT_SOURCES`; `altitude` is a second one above sea level."""
         if source in self._heights and math.isfinite(height_m):
-            self._heights[source].add(time_ns, np.array([height_m]), self._keep_ns)
+            self._heights[source].add(time_ns, np.array([height_m]), KEEP_NS)
 
     def add_distance(self, time_ns: int, distance_m: float) -> None:
         """Add a distance along the body's down axis, converted to a height over flat ground."""
@@ -246,16 +242,16 @@ class TelemetryBuffer:
                 values[TRAVELLED] = self._parts, 0.0, 0.0
             else:
                 values[TRAVELLED] = self._travelled_at(time_ns, values[:2])
-        local.add(time_ns, values, self._keep_ns)
+        local.add(time_ns, values, KEEP_NS)
 
     @property
     def covered_ns(self) -> int | None:
-        return self._attitude.covered_ns(self._ahead_ns) if self._attitude.times else None
+        return self._attitude.covered_ns(ATTITUDE_AHEAD_NS) if self._attitude.times else None
 
     def at(self, time_ns: int) -> VehicleState:
         found = self._attitude.around(time_ns)
         if found is not None and time_ns > self._attitude.times[-1]:
-            found = self._attitude.ahead(time_ns, self._ahead_ns) or found
+            found = self._attitude.ahead(time_ns, ATTITUDE_AHEAD_NS) or found
         turn = None
         if found is not None:
             before, after, weight = found
@@ -291,14 +287,6 @@ class TelemetryBuffer:
         found = (self._heights[name].at(time_ns) for name in names if name in self._heights)
         return next((float(value[0]) for value in found if value is not None), math.nan)
 
-    @property
-    def _ahead_ns(self) -> int:
-        return round(ATTITUDE_AHEAD_S * 1e9)
-
-    @property
-    def _keep_ns(self) -> int:
-        return round(KEEP_S * 1e9)
-
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
@@ -324,13 +312,12 @@ def _matrix(wxyz: Array) -> Array:
 
 
 class ClockSync:
-    """Converts times of our clock to the autopilot's and back.
+    """Converts times of our clock to the autopilot's and back. Mutable.
 
-    Offset and rate are those of the last `WINDOW` TIMESYNC exchanges: simulators run slower than
-    real time, so the rate is fitted where the exchanges show it. Without exchanges the offset comes
-    from the timestamps of messages: the one with the least delay counts. An outlier is ignored
-    unless others agree with it; then a clock was set or the autopilot restarted, and the estimate
-    starts again (`jumps`). Mutable.
+    Offset and rate are those of the last TIMESYNC exchanges: simulators run slower than real time.
+    Without exchanges the timestamp of the message with the least delay counts. An outlier is
+    ignored unless others agree with it; then a clock was set or the autopilot restarted, and the
+    estimate starts again (`jumps`).
     """
 
     WINDOW = 32
