@@ -39,9 +39,9 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
+from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
-from orthonav.onboard.run import localize_flight
 
 NAME = "long_flights"
 CAMERA = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)
