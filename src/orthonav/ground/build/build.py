@@ -41,7 +41,6 @@ from orthonav.ground.build.calibrate import (
     calibrate,
     calibrate_registration,
 )
-from orthonav.ground.build.cellparts import cell_parts
 from orthonav.ground.build.encoders import (
     EncoderRecipe,
     Learning,
@@ -52,6 +51,7 @@ from orthonav.ground.build.encoders import (
     stored_representation,
     usual_edges,
 )
+from orthonav.ground.build.layer import cell_parts
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
 from orthonav.ground.build.terrain import TerrainParts, terrain_of_dem
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -94,7 +94,7 @@ class BuildRequest:
     - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
     - `dem_datum`: what its heights count from, where the file does not state it
-      (`orthonav.ground.imagery.datum.OPTION`).
+      (`orthonav.ground.imagery.terrain.OPTION`).
     - `dem_needed`: whether an area in which the model has no height is refused; else the map has
       no terrain layer.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
