@@ -42,30 +42,24 @@ _REACH_PX = 7
 SAMPLE_PX = 512
 """Side of the decimated image that percentiles are computed from."""
 SAMPLED_SOURCES = 12
-"""Files of one kind that are sampled."""
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ContrastStretch:
-    """Linear map of raw values to 0..255: `low` becomes 0, `high` 255."""
-
     low: float
     high: float
 
     def apply(self, values: NDArray[Any]) -> NDArray[np.uint8]:
-        """8-bit values, same shape."""
         scale = 255.0 / (self.high - self.low)
         scaled = (values.astype(np.float32) - self.low) * scale
         return np.asarray(np.clip(np.nan_to_num(scaled) + 0.5, 0, 255), dtype=np.uint8)
 
 
 def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None, ...]:
-    """The stretch of each source: None for 8 bit, else common to all of one kind.
+    """The stretch of each source: None for 8 bit, else common to all of one product.
 
-    A kind has one pixel type, number of bands, ground resolution and coordinate system: the files
-    of one product. From the 0.5 and 99.5 percentiles of valid pixels of up to `SAMPLED_SOURCES`.
-    Raises `ImageryError` where none can be read or no pixel is valid.
+    From the 0.5 and 99.5 percentiles of valid pixels.
     """
     alike: dict[Any, list[int]] = {}
     for index, source in enumerate(sources):
@@ -103,7 +97,6 @@ def _common(sources: list[Source]) -> ContrastStretch:
 
 
 def _valid_values(source: Source) -> NDArray[Any]:
-    """Finite values (N,) of valid pixels of a decimated read."""
     (lattice,) = lattices_of([source])
     with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
         shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
@@ -128,7 +121,7 @@ class Mosaic:
         """Inspect files, and all orthophotos of folders, the newest first; nothing stays open.
 
         `epoch`: decimal year at which positions in systems of plates are those of WGS 84; None:
-        they are taken as they are. Raises as `open_source`, `sources_in` and `at_epoch` do.
+        they are taken as they are.
         """
         if not paths:
             raise ImageryError("no orthophoto was given")
@@ -148,22 +141,22 @@ class Mosaic:
 
     @property
     def stretch(self) -> ContrastStretch | None:
-        """The contrast stretch of the first source with more than 8 bits, if any."""
+        """Of the first source with more than 8 bits."""
         return next((each for each in self.stretches if each is not None), None)
 
     @property
     def gsd_m(self) -> float:
-        """Finest ground resolution of the sources in metres."""
+        """The finest."""
         return min(source.gsd_m for source in self.sources)
 
     @property
     def outline_latlon_deg(self) -> NDArray[np.float64]:
-        """Border points (N, 2) of all sources, latitude and longitude in degrees."""
+        """Border points (N, 2) of all sources."""
         return np.concatenate([source.outline_latlon_deg for source in self.sources])
 
     @property
     def common_stamp(self) -> list[list[float] | None]:
-        """The stretches, which all pixels depend on besides their files."""
+        """What all pixels depend on besides their files."""
         found = {(each.low, each.high) for each in self.stretches if each is not None}
         return [list(each) for each in sorted(found)]
 
@@ -178,25 +171,21 @@ class Mosaic:
         return tuple(_described(members) for members in kinds.values())
 
     def sheet(self, frame: LocalFrame, **place: Any) -> "SheetRaster":
-        """The mosaic resampled into `frame`; `place` is that of `SheetRaster`."""
         return SheetRaster(self, frame, **place)
 
     def grid_sheet(
         self, frame: LocalFrame, grid: TileGrid, threads: int | None = None
     ) -> "SheetRaster":
-        """The raster that all tiles of a grid together cover."""
         names = ("west_m", "north_m", "width_px", "height_px", "gsd_m")
         place = {name: getattr(grid, name) for name in names}
         return SheetRaster(self, frame, **place, threads=threads)
 
     @cached_property
     def lattices(self) -> list[Lattice]:
-        """The sources by the pixel lattices that they share, in order of precedence."""
         return lattices_of(self.sources)
 
 
 def _described(sources: Sequence[Source]) -> dict[str, Any]:
-    """A file, or the files of one kind of a folder: their number, first and last date."""
     first = sources[0]
     if first.folder is None:
         return first.describe()
@@ -214,20 +203,20 @@ def _described(sources: Sequence[Source]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """A window of a sheet: `rgb` (H, W, 3) uint8 and `valid` (H, W) bool."""
+    """`rgb` (H, W, 3) uint8 and `valid` (H, W) bool."""
 
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_]
 
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
-        """Grey levels (H, W) uint8 (ITU-R BT.601 weights); 0 where not valid."""
+        """ITU-R BT.601 weights; 0 where not valid."""
         return np.asarray(cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class GreyPixels:
-    """A window of a sheet: `grey` (H, W) uint8, 0 where not valid, and `valid` (H, W) bool."""
+    """`grey` (H, W) uint8, 0 where not valid, and `valid` (H, W) bool."""
 
     grey: NDArray[np.uint8]
     valid: NDArray[np.bool_]
@@ -236,8 +225,7 @@ class GreyPixels:
 class SheetRaster:
     """A north-up raster in a sheet's plane over orthophotos; a context manager.
 
-    Its first pixel begins at `west_m`, `north_m`. It belongs to the thread that enters it; start
-    other threads than the main one inside `quiet`. It uses `threads` of its own (None: all cores).
+    It belongs to the thread that enters it; start other threads than the main one inside `quiet`.
     """
 
     def __init__(
@@ -273,18 +261,12 @@ class SheetRaster:
         self._env.close()
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
-        """Pixels of a window; outside all imagery they are 0 and invalid.
-
-        Raises `ImageryError` where a file cannot be read.
-        """
+        """Pixels of a window; outside all imagery they are 0 and invalid."""
         values, valid = self._composed(Window(col, row, width_px, height_px), 3)
         return Pixels(values, valid)
 
     def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> GreyPixels:
-        """The same in grey, converted before resampling: within one level of `read`, and faster.
-
-        Raises `ImageryError` where a file cannot be read.
-        """
+        """Converted before resampling: within one level of `read`, and faster."""
         values, valid = self._composed(Window(col, row, width_px, height_px), 1)
         return GreyPixels(values[..., 0], valid)
 
@@ -344,7 +326,6 @@ class SheetRaster:
                 )
 
     def _near(self, left: int, top: int, right: int, bottom: int) -> NDArray[np.bool_]:
-        """Which of the sources may overlap a box."""
         boxes = self._boxes_px
         near = (boxes[:, 0] < right) & (boxes[:, 2] > left)
         return np.asarray(near & (boxes[:, 1] < bottom) & (boxes[:, 3] > top))
@@ -410,10 +391,7 @@ class SheetRaster:
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
     ) -> tuple[Window, bool] | None:
-        """Pixels of a lattice that a window of the sheet needs, and whether all of them exist.
-
-        None where none exists.
-        """
+        """Pixels of a lattice that a window needs, and whether all of them exist; None for none."""
         share = np.linspace(0, 1, 9)
         zero, one = np.zeros(9), np.ones(9)
         cols = np.concatenate([share, share, zero, one]) * shape[1]
@@ -439,7 +417,6 @@ class SheetRaster:
         return Window(left, top, right - left, bottom - top), had == wanted
 
     def _dataset(self, lattice: Lattice) -> Any:
-        """The open lattice, with the members that the sheet may need."""
         key = lattice.members[0]
         if key not in self._open:
             near = self._near(0, 0, self.width_px, self.height_px)
@@ -458,7 +435,6 @@ class SheetRaster:
 
 
 def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:
-    """Bands (C, h, w) converted to one or three: colours to grey, or grey to all three."""
     if len(bands) == colours:
         return bands
     if colours == 3:
@@ -468,10 +444,7 @@ def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:
 
 
 def _fill_holes(bands: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-    """Fill invalid pixels near valid ones with the mean of their surroundings.
-
-    Interpolation mixes neighbours, so the fill value of a hole would show next to it.
-    """
+    """Interpolation mixes neighbours, so the fill value of a hole would show next to it."""
     known = (mask > 0).astype(np.float32)
     if known.all() or not known.any():
         return

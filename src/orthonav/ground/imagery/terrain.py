@@ -35,11 +35,10 @@ except ImportError as error:
 
 Array = NDArray[np.float64]
 BLOCK_PX = 256
-"""Side of the windows that are read."""
 SAMPLE_PX = 512
 """Side of the overview from which units and voids are judged."""
 DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
-"""Tag of files that `orthonav fetch` wrote: what their heights count from."""
+"""In files that `orthonav fetch` wrote."""
 _UNITS = {
     "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
     "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048,
@@ -47,13 +46,12 @@ _UNITS = {
 }  # fmt: skip
 _OPTIONS = {"GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 64 * 2**20}
 Undulation = Callable[[Array, Array], Array]
-"""Function of latitudes and longitudes (deg): height of the geoid above the ellipsoid (m)."""
+"""Height of the geoid above the ellipsoid (m) by latitudes and longitudes (deg)."""
 NAMED = {"egm96": "EPSG:5773", "egm2008": "EPSG:3855", "msl": "EPSG:5714"}
-"""Vertical systems with short names; `ellipsoid` is the ellipsoid of WGS 84."""
 ELLIPSOID = "ellipsoid"
 OPTION = f"--dem-datum {'|'.join((*NAMED, ELLIPSOID))}|EPSG:NUMBER"
 GEOIDS = ("us_nga_egm08_25.tif", "egm08_25.gtx", "us_nga_egm96_15.tif", "egm96_15.gtx")
-"""Grids of the geoid, in the order of preference; the second names are those of older PROJ."""
+"""In the order of preference; the second names are those of older PROJ."""
 _DEGREES = "+proj=unitconvert +xy_in=deg +xy_out=rad"
 _RADIANS = "+proj=unitconvert +xy_in=rad +xy_out=deg"
 log = logging.getLogger(__name__)
@@ -63,9 +61,8 @@ log = logging.getLogger(__name__)
 class VerticalDatum:
     """What heights count from.
 
-    `name`: for people. `above_ellipsoid`: whether they are above the ellipsoid; all others are
-    taken as above mean sea level, from which national systems differ by up to two metres.
-    `unit_m`: metres of one unit.
+    All but those above the ellipsoid are taken as above mean sea level, from which national systems
+    differ by up to two metres. `unit_m`: metres of one unit.
     """
 
     name: str
@@ -76,11 +73,7 @@ class VerticalDatum:
 def horizontal_and_vertical(
     crs: Any, given: str | None, path: Path
 ) -> tuple[pyproj.CRS, VerticalDatum]:
-    """The horizontal system of a terrain file, and its vertical datum.
-
-    `crs`: system of the file, of rasterio. `given`: the datum that the user names, see `OPTION`;
-    needed where the file states none. Raises `ImageryError`.
-    """
+    """Of a file with the system `crs`, and the datum `given` by the user, needed if it states none."""
     try:
         system = pyproj.CRS.from_wkt(crs.to_wkt())
         stated, horizontal = _stated(system)
@@ -102,7 +95,6 @@ def horizontal_and_vertical(
 
 
 def datum_of(text: str) -> VerticalDatum:
-    """The datum of a name of `OPTION`. Raises `ImageryError` for others."""
     if text.lower() == ELLIPSOID:
         return VerticalDatum("above the ellipsoid of WGS 84", True)
     try:
@@ -139,10 +131,7 @@ def _vertical(system: pyproj.CRS) -> VerticalDatum:
 
 @functools.cache
 def geoid() -> Undulation:
-    """The geoid, from a grid of PROJ on this machine; nothing is downloaded.
-
-    Raises `ImageryError`, which names the grids and where to get them, if there is none.
-    """
+    """From a grid of PROJ on this machine; nothing is downloaded."""
     for name in GEOIDS:
         try:
             found = pyproj.Transformer.from_pipeline(
@@ -161,7 +150,7 @@ def geoid() -> Undulation:
 
 
 def _undulation(transformer: pyproj.Transformer, lat_deg: Array, lon_deg: Array) -> Array:
-    """Height of the geoid above the ellipsoid; NaN outside the grid."""
+    """NaN outside the grid."""
     lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
     shifted = transformer.transform(lon, lat, np.zeros_like(lat))[2]
     found = np.asarray(shifted, np.float64)
@@ -172,7 +161,6 @@ def _undulation(transformer: pyproj.Transformer, lat_deg: Array, lon_deg: Array)
 class Dem:
     """An open terrain model; calling it gives heights above mean sea level (`TerrainHeights`).
 
-    `path`: its file. `datum`: what its heights count from. `gsd_m`: its ground resolution.
     Heights are read by windows; for one thread.
     """
 
@@ -189,11 +177,7 @@ class Dem:
         object.__setattr__(self, "_system_from_world", turned)
 
     def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
-        """Heights above mean sea level, bilinear; NaN for no data and outside the file.
-
-        Raises `ImageryError` where the file cannot be read, or where its heights count from the
-        ellipsoid and there is no geoid.
-        """
+        """Bilinear; NaN for no data and outside the file."""
         lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
         col, row = self._pixels(lat.ravel(), lon.ravel())
         found = np.full(col.shape, np.nan)
@@ -208,7 +192,6 @@ class Dem:
         return self._above_sea(found.reshape(lat.shape), lat, lon)
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:
-        """Whether a position lies in the file, holes included."""
         col, row = self._pixels(np.array([lat_deg]), np.array([lon_deg]))
         return bool(0 <= col[0] <= self._data.width and 0 <= row[0] <= self._data.height)
 
@@ -221,11 +204,8 @@ class Dem:
         rows: int,
         cols: int,
     ) -> Array:
-        """Mean heights (rows, cols) above mean sea level of squares of `posting_m` in a plane.
-
-        The north-west corner of the first one is `west_m`, `north_m`. NaN for holes. Raises as
-        `__call__`.
-        """
+        """Mean heights (rows, cols) of squares of `posting_m` from a north-west corner; NaN for
+        holes."""
         row, col = np.mgrid[:rows, :cols] + 0.5
         points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
         lat, lon = frame.latlon_from_en(points)
@@ -244,7 +224,6 @@ class Dem:
         return self._above_sea(mean, lat, lon)
 
     def _warped(self, resampling: Resampling, **grid: Any) -> Array:
-        """Heights in metres, resampled onto a grid of `WarpedVRT`."""
         try:
             with (
                 quiet(),
@@ -269,7 +248,7 @@ class Dem:
         return heights
 
     def _metres(self, raw: Any) -> Array:
-        """Heights in metres of stored values; NaN where masked, or where no ground can be."""
+        """NaN where masked, or where no ground can be."""
         data = self._data
         heights = np.ma.filled(raw.astype(np.float64), np.nan)
         heights = (heights * data.scales[0] + data.offsets[0]) * self.datum.unit_m
@@ -310,11 +289,7 @@ class Dem:
 
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
-    """Open a terrain model: one band of heights, in any coordinate system.
-
-    `datum`: what its heights count from, where the file does not state it (`datum.OPTION`).
-    Raises `MissingFileError` or `ImageryError`.
-    """
+    """`datum`: what heights count from, where the file does not state it (`OPTION`)."""
     path = require_file(Path(path), "terrain file")
     try:
         with quiet(), rasterio.Env(**_OPTIONS):
@@ -349,10 +324,7 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
 
 
 def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
-    """The stored value that stands for no height: as stated, else one that no ground can have.
-
-    Raises `ImageryError` where there is no height, or where many are impossible.
-    """
+    """The stored value that stands for no height: as stated, else one that no ground can have."""
     shape = min(data.height, SAMPLE_PX), min(data.width, SAMPLE_PX)
     raw = data.read(1, out_shape=shape, masked=True, resampling=Resampling.nearest)
     values = np.ma.compressed(raw).astype(np.float64)
@@ -386,7 +358,6 @@ def _without(raw: Any, void: float | None) -> Any:
 
 
 def _gsd_m(data: Any, horizontal: pyproj.CRS) -> float:
-    """Ground resolution in metres at the middle of the file."""
     to_world = pyproj.Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True)
     step = data.transform
     col = data.width / 2 + np.array([0, 1, 0])
