@@ -361,11 +361,7 @@ def sheet_maps(
 
 
 def read_pictures(
-    mosaic: Mosaic,
-    area: Area,
-    grid: TileGrid,
-    representation: Any,
-    progress: Progress,
+    mosaic: Mosaic, area: Area, grid: TileGrid, representation: Any, progress: Progress
 ) -> SheetPictures:
     pictures = SheetPictures(grid, representation)
     blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
@@ -532,10 +528,7 @@ class SheetReader:
         return len(self._jobs)
 
     def read(
-        self,
-        progress: Progress,
-        workers: int | None = None,
-        cache: BlockCache | None = None,
+        self, progress: Progress, workers: int | None = None, cache: BlockCache | None = None
     ) -> None:
         """Read all blocks that are not in `cache`, with `workers` threads (None: one per core)."""
         workers = usable_cores() if workers is None else workers

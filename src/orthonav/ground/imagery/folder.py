@@ -42,12 +42,7 @@ def sources_in(folder: Path) -> list[Source]:
     if _ARCHIVES in skipped:
         log.warning("archives in the folder are not read; unpack them first: %s", folder)
     if skipped:
-        log.info(
-            "%d orthophotos; skipped %s: %s",
-            len(sources),
-            _summary(skipped),
-            folder,
-        )
+        log.info("%d orthophotos; skipped %s: %s", len(sources), _summary(skipped), folder)
     return sorted(sources, key=_preference)
 
 

@@ -146,7 +146,7 @@ class Lattice:
         )
 
     def _placed(self, members: list[int]) -> Iterator[tuple[Source, str]]:
-        """Members, the last first, with the XML of file and place, but for those that others cover."""
+        """Members not covered by others, the last first, with the XML of file and place."""
         shown, covered = [], set[tuple[int, ...]]()
         for index in members:
             box = tuple(self.boxes_px[index].tolist())

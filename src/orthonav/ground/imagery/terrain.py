@@ -73,7 +73,7 @@ class VerticalDatum:
 def horizontal_and_vertical(
     crs: Any, given: str | None, path: Path
 ) -> tuple[pyproj.CRS, VerticalDatum]:
-    """Of a file with the system `crs`, and the datum `given` by the user, needed if it states none."""
+    """Of a file with the system `crs`; the datum `given` is needed where it states none."""
     try:
         system = pyproj.CRS.from_wkt(crs.to_wkt())
         stated, horizontal = _stated(system)
