@@ -12,7 +12,7 @@ from orthonav.ground.fetch.presets import (
     presets,
 )
 from orthonav.ground.fetch.urls import checked_url
-from orthonav.ground.imagery.datum import datum_of
+from orthonav.ground.imagery.terrain import datum_of
 
 
 @pytest.mark.parametrize("name", presets())
