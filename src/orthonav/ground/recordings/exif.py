@@ -342,7 +342,7 @@ def _exposed_ns(text: str) -> int | None:
     if found is None:
         return None
     try:
-        whole = datetime(*map(int, found.groups()[:6]), tzinfo=UTC)  # type: ignore[misc]
+        whole = datetime(*map(int, found.groups()[:6]), tzinfo=UTC)  # type: ignore[misc, arg-type]
     except ValueError:
         return None
     return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))

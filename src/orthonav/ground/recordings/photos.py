@@ -408,7 +408,7 @@ def _of_one_focal_length(
         except CameraError:
             focal_px.append(math.nan)
         else:
-            focal_px.append(found and found.px)
+            focal_px.append(found.px if found else None)
             known.update([found] if found else [])
     if not known:
         return photos, []
