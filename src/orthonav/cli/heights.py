@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from orthonav.ground.planning.route import Route
     from orthonav.ground.recordings import Recording
 
-AREA_POINTS = 48
-"""Positions along a side of a map at which its terrain is averaged."""
+AREA_POINTS = 48  # positions along a side of a map at which its terrain is averaged
 log = logging.getLogger(__name__)
 
 
@@ -73,7 +72,6 @@ def map_heights(
 
 
 def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
-    """Latitudes and longitudes spread over a map."""
     import numpy as np
 
     sheet = opened.manifest.sheets[0]

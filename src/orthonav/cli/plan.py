@@ -10,8 +10,7 @@ EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
     *("--out", "--json"),
 )
-MAX_SHOWN = 12
-"""Sheets and legs named in the text."""
+MAX_SHOWN = 12  # sheets and legs named in the text
 
 if TYPE_CHECKING:
     from orthonav.ground.planning.area import Area, Extent
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     add_area(
         parser,
         parser.add_mutually_exclusive_group(required=True),
@@ -65,7 +63,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compute and print the plan."""
     from orthonav.core.errors import RouteError
     from orthonav.core.files import write_text
     from orthonav.ground.planning.route import read_route
@@ -116,7 +113,6 @@ def run(options: argparse.Namespace) -> None:
 def _sheets(
     options: argparse.Namespace, route: "Route | None"
 ) -> "tuple[list[Route | Extent], list[Area]]":
-    """Sheets as arguments of `build` (routes or bounds), and their areas."""
     from orthonav.ground.planning.area import Area
     from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
 
@@ -275,7 +271,6 @@ def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
 
 
 def plan_text(plain: dict[str, Any]) -> str:
-    """Lines of text for a plan as `orthonav plan --json` prints it."""
     lines = []
     if plain["route"] is not None:
         lines.append(_row("route", _route_text(plain["route"])))

@@ -18,7 +18,6 @@ MOUNT_STD_DEG = HORIZON_STD_DEG = 1.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     add_orthos(parser, "orthophoto to fly over, of another year than the map")
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
@@ -108,8 +107,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_errors(parser: argparse.ArgumentParser) -> None:
-    """Options for the fields of `Errors`."""
-
     def option(
         flag: str, text: str, default: float | None = 0.0, metavar: str | None = None
     ) -> None:
@@ -166,7 +163,6 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate a flight and report the number of views."""
     from orthonav.core.errors import FlightError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.planning.route import read_route

@@ -43,39 +43,31 @@ from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.sheets import sheets_of_route
 
-MARGIN_PX = 64
-"""Pixels beyond a tile that gradients and resampling use, and some more."""
-TOUCH_DEG = 1e-9
-"""Boxes that overlap by less than this only touch: a tenth of a millimetre."""
-_POINTS = 17
-"""Points along a side of a sheet at which it is compared with a search band."""
+MARGIN_PX = 64  # pixels beyond a tile that gradients and resampling use, and some more
+TOUCH_DEG = 1e-9  # boxes that overlap by less than this only touch: a tenth of a millimetre
+_POINTS = 17  # points along a side of a sheet at which it is compared with a search band
 
 
 @dataclass(frozen=True)
 class AtlasRequest:
     """What to build into an atlas.
 
-    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
-    `orthos`: files and folders of orthophotos; the first covers the next.
     `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
-    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
-    `bounds_deg`: area: west, south, east, north.
-    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
-    imagery is the area.
-    `replace`: rebuild sheets of other imagery or program versions instead of refusing them.
-    `index`: also make the index of the coarse tiles.
-    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
-    what its heights count from.
+    others are the atlas's, or the defaults (`gsd_m`: that of the imagery). `route`, `band_m`: area:
+    a search band around a route, in metres. Without bounds or route all imagery is the area.
+    `replace`: rebuild sheets of other imagery or program versions instead of refusing them. `dem`,
+    `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and what
+    its heights count from.
     """
 
-    url: str
-    orthos: Sequence[Path]
+    url: str  # the atlas, a folder or an fsspec URL, created where it does not exist
+    orthos: Sequence[Path]  # files and folders of orthophotos; the first covers the next
     recipe: Mapping[str, Any] = field(default_factory=dict)
-    bounds_deg: Extent | None = None
+    bounds_deg: Extent | None = None  # area: west, south, east, north
     route: Route | None = None
     band_m: float | None = None
     replace: bool = False
-    index: bool = True
+    index: bool = True  # also make the index of the coarse tiles
     dem: Path | None = None
     dem_datum: str | None = None
 
@@ -87,23 +79,18 @@ class AtlasRequest:
 class SheetTask:
     """A sheet to be built, with all that a worker on another machine needs.
 
-    `sheet`: its description, without tiles and area yet.
-    `atlas`: folder or URL of the atlas.
-    `orthos`: the files and folders that may show it.
-    `recipe`: how it is made.
     `dem`, `dem_datum`: terrain model and what its heights count from, as for a map.
     """
 
-    sheet: Sheet
-    atlas: str
-    orthos: tuple[Path, ...]
-    recipe: AtlasRecipe
+    sheet: Sheet  # its description, without tiles and area yet
+    atlas: str  # folder or URL of the atlas
+    orthos: tuple[Path, ...]  # the files and folders that may show it
+    recipe: AtlasRecipe  # how it is made
     dem: Path | None = None
     dem_datum: str | None = None
 
 
 def versions() -> dict[str, str]:
-    """The versions that determine the bytes of a map."""
     return {
         "orthonav": __version__,
         "numpy": np.__version__,
@@ -114,7 +101,6 @@ def versions() -> dict[str, str]:
 
 
 def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
-    """The differences, each as `name this, not that`."""
     return [
         f"{name} {found.get(name, 'absent')}, not {version}"
         for name, version in wanted.items()
@@ -180,7 +166,6 @@ def request_digest(
 
 
 def margin_m(recipe: AtlasRecipe) -> float:
-    """Width of the margin around its box on which a sheet may depend."""
     reach_m = (recipe.tile_px + MARGIN_PX) * recipe.gsd_m
     if recipe.coarse is None:
         return reach_m
@@ -188,13 +173,10 @@ def margin_m(recipe: AtlasRecipe) -> float:
 
 
 class Imagery:
-    """The sources of a mosaic by place."""
-
     def __init__(self, mosaic: Mosaic) -> None:
         self.mosaic = mosaic
 
     def under(self, bounds_deg: Extent, reach_m: float) -> Mosaic:
-        """The sources that may show a box and a margin of `reach_m` around it."""
         west, south, east, north = box_around(Area.from_bounds(bounds_deg), reach_m)
         boxes = self._boxes
         middle = (west + east) / 2
@@ -206,7 +188,6 @@ class Imagery:
         return Mosaic(sources, tuple(self.mosaic.stretches[index] for index in chosen))
 
     def sheets(self, recipe: AtlasRecipe) -> set[str]:
-        """Names of the sheets that the boxes of the sources touch."""
         found: set[str] = set()
         for west, south, east, north in self._boxes.tolist():
             around = turned(west) if east - west < 360 else -180.0
@@ -240,7 +221,6 @@ def _swapped(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> st
 
 
 def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iterable[str]:
-    """Names of the sheets of an area that imagery may touch."""
     route, bounds_deg = request.route, request.bounds_deg
     require_one_area(route, request.band_m, bounds_deg)
     there = imagery.sheets(recipe)
@@ -256,7 +236,6 @@ def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iter
 def _along(
     recipe: AtlasRecipe, route: Route, band_m: float | None, there: set[str]
 ) -> Iterator[str]:
-    """The sheets that the search band of a route crosses, and some that it nearly touches."""
     world = recipe.sheets
     for part in sheets_of_route(route, band_m):
         area = Area.from_route(part, band_m)
@@ -308,7 +287,6 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
-    """Raise `AtlasError` naming the sheets of the atlas (`known`) of other imagery or versions."""
     sheets = [task.sheet for task in tasks if task.sheet.id in known]
     other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
     if not other:
@@ -335,65 +313,48 @@ Status = Literal["built", "unchanged", "empty", "failed"]
 class SheetResult:
     """The result of one sheet and its cost.
 
-    `sheet`: name.
     `status`: `built`; `unchanged`, it was there already; `empty`, there is no imagery; `failed`.
-    `error`: why it failed.
-    `cpu_s`: processor time.
-    `wall_s`: time that the worker spent on it.
     `size_bytes`, `area_km2`, `tiles`: of the sheet.
-    `peak_bytes`: greatest memory that the worker process ever had.
     """
 
-    sheet: str
+    sheet: str  # name
     status: Status
-    error: str = ""
-    cpu_s: float = 0.0
-    wall_s: float = 0.0
+    error: str = ""  # why it failed
+    cpu_s: float = 0.0  # processor time
+    wall_s: float = 0.0  # time that the worker spent on it
     size_bytes: int = 0
     area_km2: float = 0.0
     tiles: int = 0
-    peak_bytes: int = 0
+    peak_bytes: int = 0  # greatest memory that the worker process ever had
 
 
 @dataclass
 class BuildReport:
-    """The results of a build of `total` sheets; grows while sheets are finished.
+    """The results of a build of `total` sheets; grows while sheets are finished."""
 
-    `url`: the atlas.
-    `total`: sheets asked for.
-    `started_s`: monotonic clock at the start.
-    `results`: sheets that are finished or failed.
-    `finish_error`: why snapshot or index could not be written.
-    """
-
-    url: str
-    total: int
-    started_s: float = field(default_factory=time.monotonic)
-    results: list[SheetResult] = field(default_factory=list)
-    finish_error: str | None = None
+    url: str  # the atlas
+    total: int  # sheets asked for
+    started_s: float = field(default_factory=time.monotonic)  # monotonic clock at the start
+    results: list[SheetResult] = field(default_factory=list)  # sheets that are finished or failed
+    finish_error: str | None = None  # why snapshot or index could not be written
     wall_s: float = 0.0
 
     def names(self, status: Status) -> list[str]:
-        """Names of the sheets with that status, sorted."""
         return sorted(each.sheet for each in self.results if each.status == status)
 
     @property
     def untried(self) -> int:
-        """Number of sheets that were not begun."""
         return self.total - len(self.results)
 
     @property
     def share(self) -> float:
-        """Share of the sheets that is done."""
         return len(self.results) / max(1, self.total)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all that was asked for is there."""
         return not self.names("failed") and not self.untried and self.finish_error is None
 
     def line(self) -> str:
-        """Progress in one line."""
         plain = self.to_plain()
         text = f"{len(self.results):,} of {self.total:,} sheets"
         if plain["area_km2"]:
@@ -463,15 +424,12 @@ def _rate(value: float, by: float, digits: int = 4) -> float | None:
 
 log = logging.getLogger(__name__)
 
-PROGRESS_EVERY_S = 10.0
-"""Between two lines of progress."""
+PROGRESS_EVERY_S = 10.0  # between two lines of progress
 GIVE_UP_AFTER = 8
 """Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
-SCRATCH = "orthonav-sheet-"
-"""Names of temporary folders begin with it."""
+SCRATCH = "orthonav-sheet-"  # names of temporary folders begin with it
 _LOCK = "in-use"
-LEARNT = ("autoencoder", "caevl", "triplet")
-"""Methods for which a worker is given a GPU."""
+LEARNT = ("autoencoder", "caevl", "triplet")  # methods for which a worker is given a GPU
 
 
 def build_atlas(
@@ -521,7 +479,6 @@ def build_atlas(
 
 
 def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
-    """The requested recipe. Raises `AtlasError` where it is impossible, or not the atlas's."""
     try:
         if Store(request.url).size(CATALOG) is not None:
             atlas = Atlas.open(request.url)
@@ -608,7 +565,6 @@ def _build_sheets(
     progress: Progress,
     report: Callable[[str], None],
 ) -> None:
-    """Have the sheets built and add what comes of them to `result`."""
     reported_s = time.monotonic()
     not_stored = 0
     gpu = recipe.method.partition(":")[0] in LEARNT
@@ -633,7 +589,6 @@ def _build_sheets(
 
 
 def _require_same_versions(runner: TaskRunner) -> None:
-    """Raise `WorkerError` where a machine has other versions and would make other bytes."""
     wanted = versions()
     for name, found in runner.everywhere(versions):
         if isinstance(found, Failure):

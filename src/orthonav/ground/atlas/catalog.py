@@ -39,7 +39,6 @@ SCHEMA = 1
 
 
 def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
-    """Raise `AtlasError` where a value has another type than its field, or is impossible."""
     for each in fields(recipe):
         value, kind = getattr(recipe, each.name), cast(type, each.type)
         if kind in (int, float):
@@ -59,13 +58,12 @@ def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
 class CoarseRecipe:
     """The coarse tiles in which a view is searched in the whole atlas: wide, at low resolution.
 
-    `gsd_m`: metres per pixel, above 0. `tile_px`: width of a tile. `overlap`: share that
-    neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views are found
-    (docs/decisions, the atlas). Raises `AtlasError` for impossible values.
+    `overlap`: share that neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views
+    are found (docs/decisions, the atlas). Raises `AtlasError` for impossible values.
     """
 
-    gsd_m: float = 8.0
-    tile_px: int = 128
+    gsd_m: float = 8.0  # metres per pixel, above 0
+    tile_px: int = 128  # width of a tile
     overlap: float = 0.875
 
     def __post_init__(self) -> None:
@@ -81,13 +79,11 @@ class CoarseRecipe:
 class AtlasRecipe:
     """How every sheet is made; fields and defaults not listed here are those of `BuildRequest`.
 
-    `gsd_m`: metres per pixel.
-    `sheet_km`: greatest width of a sheet.
-    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior.
-    Raises `AtlasError` and `AreaError` for impossible values.
+    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior. Raises
+    `AtlasError` and `AreaError` for impossible values.
     """
 
-    gsd_m: float
+    gsd_m: float  # metres per pixel
     tile_px: int = 256
     overlap: float = 0.875
     method: str = "gradient"
@@ -95,7 +91,7 @@ class AtlasRecipe:
     seed: int = 0
     registration: bool = True
     calibration_views: int = 24
-    sheet_km: float = 10.0
+    sheet_km: float = 10.0  # greatest width of a sheet
     coarse: CoarseRecipe | None = CoarseRecipe()
 
     def __post_init__(self) -> None:
@@ -104,11 +100,9 @@ class AtlasRecipe:
 
     @property
     def sheets(self) -> WorldSheets:
-        """The sheets of the world at this size."""
         return WorldSheets(self.sheet_km * 1000)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for the catalogue."""
         return asdict(self)
 
     @classmethod
@@ -132,8 +126,7 @@ class AtlasRecipe:
 
 
 CATALOG = "atlas.json"
-_SAME_PLACE_DEG = 1e-9
-"""A tenth of a millimetre: rounding only."""
+_SAME_PLACE_DEG = 1e-9  # a tenth of a millimetre: rounding only
 
 
 class Atlas:
@@ -150,12 +143,10 @@ class Atlas:
 
     @property
     def url(self) -> str:
-        """Its folder or URL."""
         return self.store.url
 
     @classmethod
     def open(cls, url: str | Path) -> "Atlas":
-        """Open an atlas. Raises `AtlasError` where there is none, or it is not ours."""
         store = Store(str(url))
         if store.size(CATALOG) is None:
             raise AtlasError(f"no atlas: it has no {CATALOG}: {store}")
@@ -177,7 +168,6 @@ class Atlas:
         return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:
-        """All sheets by name, sorted. Raises `AtlasError` where an item is damaged."""
         if self._sheets is None or refresh:
             found, broken = read_items(self.store)
             if broken:
@@ -256,7 +246,6 @@ class Atlas:
         return self.store.fetch(found.name, found.size_bytes, found.sha256)
 
     def snapshot(self) -> None:
-        """Write all items into one file, which opens faster and in any GIS. Items are decisive."""
         self.store.write(SNAPSHOT, snapshot_of(self.sheets(refresh=True).values()))
 
     def require_recipe(self, recipe: AtlasRecipe) -> "Atlas":
@@ -269,7 +258,6 @@ class Atlas:
         return self
 
     def require_place(self, sheet: Sheet) -> None:
-        """Raise `AtlasError` where a sheet does not belong to the lattice of this atlas."""
         try:
             box = self.recipe.sheets.bounds_deg(sheet.id)
         except AreaError as error:
@@ -294,7 +282,6 @@ class Atlas:
                 self.store.write(file.name, Path(files[key]))
 
     def _remove_items(self, names: Iterable[str], there: Mapping[str, Sheet | None]) -> None:
-        """Remove some of the items of a sheet, then the files that the others do not name."""
         names = sorted(names)
         for name in names:
             self.store.remove(f"{ITEMS}/{name}")
@@ -340,7 +327,6 @@ def copy_sheets(
 
 
 def _is_free(store: Store) -> bool:
-    """Whether there are no files but hidden ones."""
     names: Iterable[str] = store.names()
     if store.is_local and (folder := Path(store.url)).exists():
         names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name]
@@ -348,7 +334,6 @@ def _is_free(store: Store) -> bool:
 
 
 def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:
-    """Names of the files that items name."""
     return {file.name for sheet in items.values() if sheet for file in sheet.files.values()}
 
 

@@ -24,24 +24,17 @@ log = logging.getLogger(__name__)
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
-RETRIES = 3
-"""How often an item is started again where its process or machine died."""
-WINDOW = 2
-"""Items submitted at a time for each core: one running, one waiting."""
-POLL_S = 1.0
-"""How long is waited for results before free cores are counted again."""
-PROBE_S = 120.0
-"""How long a machine may take to start a process and answer."""
-STOP_S = 15.0
-"""How long processes may take to clean up before they are killed."""
-OBJECTS_BYTES = 100 * 2**20
-"""Shared memory of a local cluster; items and results are small."""
-ENVIRONMENT = {
+RETRIES = 3  # how often an item is started again where its process or machine died
+WINDOW = 2  # items submitted at a time for each core: one running, one waiting
+POLL_S = 1.0  # how long is waited for results before free cores are counted again
+PROBE_S = 120.0  # how long a machine may take to start a process and answer
+STOP_S = 15.0  # how long processes may take to clean up before they are killed
+OBJECTS_BYTES = 100 * 2**20  # shared memory of a local cluster; items and results are small
+ENVIRONMENT = {  # environment of the workers, as the command line sets it for itself
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_LOG_LEVEL": "OFF",
     "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**28),
 }
-"""Environment of the workers, as the command line sets it for itself."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +47,7 @@ class Failure:
 
 
 class SerialRunner:
-    """Runs items in this process, one after the other."""
-
-    at_once = 1
-    """Number of items that run at the same time."""
+    at_once = 1  # number of items that run at the same time
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
         """The result of a function on every machine, each with the machine's name: here on one."""
@@ -92,12 +82,10 @@ class RayRunner:
 
     @property
     def at_once(self) -> int:
-        """The number of cores of the cluster at present, at most `workers`."""
         cores = int(self._ray.cluster_resources().get("CPU", 0))
         return max(1, cores if self._workers is None else min(cores, self._workers))
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """The result of the function on every machine that has cores and is present now."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         probes = []
@@ -187,8 +175,7 @@ class RayRunner:
             self._ray.shutdown()
 
 
-TaskRunner = SerialRunner | RayRunner
-"""A context manager that runs tasks."""
+TaskRunner = SerialRunner | RayRunner  # a context manager that runs tasks
 
 
 def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:

@@ -35,12 +35,9 @@ SCHEMA = 1
 EDGES = "gradient"
 """Representation of coarse tiles and of views searched among them, independent of the maps'."""
 POOLING = WhitenedRecipe()
-MAX_TILES = 1_000_000
-"""Greatest number of a sheet: 45 km with tiles 50 m apart are 800,000."""
-MAX_FEATURES = 16_384
-"""Greatest number per tile: 16 x 16 cells of 64 channels."""
-FULL = 255
-"""A cell that is valid everywhere."""
+MAX_TILES = 1_000_000  # greatest number of a sheet: 45 km with tiles 50 m apart are 800,000
+MAX_FEATURES = 16_384  # greatest number per tile: 16 x 16 cells of 64 channels
+FULL = 255  # a cell that is valid everywhere
 _CHUNK_TILES = 512
 _SLACK_DEG = 1e-9
 
@@ -49,18 +46,15 @@ _SLACK_DEG = 1e-9
 class CoarseTiles:
     """Coarse tiles of a sheet, in rows from north to south; arrays are read-only.
 
-    `recipe`: how they were made.
-    `bounds_deg`: box of the sheet: west, south, east, north.
-    `centres_latlon_deg` (N, 2) float64; N is 0 where no tile shows enough imagery.
-    `features` (N, F) float16: F is cells x cells x channels.
-    `valid` (N, cells x cells) uint8: 255 where all of a cell shows imagery.
+    `bounds_deg`: box of the sheet: west, south, east, north. `centres_latlon_deg` (N, 2) float64; N
+    is 0 where no tile shows enough imagery.
     """
 
-    recipe: CoarseRecipe
+    recipe: CoarseRecipe  # how they were made
     bounds_deg: Extent
     centres_latlon_deg: NDArray[np.float64]
-    features: NDArray[np.float16]
-    valid: NDArray[np.uint8]
+    features: NDArray[np.float16]  # (N, F) float16; F is cells x cells x channels
+    valid: NDArray[np.uint8]  # (N, cells x cells) uint8; 255 where all of a cell shows imagery
 
     def features_of(self, tiles: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Features (n, F) of some tiles, and weights (n, F): the valid share of each feature's
@@ -71,7 +65,6 @@ class CoarseTiles:
 
 
 def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
-    """The grid of the coarse tiles of an area. Raises `AreaError` for impossible recipes."""
     return TileGrid.covering(
         area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
     )
@@ -126,7 +119,6 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
 
 
 def tile_count(path: Path) -> int:
-    """Number of coarse tiles in a file, from its header alone. Raises as `read_coarse`."""
     try:
         with safe_open(require_file(path, "coarse tiles"), framework="numpy") as stored:
             return int(stored.get_slice("valid").get_shape()[0])

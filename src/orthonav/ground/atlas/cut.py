@@ -75,12 +75,9 @@ from orthonav.ground.planning.sheets import WorldSheets, in_box
 
 log = logging.getLogger(__name__)
 
-MAX_TILES = 20_000
-"""Tiles of an area that are checked; more are checked at even spacing."""
-EDGE_POINTS = 33
-"""Points along an edge of a box: edges are not straight in degrees."""
-NAMED = 8
-"""Missing sheets named in a message, at most."""
+MAX_TILES = 20_000  # tiles of an area that are checked; more are checked at even spacing
+EDGE_POINTS = 33  # points along an edge of a box: edges are not straight in degrees
+NAMED = 8  # missing sheets named in a message, at most
 Array = NDArray[np.float64]
 
 
@@ -101,7 +98,6 @@ def box_deg(area: Area, margin_m: float) -> Extent:
 
 
 def turned(lon_deg: float) -> float:
-    """A longitude from -180, without 180."""
     return (lon_deg + 180) % 360 - 180
 
 
@@ -209,8 +205,7 @@ CACHE_BYTES = 24 * 2**20
 """Decoded chunks cached of each sheet: those along the border of a row of blocks."""
 REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
 
-DECIDING = 0.5, 0.99
-"""Thresholds of acceptance lie in this range of probabilities."""
+DECIDING = 0.5, 0.99  # thresholds of acceptance lie in this range of probabilities
 SCORES = np.linspace(0.05, 1.0, 20)
 MARGINS = np.linspace(0.0, 0.6, 13)
 """Evidence at which the pooled confidence is compared with the sheets': scores and margins of
@@ -218,7 +213,6 @@ tiles."""
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
-    """Open and verify sheets. Raises `AtlasError` where one is damaged or differs from others."""
     found: list[SheetSource] = []
     for sheet in sheets:
         try:
@@ -231,7 +225,6 @@ def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list
 
 
 def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
-    """Recipe of the embedding, and representation. Raises `AtlasError` for other methods."""
     try:
         recipe = variant_from_recipe(embed.TABLE, manifest.recipe.get("embed"))
         representation = variant_from_recipe(represent.TABLE, manifest.recipe.get("represent"))
@@ -406,8 +399,7 @@ def _heights(
     return found
 
 
-COARSER = 4
-"""Factor by which blocks are reduced for the preview."""
+COARSER = 4  # factor by which blocks are reduced for the preview
 
 
 def cut_map(
@@ -455,8 +447,6 @@ def cut_in_memory(atlas: Atlas, area: Area) -> MapFile:
 
 
 class _MapCutter:
-    """Collects cells, grey layer and preview of the map from the sheets under it."""
-
     def __init__(self, atlas: Atlas, area: Area) -> None:
         common = atlas.recipe
         self.area = area
@@ -510,7 +500,6 @@ class _MapCutter:
 def _learnt(
     cutter: _MapCutter, workers: int, progress: Progress
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
-    """Manifest and arrays of the map."""
     area, grid, members = cutter.area, cutter.grid, cutter.members
     tiles_rc = tiles_of(area, grid, cutter.cells)
     tiles_px = tiles_rc * grid.stride_px

@@ -123,7 +123,6 @@ def _snapshot_problems(store: Store, sheets: Iterable[Sheet], clean: bool) -> It
 
 
 def _current(items: Mapping[str, Sheet]) -> dict[str, Sheet]:
-    """The items of the highest revisions."""
     last = {items[name].id: name for name in sorted(items)}
     return {name: items[name] for name in last.values()}
 
@@ -139,8 +138,6 @@ def _files(store: Store) -> dict[str, int]:
 def _orphans(
     store: Store, files: Mapping[str, int], items: Mapping[str, Sheet], not_whole: set[str]
 ) -> list[str]:
-    """Files of sheets that no item names, except those of sheets with an unreadable item."""
-
     def unnamed(items: Mapping[str, Sheet]) -> list[str]:
         named = {file.name for sheet in items.values() for file in sheet.files.values()}
         return [
@@ -218,7 +215,6 @@ def _index_problems(atlas: Atlas, deep: bool) -> Iterator[Problem]:
 
 @contextmanager
 def _local_path(store: Store, name: str) -> Iterator[Path]:
-    """A file of the atlas on this machine, while the context lasts."""
     if store.is_local:
         yield Path(store.url, *name.split("/"))
         return
@@ -243,7 +239,6 @@ def _content_problem(
 
 
 def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[str]:
-    """The differences between a map, the recipe of its atlas and its item."""
     info = manifest.sheets[0]
     represent = manifest.recipe.get("represent")
     pairs = [

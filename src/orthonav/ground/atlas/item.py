@@ -26,17 +26,13 @@ STAC_VERSION = "1.0.0"
 COLLECTION = "orthonav-atlas"
 MAX_ITEM_BYTES = 2**20
 """A guard for memory: items have some 2 kB, 60 bytes more for each further orthophoto."""
-MAX_REVISION = 9999
-"""What four digits of a file name hold."""
-MAX_DIGITS = 20
-"""Digits of an integer: 64 bits. Python needs quadratic time for longer ones."""
-MAX_TILES = 10**9
-"""A guard against impossible values: tiles 1.5 m apart on a sheet of 45 km."""
-FILES = {
+MAX_REVISION = 9999  # what four digits of a file name hold
+MAX_DIGITS = 20  # digits of an integer: 64 bits. Python needs quadratic time for longer ones.
+MAX_TILES = 10**9  # a guard against impossible values: tiles 1.5 m apart on a sheet of 45 km
+FILES = {  # folder, suffix and media type of the files that a sheet may have
     "map": ("sheets", ".onav", "application/octet-stream"),
     "coarse": ("coarse", ".safetensors", "application/octet-stream"),
 }
-"""Folder, suffix and media type of the files that a sheet may have."""
 _FILE_EXTENSION = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _SHA256_MULTIHASH = "1220"
 _SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
@@ -69,29 +65,20 @@ class Sheet:
     """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
     building, so that the same sheet is the same bytes everywhere.
 
-    `id`: name in the lattice, as r001526c001392.
-    `bounds_deg`: its box in the lattice: west, south, east, north.
-    `gsd_m`: ground resolution of its map, metres per pixel.
-    `tiles`: tiles of its map, 1 or more.
-    `area_km2`: area of its tile centres.
-    `dates`: dates of its imagery, YYYY[-MM[-DD]].
-    `imagery`: its orthophotos, as the manifest of a map describes them.
-    `request`: digest of all that it was made from and how.
-    `made_by`: programs and versions that made it.
-    `revision`: from 1; 0 for a sheet that is not in an atlas yet.
-    `files`: its files by kind: `map`, `coarse`.
+    `imagery`: its orthophotos, as the manifest of a map describes them. `files`: its files by kind:
+    `map`, `coarse`.
     """
 
-    id: str
-    bounds_deg: Extent
-    gsd_m: float
-    tiles: int
-    area_km2: float
-    dates: tuple[str, ...]
+    id: str  # name in the lattice, as r001526c001392
+    bounds_deg: Extent  # its box in the lattice: west, south, east, north
+    gsd_m: float  # ground resolution of its map, metres per pixel
+    tiles: int  # tiles of its map, 1 or more
+    area_km2: float  # area of its tile centres
+    dates: tuple[str, ...]  # dates of its imagery, YYYY[-MM[-DD]]
     imagery: tuple[Mapping[str, Any], ...]
-    request: str
-    made_by: Mapping[str, str]
-    revision: int = 0
+    request: str  # digest of all that it was made from and how
+    made_by: Mapping[str, str]  # programs and versions that made it
+    revision: int = 0  # from 1; 0 for a sheet that is not in an atlas yet
     files: Mapping[str, StoredFile] = field(default_factory=dict)
 
     def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
@@ -104,16 +91,13 @@ class Sheet:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of all its files."""
         return sum(file.size_bytes for file in self.files.values())
 
     @property
     def item_name(self) -> str:
-        """File name of its item in the folder `items`."""
         return item_name(self.id, self.revision, canonical(self.to_item()))
 
     def to_item(self) -> dict[str, Any]:
-        """The STAC item, as plain values."""
         west, south, east, north = map(float, self.bounds_deg)
         ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
         return {
@@ -209,7 +193,6 @@ def reason(error: Exception) -> str:
 
 
 def canonical(plain: Any) -> bytes:
-    """Plain values as canonical JSON. Raises `AtlasError` for values that JSON cannot hold."""
     try:
         return _ENCODER.encode(plain).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -257,7 +240,6 @@ def read_item(name: str, data: bytes, plain: Any = None) -> Sheet:
 
 
 def file_name(key: str, sheet_id: str, sha256: str) -> str:
-    """Name in the atlas of a file of a sheet with that content."""
     folder, suffix, _ = FILES[key]
     return f"{folder}/{sheet_id}.{sha256[:12]}{suffix}"
 
@@ -301,7 +283,6 @@ def _times(dates: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _span(text: str) -> tuple[date, date] | None:
-    """First and last day of YYYY[-MM[-DD]], None for an invalid date."""
     if not _DATE.fullmatch(text):
         return None
     try:
@@ -322,12 +303,10 @@ def _integer(text: str) -> int:
 log = logging.getLogger(__name__)
 
 ITEMS, SNAPSHOT = "items", "items.geojson"
-MAX_SNAPSHOT_BYTES = 2**30
-"""A guard for memory: 500,000 items of 2 kB."""
+MAX_SNAPSHOT_BYTES = 2**30  # a guard for memory: 500,000 items of 2 kB
 MAX_ITEMS = 10**6
 """A guard for memory: seven times the sheets of a country at 20 cm (docs/country.md)."""
-_READ_AT_ONCE = 1000
-"""One page of a listing of S3."""
+_READ_AT_ONCE = 1000  # one page of a listing of S3
 
 
 def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
@@ -345,7 +324,6 @@ def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
 
 
 def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
-    """A STAC item collection, with references relative to the root of the atlas."""
     items = [_moved(sheet.to_item(), "../", "./") for sheet in sheets]
     return canonical({"type": "FeatureCollection", "features": items})
 
@@ -372,7 +350,6 @@ def _read_snapshot(store: Store, names: Mapping[str, int]) -> dict[str, Sheet]:
 
 
 def read_some(store: Store, names: Mapping[str, int]) -> tuple[dict[str, Sheet], dict[str, str]]:
-    """As `read_items`, for items of these file names (and sizes) only."""
     found: dict[str, Sheet] = {}
     broken = {
         name: f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{name}"
@@ -404,8 +381,6 @@ def _contents(store: Store, paths: list[str]) -> dict[str, bytes]:
 
 
 def _moved(item: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
-    """The item with its references relative to another folder."""
-
     def moved(entry: Mapping[str, Any]) -> dict[str, Any]:
         return {**entry, "href": new + entry["href"].removeprefix(old)}
 

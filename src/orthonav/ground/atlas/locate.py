@@ -46,28 +46,23 @@ from orthonav.ground.atlas.search import (
 from orthonav.ground.planning.area import Area
 
 # Values without another source: `benchmarks.atlas_lost` at d63ac91.
-CANDIDATES = 40
-"""Places of the whole atlas that are judged, 4 ms each."""
+CANDIDATES = 40  # places of the whole atlas that are judged, 4 ms each
 TURN_STEP_DEG = 8.0
 LOG_SCALES = (-0.06, 0.06)
 """Headings and log scales under which coarse tiles are searched: each
 view has a pose that is off by 4 deg and 6 % at most, for scales within 12 %."""
-KNOWN_SIGMAS = 2.0
-"""Standard deviations of a reported heading that are searched to either side."""
+KNOWN_SIGMAS = 2.0  # standard deviations of a reported heading that are searched to either side
 REACH_STRIDES = 0.8
 """Strides of the coarse tiles around a candidate that are searched: more than half a diagonal."""
-TURN_STD_RAD = math.radians(4.0)
-"""Of the heading of a candidate: half of `TURN_STEP_DEG`."""
-VIEW_TILES = (0.6, 2.5)
-"""Least and greatest side of a view, in coarse tiles."""
+TURN_STD_RAD = math.radians(4.0)  # of the heading of a candidate: half of `TURN_STEP_DEG`
+VIEW_TILES = (0.6, 2.5)  # least and greatest side of a view, in coarse tiles
 FOLLOWED, FOLLOWED_NATS = 4, 4.0
 """Chains whose expected places are searched: at most so many, and not less likely than the best by
 more nats."""
 START_PX = 5.0
 """Standard deviation of a found place, in pixels of the sheets: half of the radius within which
 their confidence counts a place as right."""
-REPLAYED = 4
-"""Latest views of a place that a track begins with."""
+REPLAYED = 4  # latest views of a place that a track begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +70,12 @@ class FoundPlace:
     """A place on which several views agree.
 
     `seen`: the latest of these views, each with the place of its camera, the last one that of the
-    view found. `std_m`: standard deviation of such a place, per axis. `confidence`: probability
-    that the places are right, against all others of the atlas.
+    view found.
     """
 
     seen: tuple[tuple[View, Placement], ...]
-    std_m: float
-    confidence: float
+    std_m: float  # standard deviation of such a place, per axis
+    confidence: float  # probability that the places are right, against all others of the atlas
 
 
 class PlaceFinder:
@@ -98,7 +92,6 @@ class PlaceFinder:
         self._number = 0
 
     def restart(self) -> None:
-        """Forget all views."""
         self._agreement = Agreement()
         self._views = {}
 
@@ -150,7 +143,6 @@ class PlaceFinder:
         return self._outcome()
 
     def _expected(self, view: View, coarse: RectifiedView, time_ns: int) -> list[SearchRegion]:
-        """Where the most likely one chains expect the view."""
         found = []
         chains = self._agreement.chains[:FOLLOWED]
         for each in chains:
@@ -169,7 +161,6 @@ class PlaceFinder:
         return found
 
     def _candidates(self, view: View, coarse: RectifiedView) -> list[SearchRegion]:
-        """The places of the whole atlas that are most similar to the view."""
         headings = np.arange(0.0, 360.0, TURN_STEP_DEG)
         if self._heading_known:
             reach = KNOWN_SIGMAS * math.degrees(pose_prior(view.telemetry, True).turn_std_rad)
@@ -222,12 +213,9 @@ def _moved(
 
 log = logging.getLogger(__name__)
 
-SIGMAS = 3.0
-"""Standard deviations of a position within which the aircraft is."""
-AHEAD_M = 1000.0
-"""A map reaches so much farther than the next view can: fewer maps are cut."""
-LIKELY = 0.5
-"""Least confidence of a fix."""
+SIGMAS = 3.0  # standard deviations of a position within which the aircraft is
+AHEAD_M = 1000.0  # a map reaches so much farther than the next view can: fewer maps are cut
+LIKELY = 0.5  # least confidence of a fix
 MODEL = Model(wide_m=MAX_REACH_M / SIGMAS, most_agreement=1.0)
 """Views of a flight without a prior may be far apart in time: their positions are never predicted
 well. So each must show the map by itself, however well it agrees with the prediction, and a wide
@@ -241,7 +229,6 @@ class LocalTrack:
     """
 
     def __init__(self, atlas: Atlas, found: FoundPlace, *, heading_known: bool) -> None:
-        """Begin with the views on which the place was found. Raises as `cut_in_memory`."""
         self._atlas = atlas
         views = [view for view, _ in found.seen]
         places = [place.latlon_deg for _, place in found.seen]
@@ -270,7 +257,6 @@ class LocalTrack:
 
     @property
     def state(self) -> State:
-        """State after the last view."""
         return self._tracker.state
 
     def locate(self, view: View) -> bool:
@@ -283,7 +269,6 @@ class LocalTrack:
         return not (was_lost and self.state is State.LOST)
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> bool:
-        """The same for a view whose picture cannot be used for `reason`."""
         if not self._can_follow(telemetry, 0.0):
             return False
         self._take(self._tracker.passed(telemetry, reason), telemetry)
@@ -337,7 +322,6 @@ class AtlasLocator:
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
-        """Raises `AtlasError` where no maps can be cut out of the atlas."""
         self._atlas = registrar.atlas
         recipe = self._atlas.recipe
         if recipe.method.partition(":")[0] != "gradient" or not recipe.registration:
@@ -388,7 +372,6 @@ class AtlasLocator:
             self._track = None
 
     def _begin(self, found: FoundPlace) -> None:
-        """Begin another track at a place, where its views agree on it on a map cut there too."""
         try:
             begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
         except (AreaError, AtlasError) as error:
@@ -398,7 +381,6 @@ class AtlasLocator:
             self._track = begun
 
     def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:
-        """The fix of the track, or why there is none."""
         if self._track is not None:
             self._state = self._track.state
         elif self._state is not State.SEARCHING:
@@ -409,5 +391,4 @@ class AtlasLocator:
 
 
 def _half_diagonal_m(view: View) -> float:
-    """Half of the diagonal of the ground that a view shows from straight above."""
     return view.telemetry.agl_m * math.hypot(*view.camera.extent) / 2

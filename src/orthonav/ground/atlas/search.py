@@ -51,8 +51,7 @@ from orthonav.ground.atlas.index import (
 )
 from orthonav.ground.atlas.vectors import ShardedIndex
 
-PER_POSE = 60
-"""Tiles found for each pose; several neighbouring tiles are one place."""
+PER_POSE = 60  # tiles found for each pose; several neighbouring tiles are one place
 EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
 MOST_EFFORT = 0.085, 1500
 """Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
@@ -60,8 +59,7 @@ finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
 (`benchmarks.atlas_search` at d63ac91)."""
 APART_STRIDES = 1.5
 """Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
-MAX_LAT_DEG = 89.8
-"""Nearer to a pole a view has no meaningful heading."""
+MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
 
 
 class TileSearch:
@@ -71,7 +69,6 @@ class TileSearch:
     """
 
     def __init__(self, atlas: Atlas) -> None:
-        """Raises `AtlasError` where the atlas has no coarse tiles, or no valid index of them."""
         if atlas.recipe.coarse is None:
             raise AtlasError(
                 f"the atlas has no coarse tiles, so views need a prior there: {atlas.url}"
@@ -134,8 +131,7 @@ class TileSearch:
 
 log = logging.getLogger(__name__)
 
-MAX_OPEN = 16
-"""Sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all."""
+MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
 BORDER_SHARE = 0.25
 """Sheets reach half a tile beyond their box: a sheet is
 searched where the middle of a view may lie up to this share of its side outside the box."""
@@ -146,19 +142,11 @@ registered."""
 
 @dataclass(frozen=True)
 class SearchRegion(Placement):
-    """A placement around which a view is registered.
-
-    `middle_latlon_deg`: middle of the ground that the view shows.
-    `reach_m`: how far from the place is searched.
-    `turn_std_rad`: standard deviation of the heading.
-    """
-
-    middle_latlon_deg: tuple[float, float]
-    reach_m: float
-    turn_std_rad: float
+    middle_latlon_deg: tuple[float, float]  # middle of the ground that the view shows
+    reach_m: float  # how far from the place is searched
+    turn_std_rad: float  # standard deviation of the heading
 
     def contains(self, place: Placement) -> bool:
-        """Whether a place is within reach."""
         return nearest_m(self.latlon_deg, [place.latlon_deg]) <= self.reach_m
 
 
@@ -166,11 +154,10 @@ class SearchRegion(Placement):
 class SheetMatch(Placement):
     """The placement of a view registered on a sheet.
 
-    `evidence`: scores of the match and of its rivals.
     `confidence`: what the sheet makes of the evidence, None where it has learnt nothing.
     """
 
-    evidence: Mapping[str, float]
+    evidence: Mapping[str, float]  # scores of the match and of its rivals
     confidence: RegisteredConfidence | None
 
 
@@ -187,7 +174,6 @@ class PyramidPart:
     width: int
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
         return level_shape(self.height, self.width, level)
 
     def read(
@@ -236,8 +222,6 @@ class SheetRegistrar:
 
 
 class ViewRegistrar:
-    """Registers one view, which is prepared once for all sheets that are alike."""
-
     def __init__(self, sheets: SheetRegistrar, view: View, side_m: float) -> None:
         self._sheets, self._side_m = sheets, side_m
         self._prepared = functools.cache(functools.partial(prepare, view, heading_known=False))
@@ -313,8 +297,6 @@ def part_of(
 
 @dataclass(frozen=True, eq=False)
 class JudgedRegion:
-    """A view on the part of a sheet around a region."""
-
     sheet: RegistrationLocalizer
     view: PreparedView
     region: SearchRegion
@@ -322,7 +304,6 @@ class JudgedRegion:
 
     @functools.cached_property
     def search(self) -> Search:
-        """The search for the view in the region."""
         return Search(self.sheet, self.view, self.prior)
 
     @functools.cached_property
@@ -339,16 +320,13 @@ class JudgedRegion:
 
     @property
     def look(self) -> float:
-        """Score of the best of them, less the cost of its prior."""
         return self.search.placer.standing(self.judged)[0]
 
     @property
     def latlon_deg(self) -> tuple[float, float]:
-        """Latitude and longitude of the camera there."""
         return self._latlon_deg(self.judged[0].pose)
 
     def finished(self) -> SheetMatch:
-        """The match at the best of them."""
         placer = self.search.placer
         places = placer.on_terrain(self.judged, 1)
         return self._match(placer.below_camera(placer.finished(places, len(places))))
@@ -375,10 +353,8 @@ SEARCHED = 4
 PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""
-RIVAL_SHARE = 0.25
-"""Matches farther apart than this share of the view's side are different places."""
-LEAST = 1e-5
-"""Least and greatest (1 - LEAST) probability of a match, for finite odds."""
+RIVAL_SHARE = 0.25  # matches farther apart than this share of the view's side are different places
+LEAST = 1e-5  # least and greatest (1 - LEAST) probability of a match, for finite odds
 
 
 class ViewMatches:
@@ -395,7 +371,6 @@ class ViewMatches:
         self.found: list[SheetMatch] = []
 
     def add_candidates(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
-        """Judge candidates, finish those with hope, search the strongest until one is proven."""
         judged = [each for each in map(registrar.judged, regions) if each is not None]
         judged.sort(key=lambda each: -each.look)
         hopeful = sum(each.look >= HOPE * judged[0].look for each in judged)
@@ -431,15 +406,12 @@ class ViewMatches:
 
     @property
     def _proven(self) -> bool:
-        """Whether the strongest match is proven."""
         return bool(self.found) and self.log_odds(0) >= PROVEN
 
     def _proven_in(self, region: SearchRegion) -> bool:
-        """Whether it is, and lies in a region."""
         return self._proven and region.contains(self.found[0])
 
     def log_odds(self, number: int) -> float:
-        """Log odds of one of the matches against all others."""
         one = self.found[number]
         rivals = [each.evidence for at, each in enumerate(self.found) if at != number]
         looks = [
@@ -451,7 +423,6 @@ class ViewMatches:
         return logit(confidence(against(one.evidence, rivals, looks)), LEAST)
 
     def _distinct(self, matches: Sequence[SheetMatch]) -> list[SheetMatch]:
-        """The strongest match of each place, strongest first."""
         distinct: list[SheetMatch] = []
         for each in sorted(matches, key=lambda one: -one.evidence["strength"]):
             others = [one.latlon_deg for one in distinct]

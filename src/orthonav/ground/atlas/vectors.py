@@ -39,12 +39,9 @@ MAX_TRAINING_VECTORS = 200_000
 POINTS_PER_CENTRE = 4096
 """Training vectors per centre, if there are as many. FAISS's default, 256, loses 2 to 4 points of
 recall where lists or codes have few centres (2e5 of `benchmarks.atlas_fields` at d63ac91)."""
-ROUNDS = 12
-"""Iterations of k-means, as in `benchmarks.atlas_search` at d63ac91."""
-CODE_BITS = 4
-"""Bits per quantizer: what the fast scan of FAISS supports."""
-BLOCK = 32
-"""Codes that FAISS scans together; the room of a list is a multiple of it."""
+ROUNDS = 12  # iterations of k-means, as in `benchmarks.atlas_search` at d63ac91
+CODE_BITS = 4  # bits per quantizer: what the fast scan of FAISS supports
+BLOCK = 32  # codes that FAISS scans together; the room of a list is a multiple of it
 FORMAT = "orthonav-vectors"
 
 
@@ -69,17 +66,14 @@ def one_thread() -> Iterator[None]:
 class VectorRecipe:
     """How vectors are assigned to lists and coded.
 
-    `dims`: components per vector, even.
     `list_bits`: there are 2 ** `list_bits` lists, half of the bits from either half of a vector;
     even, 2 to 20.
-    `quantizers`: codes of 4 bits per vector; even, divides `dims`.
-    `seed`: seed of k-means.
     """
 
-    dims: int
+    dims: int  # components per vector, even
     list_bits: int = 14
-    quantizers: int = 32
-    seed: int = 0
+    quantizers: int = 32  # codes of 4 bits per vector; even, divides `dims`
+    seed: int = 0  # seed of k-means
 
     def __post_init__(self) -> None:
         if self.dims < 2 or self.dims % 2:
@@ -102,12 +96,10 @@ class VectorRecipe:
 
     @property
     def lists(self) -> int:
-        """Number of lists."""
         return int(2**self.list_bits)
 
     @property
     def code_bytes(self) -> int:
-        """Bytes of a code."""
         return self.quantizers // 2
 
 
@@ -115,24 +107,20 @@ class VectorRecipe:
 class Quantizers:
     """The trained quantizers that all shards of an index share.
 
-    `recipe`: how they were made.
     `rotation` (D, D): rotates vectors so that variance is spread evenly over the quantizers.
     `halves` (2, sqrt(lists), D / 2): list centres of each half of a rotated vector.
-    `codebook` (quantizers, 16, D / quantizers): codes of the residual.
     """
 
-    recipe: VectorRecipe
+    recipe: VectorRecipe  # how they were made
     rotation: Array
     halves: Array
-    codebook: Array
+    codebook: Array  # (quantizers, 16, D / quantizers), codes of the residual
 
     @cached_property
     def digest(self) -> str:
-        """Short digest of all arrays."""
         return sha256(self._bytes()).hexdigest()[:16]
 
     def save(self, path: Path) -> None:
-        """Write to `path` (safetensors)."""
         path.write_bytes(self._bytes())
 
     @classmethod
@@ -174,7 +162,6 @@ class Quantizers:
         return lists, products
 
     def empty_index(self) -> Any:
-        """An empty FAISS index (IndexIVFPQFastScan) with these quantizers."""
         module = faiss()
         index, coarse = _untrained(self.recipe)
         module.copy_array_to_vector(self.halves.reshape(-1), coarse.pq.centroids)
@@ -184,7 +171,6 @@ class Quantizers:
 
 
 def _untrained(recipe: VectorRecipe) -> tuple[Any, Any]:
-    """An index of FAISS to be trained, and its quantizer of lists."""
     module = faiss()
     coarse = module.MultiIndexQuantizer(recipe.dims, 2, recipe.list_bits // 2)
     index = module.IndexIVFPQFastScan(
@@ -202,7 +188,6 @@ def _untrained(recipe: VectorRecipe) -> tuple[Any, Any]:
 
 
 def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of `Quantizers` by name."""
     dims, quantizers = recipe.dims, recipe.quantizers
     return {
         "rotation": (dims, dims),
@@ -263,11 +248,9 @@ def _rotation(vectors: Array, groups: int) -> Array:
     return np.ascontiguousarray(axes[:, order], dtype=np.float32)
 
 
-SCAN_ONE = 10
-"""FAISS's implementation of the scan that is fastest for one query at a time."""
+SCAN_ONE = 10  # FAISS's implementation of the scan that is fastest for one query at a time
 ADD_ROWS = 32_768
-NONE = -1
-"""Id where fewer than k vectors were found."""
+NONE = -1  # id where fewer than k vectors were found
 
 Ids = NDArray[np.int64]
 Places = NDArray[np.float64]
@@ -275,18 +258,10 @@ Places = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of one sheet in a shard, in the order of its coarse tiles.
-
-    `sheet`: name of the sheet.
-    `sha256`: digest of its coarse tiles (hex).
-    `rows`: how many.
-    `retired`: the sheet has changed or gone, and its rows are not found any more.
-    """
-
-    sheet: str
-    sha256: str
-    rows: int
-    retired: bool = False
+    sheet: str  # name of the sheet
+    sha256: str  # digest of its coarse tiles (hex)
+    rows: int  # how many
+    retired: bool = False  # the sheet has changed or gone, and its rows are not found any more
 
 
 @dataclass(frozen=True)
@@ -299,7 +274,6 @@ class ShardInfo:
 
     @property
     def rows(self) -> int:
-        """Number of rows, retired ones included."""
         return sum(part.rows for part in self.parts)
 
     @property
@@ -345,7 +319,6 @@ def write_shard(
 
 
 def _write_header(out: IO[bytes], rows: int, dims: int) -> None:
-    """Header of an array of NumPy, which reserves room for any number of rows."""
     header = {"descr": "<f2", "fortran_order": False, "shape": (rows, dims)}
     np.lib.format.write_array_header_1_0(out, header)
 
@@ -364,7 +337,6 @@ def _write_lists(folder: Path, name: str, index: Any, quantizers: Quantizers) ->
 
 
 def _lists(index: Any, quantizers: Quantizers) -> Iterator[tuple[int, NDArray[np.uint8], Ids]]:
-    """Number, codes in blocks, and rows of each list that is not empty."""
     module, lists = faiss(), index.invlists
     for number in range(quantizers.recipe.lists):
         size = lists.list_size(number)
@@ -383,7 +355,6 @@ class OpenShard:
     def __init__(
         self, file: Callable[[str], Path], info: ShardInfo, quantizers: Quantizers
     ) -> None:
-        """Raises `AtlasError` where a file cannot be read or does not fit `info`."""
         self.info = info
         ends = ("vectors.npy", "codes", "lists.npy", "places.npy")
         path, codes, lists, places = (file(f"{info.name}.{end}") for end in ends)
@@ -413,7 +384,6 @@ class OpenShard:
     def _map_lists(
         self, path: Path, size: int, table: NDArray[np.uint64], quantizers: Quantizers
     ) -> None:
-        """Let FAISS scan the lists in the mapped file."""
         module, recipe = faiss(), quantizers.recipe
         _check_table(table, recipe.lists, recipe.code_bytes, size, path)
         if int(table[:, 0].sum()) != self.info.rows:
@@ -463,7 +433,6 @@ class OpenShard:
 def _check_table(
     table: NDArray[np.uint64], lists: int, code_bytes: int, size: int, path: Path
 ) -> None:
-    """Raise `AtlasError` unless every list lies within the file."""
     fits = table.shape == (lists, 3) and table.dtype == np.uint64
     if fits:
         count, room, offset = table.astype(np.float64).T
@@ -549,7 +518,6 @@ class ShardedIndex:
 
 
 def _highest(scores: Array, ids: Ids, count: int) -> tuple[Array, Ids]:
-    """The `count` highest of each row, in no order."""
     if scores.shape[1] <= count:
         return scores, ids
     chosen = np.argpartition(scores, -count, axis=1)[:, -count:]

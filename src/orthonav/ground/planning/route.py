@@ -35,8 +35,6 @@ _FORM = f"{PREFIX}A@LAT,LON[,BEARING]"
 
 @dataclass(frozen=True)
 class PaperTrajectory:
-    """A column of Table 1, and the ground resolution taken for it."""
-
     name: str
     agl_m: float
     length_m: float
@@ -211,7 +209,6 @@ def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
 
 
 def _listed(found: list[Route]) -> str:
-    """Number and name of each line."""
     shown = [
         f"{number} {route.name!r:.60}" if route.name else f"{number} (no name)"
         for number, route in enumerate(found[:MAX_LISTED], 1)

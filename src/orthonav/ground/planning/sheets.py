@@ -23,16 +23,12 @@ from orthonav.core.geo.swapped import swapped_bounds_hint, swapped_hint
 from orthonav.ground.planning.area import Area, Extent, unwrapped
 from orthonav.ground.planning.route import Height, Route, leg_lengths_m
 
-MAX_SHEETS = 10_000
-"""Limit of the program; 2500 km2 each, so 25 million km2."""
+MAX_SHEETS = 10_000  # limit of the program; 2500 km2 each, so 25 million km2
 MAX_ROUTE_SHEETS = 500
 """Limit for a route: more than once around the Earth with bands of less than 10 km."""
-_DEGREE_M = 110_574.0
-"""Shortest degree of latitude, at the equator (WGS84)."""
-_LON_DEGREE_M = 111_320.0
-"""Degree of longitude at the equator (WGS84)."""
-_TRIES = 4
-"""Numbers of columns tried for one row before rows are made lower."""
+_DEGREE_M = 110_574.0  # shortest degree of latitude, at the equator (WGS84)
+_LON_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
+_TRIES = 4  # numbers of columns tried for one row before rows are made lower
 
 
 def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
@@ -149,7 +145,6 @@ def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
 
 
 def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
-    """The same route with more waypoints, so that each leg fits a sheet."""
     waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
     leg_bands: list[float | None] = []
     lengths_m = leg_lengths_m(route)
@@ -210,17 +205,13 @@ def _too_many(count: int) -> AreaError:
 LARGEST_SIDE_M = 0.9 * MAX_SHEET_M
 """The box around a sheet is wider than the sheet, because meridians converge."""
 SMALLEST_SIDE_M = 200.0
-_MERIDIAN_DEGREE_M = 111_695.0
-"""Longest degree of latitude, at a pole (WGS84)."""
-_PARALLEL_DEGREE_M = 111_320.0
-"""Degree of longitude at the equator (WGS84)."""
+_MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
+_PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 _NAME = re.compile(r"r([0-9]{6})c([0-9]{6})")
 
 
 @dataclass(frozen=True)
 class WorldSheets:
-    """Sheets at most `side_m` wide and high. Raises `AreaError` for an impossible size."""
-
     side_m: float
 
     def __post_init__(self) -> None:
@@ -232,18 +223,15 @@ class WorldSheets:
 
     @property
     def rows(self) -> int:
-        """Rows from pole to pole."""
         return math.ceil(180 * _MERIDIAN_DEGREE_M / self.side_m)
 
     def cols(self, row: int) -> int:
-        """Columns of a row."""
         south, north = self._parallels(row)
         widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
         around_m = 360 * _PARALLEL_DEGREE_M * math.cos(math.radians(widest))
         return max(1, math.ceil(around_m / self.side_m))
 
     def name_at(self, lat_deg: float, lon_deg: float) -> str:
-        """Name of the sheet that contains a position. Raises `AreaError` if it is invalid."""
         if not (abs(lat_deg) <= 90 and math.isfinite(lon_deg)):
             hint = swapped_hint(lat_deg, lon_deg)
             raise AreaError(f"not a latitude and longitude in degrees: {lat_deg}, {lon_deg}{hint}")
@@ -253,7 +241,6 @@ class WorldSheets:
         return _named(row, min(cols - 1, int(turned / 360 * cols)))
 
     def bounds_deg(self, name: str) -> Extent:
-        """West, south, east, north of a sheet. Raises `AreaError` if there is no such sheet."""
         match = _NAME.fullmatch(name)
         row, col = (int(part) for part in match.groups()) if match else (-1, -1)
         if not (0 <= row < self.rows and 0 <= col < self.cols(row)):

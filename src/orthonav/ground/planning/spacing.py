@@ -25,33 +25,24 @@ GOOD_VIEW_PX = 144.0
 """Size of a view, in map pixels, at which registration ends; smaller views register less well."""
 LEAST_VIEW_PX = 24.0
 LEAST_TILE_SHARE = 0.4
-MOST_COARSER = 4.0
-"""The localizer refuses views beyond these three limits: too_small, too_coarse."""
-FINEST_IMAGERY_M = 0.2
-"""Open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)."""
-LOW_VIEW_M = 100.0
-"""Below this a single field or wood can fill the view."""
+MOST_COARSER = 4.0  # the localizer refuses views beyond these three limits: too_small, too_coarse
+FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)
+LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
 MOST_RELIEF = 0.05
 """Relief within a view, as a share of the height, above which the flat-ground model fails: equal to
 the standard deviation of the reported height in all benchmarks."""
-VIEW_OVERLAP = 0.6
-"""Usual forward overlap of aerial photography."""
-TRACKED_PER_S = 10.0
-"""Views per second while tracking on one desktop core: docs/benchmarks.md."""
+VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
+TRACKED_PER_S = 10.0  # views per second while tracking on one desktop core: docs/benchmarks.md
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 """A field of view of 65 by 51 degrees, usual for small drones."""
-DEFAULT_PRIOR_STD_M = 150.0
-"""About 5 km of dead reckoning with an error of 3 %."""
+DEFAULT_PRIOR_STD_M = 150.0  # about 5 km of dead reckoning with an error of 3 %
 BAND_PRIORS = 4.0
 """Width of a band that is not given, in standard deviations of the prior: two to each side."""
-MIN_BAND_VIEWS = 0.5
-"""A band is checked at least so many sides of a view wide."""
-_NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
-"""Mantissas of round ground resolutions."""
+MIN_BAND_VIEWS = 0.5  # a band is checked at least so many sides of a view wide
+_NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)  # mantissas of round ground resolutions
 
 
 def default_band_m(view_m: float, prior_std_m: float | None = DEFAULT_PRIOR_STD_M) -> float:
-    """Width of the search band of a route, for views of `view_m` and a prior position, if any."""
     priors = BAND_PRIORS * (view_m if prior_std_m is None else prior_std_m)
     return max(priors, MIN_BAND_VIEWS * view_m)
 
@@ -68,18 +59,16 @@ class Caution:
 class ViewPlan:
     """Footprint of a vertical view of flat ground.
 
-    `agl_m`: height above ground. `width_m`, `height_m`: sides of the footprint. `gsd_m`: ground
-    resolution, metres per pixel.
+    `width_m`, `height_m`: sides of the footprint.
     """
 
-    agl_m: float
+    agl_m: float  # height above ground
     width_m: float
     height_m: float
-    gsd_m: float
+    gsd_m: float  # ground resolution, metres per pixel
 
     @classmethod
     def of(cls, camera: Camera, agl_m: float) -> "ViewPlan":
-        """The view from a height above ground. Raises `CameraError` on an impossible height."""
         if not 1 <= agl_m <= 50_000:
             raise CameraError(f"height above ground must be 1 to 50,000 m, got {agl_m}")
         return cls(
@@ -101,11 +90,9 @@ class ViewPlan:
 
     @property
     def spacing_m(self) -> float:
-        """Largest distance between views that overlap by `VIEW_OVERLAP` along the shorter side."""
         return (1 - VIEW_OVERLAP) * self.short_m
 
     def tile_share(self, tile_m: float) -> float:
-        """Share of a tile of width `tile_m` covered by the view at the same heading."""
         return min(self.width_m, tile_m) * min(self.height_m, tile_m) / tile_m**2
 
     def across_px(self, gsd_m: float) -> float:
@@ -128,21 +115,18 @@ def suited_map(view: ViewPlan) -> tuple[float, int]:
 
 
 def suited_tile_px(view: ViewPlan, gsd_m: float) -> int:
-    """The widest tile that the view covers at a given ground resolution, else the smallest."""
     return next(
         (px for px in TILE_SIZES_PX if px * gsd_m <= view.short_m * 1.001), TILE_SIZES_PX[-1]
     )
 
 
 def _nice_below(value: float) -> float:
-    """The largest round number not above a value."""
     power = 10.0 ** math.floor(math.log10(value) + 1e-9)
     nice = max(each for each in _NICE if each * power <= value * (1 + 1e-9))
     return float(f"{nice * power:.3g}")
 
 
 def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
-    """Cautions about views on a map of this ground resolution and tile width."""
     found = []
     tile_m = gsd_m * tile_px
     share, across_px = view.tile_share(tile_m), view.across_px(gsd_m)
@@ -178,7 +162,6 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
 
 
 def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
-    """Cautions about a ground speed."""
     needed = speed_mps / view.spacing_m
     if needed <= TRACKED_PER_S:
         return []
@@ -189,8 +172,7 @@ def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
     return [Caution("fast", text)]
 
 
-TILE_BYTES = 273.0
-"""Embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles."""
+TILE_BYTES = 273.0  # embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles
 LAYER_BYTES_PER_PX = 0.15, 0.35
 """Registration layer, all levels: minimum and maximum of real imagery, docs/map-format.md."""
 BUILD_FIXED_S = 40.0
@@ -198,8 +180,7 @@ BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
 for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s for 4 million on a
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
-_PAIRS = 1_000_000_000
-"""Limit on pairs of points and legs, which bounds the time of an estimate."""
+_PAIRS = 1_000_000_000  # limit on pairs of points and legs, which bounds the time of an estimate
 _MOST_POINTS = 200_000
 _LEAST_POINTS = 2_500
 """Points sampled at most and at least: a standard error of the share of 0.1 % to 1 %."""
@@ -209,16 +190,14 @@ _LEAST_POINTS = 2_500
 class MapEstimate:
     """Estimate for a map of one sheet.
 
-    `area_km2`: area covered by tile centres. `imagery_km2`: area of the pixels under the tiles.
-    `tiles`: number of reference tiles. `map_mb`: smallest and largest expected file size.
     `build_s`: time of the default build on one desktop core, with registration; training a network
     takes hours more.
     """
 
-    area_km2: float
-    imagery_km2: float
-    tiles: int
-    map_mb: tuple[float, float]
+    area_km2: float  # area covered by tile centres
+    imagery_km2: float  # area of the pixels under the tiles
+    tiles: int  # number of reference tiles
+    map_mb: tuple[float, float]  # smallest and largest expected file size
     build_s: float
 
 
@@ -290,12 +269,10 @@ def _share(
 
 
 Array = NDArray[np.float64]
-MAX_POSITIONS = 2000
-"""Sampled positions along a route at most."""
+MAX_POSITIONS = 2000  # sampled positions along a route at most
 LANDING_M = 30.0
 """Height above ground below which the aircraft takes off or lands; views there are not judged."""
-_BELOW_GROUND_M = 2.0
-"""Tolerance for errors of the terrain model."""
+_BELOW_GROUND_M = 2.0  # tolerance for errors of the terrain model
 _ACROSS = (0.0, -0.5, 0.5)
 _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 
@@ -304,16 +281,15 @@ _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 class LegProfile:
     """A leg over terrain.
 
-    `leg`: number, from 1. `length_m`: its length. `ground_m`: minimum and maximum terrain height
-    above mean sea level along it. `agl_m`: minimum and maximum height above ground. `relief`:
-    largest difference of terrain height within a view centred on the leg or on an edge of its
-    search band, as a share of the height above ground; 0 below `LANDING_M`.
+    `ground_m`: minimum and maximum terrain height above mean sea level along it. `relief`: largest
+    difference of terrain height within a view centred on the leg or on an edge of its search band,
+    as a share of the height above ground; 0 below `LANDING_M`.
     """
 
-    leg: int
-    length_m: float
+    leg: int  # number, from 1
+    length_m: float  # its length
     ground_m: tuple[float, float]
-    agl_m: tuple[float, float]
+    agl_m: tuple[float, float]  # minimum and maximum height above ground
     relief: float
 
 
@@ -408,7 +384,6 @@ def _flown_amsl_m(
 
 
 def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
-    """Cautions about a route over this terrain."""
     found = []
     low = [leg.leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
     steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg.leg not in low]

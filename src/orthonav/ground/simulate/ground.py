@@ -17,24 +17,17 @@ from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.ground.planning.area import Area
 from orthonav.ground.simulate.perspective import Raster, coloured, met, rays_enu
 
-COVERAGE_PX = 1024
-"""Size of the coverage mask; bounds its memory for any imagery."""
-MAX_NODES = 4000
-"""Heights along a side of the area, at most; bounds their memory."""
+COVERAGE_PX = 1024  # size of the coverage mask; bounds its memory for any imagery
+MAX_NODES = 4000  # heights along a side of the area, at most; bounds their memory
 READ_ROWS = 64
-FARTHEST = 12.0
-"""Ground farther away than so many heights above it is not rendered: it is sky."""
-NEAR = 3.0
-"""Ground nearer than so many heights must be covered by imagery."""
-MANY_PX = 500_000
-"""Of larger pictures every second ray is followed."""
+FARTHEST = 12.0  # ground farther away than so many heights above it is not rendered: it is sky
+NEAR = 3.0  # ground nearer than so many heights must be covered by imagery
+MANY_PX = 500_000  # of larger pictures every second ray is followed
 BORDER = 9
 Array = NDArray[np.float64]
 
 
 class Coverage:
-    """Mask of the covered area, subsampled to at most `COVERAGE_PX` pixels across."""
-
     def __init__(self, mosaic: Mosaic, area: Area) -> None:
         self._west, south, east, self._north = area.extent_en_m
         across = max(east - self._west, self._north - south)
@@ -98,15 +91,14 @@ class Coverage:
 class GroundImagery:
     """Imagery in a local plane.
 
-    `raster`: the resampled imagery. `west_m`, `north_m`: its north-west corner. `gsd_m`: metres per
-    pixel. `mirror_px`: box (left, top, right, bottom) that is mirrored at its sides to fill pixels
-    without imagery, None for no filling.
+    `west_m`, `north_m`: its north-west corner. `mirror_px`: box (left, top, right, bottom) that is
+    mirrored at its sides to fill pixels without imagery, None for no filling.
     """
 
-    raster: SheetRaster
+    raster: SheetRaster  # the resampled imagery
     west_m: float
     north_m: float
-    gsd_m: float
+    gsd_m: float  # metres per pixel
     mirror_px: tuple[int, int, int, int] | None = None
 
     def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
@@ -136,7 +128,6 @@ class GroundImagery:
 
 
 def reflected(index: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
-    """Indices reflected into low..high-1 at both ends."""
     size = high - low
     folded = (index - low) % (2 * size)
     return np.asarray(low + np.minimum(folded, 2 * size - 1 - folded))

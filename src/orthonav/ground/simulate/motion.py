@@ -11,24 +11,16 @@ from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import attitude_of, enu_from_camera
 from orthonav.ground.planning.route import along_polyline_en_m
 
-GUST_STD = 0.15
-"""Standard deviation of the gusts per axis, as a share of the wind speed."""
-LARGEST_GUST = 0.4
-"""Largest gust, as a share of the wind speed."""
-GUST_TIME_S = 60.0
-"""Time constant of the gusts."""
-DRIFT_TIME_S = 300.0
-"""Time constant of the odometry error, which hardly changes within a minute."""
-ARC_STEP_DEG = 2.0
-"""Angle between the points of an arc."""
-SHARPEST_DEG = 179.0
-"""Sharper corners are flown as turns on the spot."""
-LONGEST_STEP_S = 0.5
-"""Longest time step with constant wind and course."""
+GUST_STD = 0.15  # standard deviation of the gusts per axis, as a share of the wind speed
+LARGEST_GUST = 0.4  # largest gust, as a share of the wind speed
+GUST_TIME_S = 60.0  # time constant of the gusts
+DRIFT_TIME_S = 300.0  # time constant of the odometry error, which hardly changes within a minute
+ARC_STEP_DEG = 2.0  # angle between the points of an arc
+SHARPEST_DEG = 179.0  # sharper corners are flown as turns on the spot
+LONGEST_STEP_S = 0.5  # longest time step with constant wind and course
 HORIZON_TIME_S = 15.0
 """Correlation time of the horizon. Errors of real autopilots change within 10 to 30 s."""
-MAX_STEPS = 1_000_000
-"""Limit of the time steps of a flight in wind: 139 hours."""
+MAX_STEPS = 1_000_000  # limit of the time steps of a flight in wind: 139 hours
 Array = NDArray[np.float64]
 
 
@@ -53,7 +45,6 @@ class Wind:
 
     @property
     def strongest_mps(self) -> float:
-        """Wind speed in the strongest gust."""
         return self.speed_mps * (1 + LARGEST_GUST)
 
     @property
@@ -64,16 +55,10 @@ class Wind:
 
 @dataclass(frozen=True, eq=False)
 class FlownPath:
-    """N views along a route.
-
-    `places_en_m` (N, 2): positions. `headings_deg` (N,). `times_s` (N,): time since the first.
-    `first_velocity_en_mps` (2,): velocity over ground at the first.
-    """
-
-    places_en_m: Array
-    headings_deg: Array
-    times_s: Array
-    first_velocity_en_mps: Array
+    places_en_m: Array  # (N, 2)
+    headings_deg: Array  # (N,)
+    times_s: Array  # (N,) time since the first
+    first_velocity_en_mps: Array  # (2,) velocity over ground at the first
 
     @property
     def velocities_en_mps(self) -> Array:
@@ -221,7 +206,6 @@ def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
 def mounted(
     attitude_deg: tuple[float, float, float], pitch_deg: float, roll_deg: float
 ) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a tilted camera in an aircraft with the given attitude."""
     level = enu_from_camera(0.0, 0.0, 0.0)
     tilted = enu_from_camera(0.0, pitch_deg, roll_deg)
     return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ tilted)

@@ -15,15 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
 
-STRIDE_PX = 1.0
-"""Steps along a ray, in pixels of the heights."""
-HALVINGS = 8
-"""Halvings of the step in which a ray meets the ground."""
+STRIDE_PX = 1.0  # steps along a ray, in pixels of the heights
+HALVINGS = 8  # halvings of the step in which a ray meets the ground
 MAX_STEPS = 4000
-MAX_HALVED = 5
-"""Imagery is averaged down to 1/32 at most where a pixel sees much ground."""
-SKY = 200.0
-"""Grey level where a ray meets no ground."""
+MAX_HALVED = 5  # imagery is averaged down to 1/32 at most where a pixel sees much ground
+SKY = 200.0  # grey level where a ray meets no ground
 Array = NDArray[np.float64]
 
 

@@ -17,22 +17,15 @@ from orthonav.core.geo.camera import (
     undistort,
 )
 
-FEWEST_VIEWS, MOST_VIEWS = 10, 40
-"""Length of a cloudy stretch in views."""
-EDGE = 0.25
-"""Share of a stretch, at each end, over which the clouds close."""
-BROKEN = 0.3
-"""Share of the stretches whose clouds never close."""
-HEIGHT = 0.5
-"""Height of the clouds as a share of the aircraft's."""
-SOFTNESS = 0.25
-"""Width of a cloud edge, as a share of the range of cloud cover."""
+FEWEST_VIEWS, MOST_VIEWS = 10, 40  # length of a cloudy stretch in views
+EDGE = 0.25  # share of a stretch, at each end, over which the clouds close
+BROKEN = 0.3  # share of the stretches whose clouds never close
+HEIGHT = 0.5  # height of the clouds as a share of the aircraft's
+SOFTNESS = 0.25  # width of a cloud edge, as a share of the range of cloud cover
 TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0
 """Period of the cloud texture, in its pixels and in lengths of a view."""
-BLOB_PX = 40.0
-"""Size of the largest clouds in pixels of the texture."""
-GRID = 8
-"""Clouds are rendered at this fraction of the resolution of the view."""
+BLOB_PX = 40.0  # size of the largest clouds in pixels of the texture
+GRID = 8  # clouds are rendered at this fraction of the resolution of the view
 Array = NDArray[np.float64]
 
 
@@ -142,15 +135,13 @@ def _enlarged(part: Array, size: tuple[int, int]) -> NDArray[np.float32]:
 class ViewEffects:
     """Image degradation.
 
-    `exposure_std`: standard deviation of the logarithm of the exposure, 0..1. `blur_px`: standard
-    deviation of the blur in pixels, 0..50. `noise_std`: standard deviation of the sensor noise in
-    grey levels, 0..128. `jpeg_quality`: 1..100. Raises `FlightError` outside these ranges.
+    Raises `FlightError` outside these ranges.
     """
 
-    exposure_std: float = 0.15
-    blur_px: float = 0.6
-    noise_std: float = 2.0
-    jpeg_quality: int = 90
+    exposure_std: float = 0.15  # standard deviation of the logarithm of the exposure, 0..1
+    blur_px: float = 0.6  # standard deviation of the blur in pixels, 0..50
+    noise_std: float = 2.0  # standard deviation of the sensor noise in grey levels, 0..128
+    jpeg_quality: int = 90  # 1..100
 
     def __post_init__(self) -> None:
         limits = {"exposure_std": 1.0, "blur_px": 50.0, "noise_std": 128.0}

@@ -25,8 +25,7 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
 _BAND = ("band_m",)
-_MODE = ("altitudemode", "altitude_mode")
-"""Column of Litchi."""
+_MODE = ("altitudemode", "altitude_mode")  # column of Litchi
 _FRAME_OF_MODE: dict[float, HeightFrame] = {0: "home", 1: "agl"}
 _UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")
 """Unit that ends the name of a column, as in altitude(m)."""
@@ -124,7 +123,6 @@ def _bands_m(
 
 
 def _column(names: dict[str, Any], aliases: tuple[str, ...]) -> Any:
-    """The spelling in the header of the first alias found, None if there is none."""
     return next((names[alias] for alias in aliases if alias in names), None)
 
 

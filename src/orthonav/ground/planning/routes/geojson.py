@@ -21,12 +21,10 @@ from orthonav.ground.planning.routes.record import (
 
 
 def read_geojson(data: bytes) -> list[Route]:
-    """All lines of a GeoJSON document, in order. Raises `RouteError`."""
     return routes_of(json_object(data))
 
 
 def routes_of(plain: dict[str, Any]) -> list[Route]:
-    """All lines of a GeoJSON object, in order. Raises `RouteError` if there is none."""
     found: list[Route] = []
     others: list[tuple[str, str, Any]] = []
     for geometry, properties in _geometries(plain):
@@ -131,7 +129,6 @@ def _position(point: Any) -> tuple[float, float, float | None]:
 
 
 def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Geometries of a GeoJSON object with their properties, without recursion."""
     stack: list[tuple[Any, dict[str, Any]]] = [(node, {})]
     while stack:
         item, properties = stack.pop()

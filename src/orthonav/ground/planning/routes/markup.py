@@ -34,12 +34,11 @@ _KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "
 """With other altitude modes, or none, the altitude is ignored, as KML specifies."""
 _POINTLESS = ("Point", "Polygon", "LinearRing", "Model")
 _END = struct.Struct("<4s4H2LH")
-_WPML_FRAMES: dict[str, HeightFrame] = {
+_WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
     "relativeToStartPoint": "home",
     "WGS84": "hae",
     "realTimeFollowSurface": "agl",
 }
-"""By `executeHeightMode`."""
 _Place = tuple[float, float, Height | None]
 
 
@@ -76,8 +75,6 @@ def text_of(element: Element, tag: str) -> str | None:
 
 
 class _Builder(TreeBuilder):
-    """Builds a tree from parser events, within limits."""
-
     def __init__(self, kind: str) -> None:
         super().__init__()
         self._kind = kind
@@ -179,7 +176,6 @@ def _chosen_members(members: list[str]) -> list[str]:
 
 
 def read_kml(data: bytes) -> list[Route]:
-    """Lines and tracks of all placemarks, those of one placemark joined. Raises `RouteError`."""
     root = read_markup(data, "KML", "kml")
     marks = list(root.iter("Placemark"))
     found = [route for mark in marks for route in _kml_routes(mark)]
@@ -240,7 +236,6 @@ def _kml_place(values: list[str], frame: HeightFrame | None, text: str) -> _Plac
 
 
 def _check_archive(data: bytes) -> None:
-    """Refuse archives with so many members that their list alone would exhaust memory."""
     at = data.rfind(b"PK\x05\x06")
     if at < 0 or len(data) - at < _END.size:
         raise RouteError("KMZ is not a complete zip archive (its end is missing)")

@@ -37,11 +37,10 @@ WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 
 _CIRCLES = (17, 18, 19, 31, 34)
 _ARC, _SPLINE, _PLACE, _REPOSITION = 36, 82, 94, 192
 _OF_USERS = range(31000, 31005)
-FLOWN = {
+FLOWN = {  # commands with a position that the aircraft flies to
     *(WAYPOINT, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND),
     *(*_CIRCLES, _ARC, _SPLINE, _PLACE, _REPOSITION, *_OF_USERS),
 }
-"""Commands with a position that the aircraft flies to."""
 _NOT_FLOWN = {
     *(80, 83, 92, 93, 95),  # regions of interest, delays
     *range(112, 160),  # conditions
@@ -67,33 +66,28 @@ _HEIGHT_FRAMES: dict[int, HeightFrame] = {
 class MissionItem:
     """A mission item.
 
-    `command`: MAV_CMD. `frame`: MAV_FRAME, the reference of `height_m`. `lat_deg`, `lon_deg`:
-    position, None if it has none. `number`: of the item in its file. `pattern`: number shared by
-    all items of one survey or corridor, which is flown as a whole. `band_m`: search band between
-    items of one pattern.
+    `lat_deg`, `lon_deg`: position, None if it has none. `pattern`: number shared by all items of
+    one survey or corridor, which is flown as a whole.
     """
 
-    command: int
-    frame: int
+    command: int  # MAV_CMD
+    frame: int  # MAV_FRAME, the reference of `height_m`
     lat_deg: float | None
     lon_deg: float | None
     height_m: float | None = None
-    number: int = 0
+    number: int = 0  # of the item in its file
     pattern: int | None = None
-    band_m: float | None = None
+    band_m: float | None = None  # search band between items of one pattern
 
 
 @dataclass(frozen=True)
 class Home:
-    """The planned take-off position, and its height above mean sea level."""
-
     lat_deg: float
     lon_deg: float
     amsl_m: float | None = None
 
 
 def height_frame(frame: int) -> HeightFrame:
-    """Height reference of a MAV_FRAME. Raises `RouteError` for frames that are not global."""
     if frame not in _HEIGHT_FRAMES:
         raise RouteError(
             f"mission has a waypoint in MAV_FRAME {frame}; expected a global one "
@@ -154,7 +148,6 @@ def _has_place(item: MissionItem) -> bool:
 
 
 def _is_lost(item: MissionItem) -> bool:
-    """Whether an item that is left out may be flown to."""
     return (item.command in FLOWN or item.command not in _NOT_FLOWN) and _has_place(item)
 
 
@@ -177,17 +170,14 @@ _LANDINGS = ("fwLandingPattern", "vtolLandingPattern")
 
 
 def read_plan(data: bytes) -> list[Route]:
-    """The route of a plan. Raises `RouteError`, naming items that cannot be flown with a map."""
     return [plan_route(json_object(data))]
 
 
 def is_plan(plain: dict[str, Any]) -> bool:
-    """Whether a JSON object is a plan."""
     return plain.get("fileType") == "Plan"
 
 
 def plan_route(plain: dict[str, Any]) -> Route:
-    """The route of a plan read as JSON. Raises `RouteError`."""
     if not is_plan(plain):
         raise RouteError(f"plan must have fileType 'Plan', got {plain.get('fileType')!r:.40}")
     mission = plain.get("mission")
@@ -265,7 +255,6 @@ def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]
 def _survey_height(
     camera: dict[str, Any], inner: dict[str, Any], where: str
 ) -> tuple[int, float | None]:
-    """MAV_FRAME and height of a survey, from its camera calculation."""
     height_m = number_or_none(camera.get("DistanceToSurface"), f"{where}: DistanceToSurface")
     mode = camera.get("DistanceMode")
     if mode in _FRAME_OF_MODE:
@@ -296,17 +285,14 @@ def _latlon(point: Any, what: str) -> tuple[float, float]:
 
 _COLUMNS = 12
 _MAGIC = b"QGC WPL"
-_HOMES = (0, WAYPOINT, 179)
-"""Commands of the home position: none, a waypoint, or one that sets it."""
+_HOMES = (0, WAYPOINT, 179)  # commands of the home position: none, a waypoint, or one that sets it
 
 
 def is_wpl(data: bytes) -> bool:
-    """Whether a file begins like a waypoint file."""
     return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_MAGIC)
 
 
 def read_wpl(data: bytes) -> list[Route]:
-    """The route of a waypoint file. Raises `RouteError`."""
     lines = bounded_lines(io.StringIO(decoded(data).lstrip(), newline=None))
     try:
         first_line = next(lines)

@@ -15,17 +15,13 @@ from orthonav.core.geo.swapped import swapped_hint
 
 HeightFrame = Literal["agl", "home", "amsl", "hae"]
 HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
-MAX_HEIGHT_M = 100_000.0
-"""Sanity limit: the edge of space."""
-MAX_BAND_M = 50_000.0
-"""Width of the largest sheet."""
-MAX_WAYPOINTS = 100_000
-"""Sanity limit against files that exhaust memory."""
+MAX_HEIGHT_M = 100_000.0  # sanity limit: the edge of space
+MAX_BAND_M = 50_000.0  # width of the largest sheet
+MAX_WAYPOINTS = 100_000  # sanity limit against files that exhaust memory
 MAX_NAMED = 12
 
 
 def left_out_text(left_out: Sequence[str]) -> str:
-    """A sentence that names what a route leaves out."""
     more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
     return (
         "positions that are not part of the route, so the map may not cover them: "
@@ -71,19 +67,17 @@ class Route:
 
     Leg i goes from waypoint i to waypoint i + 1; a route of one waypoint has one leg of length 0.
 
-    - `waypoints`: `(lat_deg, lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360.
-    - `heights`: one per waypoint, None if unknown; empty if the file has none.
-    - `leg_bands_m`: full width of the search band per leg in metres, None for the default; empty
-      if the file has none.
-    - `name`: name of the line in its file, None if it has none.
-    - `home_amsl_m`: height of the take-off position above mean sea level, metres, None if unknown.
-    - `left_out`: what of the file has a position and is not part of the route, by name.
+    `waypoints`: `(lat_deg, lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360. `heights`:
+    one per waypoint, None if unknown; empty if the file has none. `leg_bands_m`: full width of the
+    search band per leg in metres, None for the default; empty if the file has none. `home_amsl_m`:
+    height of the take-off position above mean sea level, metres, None if unknown. `left_out`: what
+    of the file has a position and is not part of the route, by name.
     """
 
     waypoints: tuple[tuple[float, float], ...]
     heights: tuple[Height | None, ...] = ()
     leg_bands_m: tuple[float | None, ...] = ()
-    name: str | None = None
+    name: str | None = None  # name of the line in its file, None if it has none
     home_amsl_m: float | None = None
     left_out: tuple[str, ...] = ()
 
@@ -129,7 +123,6 @@ class Route:
 
     @property
     def legs(self) -> int:
-        """Number of legs, at least one."""
         return max(1, len(self.waypoints) - 1)
 
     def points_en_m(self, frame: LocalFrame) -> NDArray[np.float64]:
@@ -149,7 +142,6 @@ class Route:
         return known if len(known) == len(bands) else None
 
     def part(self, first: int, last: int, name: str | None = None) -> "Route":
-        """The legs from waypoint `first` to waypoint `last`, both included."""
         return Route(
             self.waypoints[first : last + 1],
             self.heights[first : last + 1],
@@ -160,7 +152,6 @@ class Route:
 
 
 def number(value: Any, what: str) -> float:
-    """A finite JSON number. Raises `RouteError` for anything else, as `"12"` or true."""
     if type(value) not in (int, float) or not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {value!r:.80}")
     return float(value)
@@ -174,7 +165,6 @@ def number_or_none(value: Any, what: str) -> float | None:
 
 
 def parsed(text: str, what: str) -> float:
-    """The finite number in a text. Raises `RouteError`, also for NaN and infinity."""
     try:
         value = float(text)
     except ValueError as error:
@@ -206,7 +196,6 @@ def decoded(data: bytes) -> str:
 
 
 def json_object(data: bytes) -> dict[str, Any]:
-    """The object of a JSON document. Raises `RouteError`."""
     try:
         plain = json.loads(decoded(data))
     except (json.JSONDecodeError, RecursionError) as error:
