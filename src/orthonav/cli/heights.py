@@ -17,11 +17,7 @@ log = logging.getLogger(__name__)
 
 
 def dem_of(options: argparse.Namespace) -> "Dem | None":
-    """The terrain model of `--dem`, None without one.
-
-    Raises `ImageryError`, `MissingFileError`, `MissingExtraError`, and `FlightError` for options
-    that exclude each other.
-    """
+    """The terrain model of `--dem`, None without one."""
     from orthonav.core.errors import FlightError
 
     if options.dem is None:
@@ -38,10 +34,7 @@ def dem_of(options: argparse.Namespace) -> "Dem | None":
 
 
 def dem_for_route(options: argparse.Namespace, route: "Route") -> "Dem | None":
-    """The same for a route, at least one waypoint of which lies in it.
-
-    Raises also `ImageryError` where none does; it names swapped coordinates as the cause.
-    """
+    """The same for a route, at least one waypoint of which lies in it."""
     from orthonav.core.errors import ImageryError
     from orthonav.core.geo.swapped import swapped_hint
 
@@ -90,11 +83,8 @@ def flight_heights(
     flight: "Recording",
     dem: "Dem | None",
 ) -> "FlownHeights | None":
-    """Heights above ground of the views of a recorded flight; None without a terrain.
-
-    What is assumed about heights is logged once. Raises `ImageryError` where the terrain model lies
-    outside the map.
-    """
+    """Heights above ground of the views of a recorded flight; None without a terrain. What is
+    assumed about heights is logged once."""
     from orthonav.core.errors import ImageryError
 
     if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
@@ -123,10 +113,8 @@ def say_assumed_heights(
     terrain: str | None = None,
     advice: str = "give --dem, or build the map with it",
 ) -> None:
-    """Log what is assumed about the heights of a flight, over a terrain or without one.
-
-    `advice`: what would help. Other recordings than flights have said it when they were opened.
-    """
+    """Log what is assumed about the heights of a flight, over a terrain or without one. `advice`:
+    what would help. Other recordings than flights have said it when they were opened."""
     from orthonav.core.flight.heights import assumed_heights
 
     first = next(iter(flight.views), None)
@@ -136,10 +124,8 @@ def say_assumed_heights(
 
 
 def geoid_for(flight: "Recording") -> "Undulation | None":
-    """The geoid, where the height above the ellipsoid is known and that above the sea is not.
-
-    Where it is needed and missing, a warning says what to install.
-    """
+    """The geoid, where the height above the ellipsoid is known and that above the sea is not. Where
+    it is needed and missing, a warning says what to install."""
     from orthonav.core.errors import ImageryError, MissingExtraError
 
     first = next(iter(flight.views), None)

@@ -48,10 +48,8 @@ MAX_CHAIN_LOG_ODDS = 14.0
 
 @dataclass(frozen=True)
 class Placement:
-    """How a view may have been taken.
-
-    `lat_deg`, `lon_deg`: place of the camera, if nothing else is said.
-    """
+    """How a view may have been taken. `lat_deg`, `lon_deg`: place of the camera, if nothing else is
+    said."""
 
     lat_deg: float
     lon_deg: float
@@ -127,11 +125,9 @@ class Agreement:
     def add_view(
         self, places: Sequence[PlaceEvidence], time_ns: int, side_m: float, chance: float
     ) -> None:
-        """Take in the places where a view `side_m` wide may have been taken.
-
-        `chance`: probability that the best of the wrong places lies where a chain expects the view,
-        the share of the searched area that was searched there.
-        """
+        """Take in the places where a view `side_m` wide may have been taken. `chance`: probability
+        that the best of the wrong places lies where a chain expects the view, the share of the
+        searched area that was searched there."""
         gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
         made: list[Chain] = []
         supporting = [each for each in places if _support(each, gain) > 0]

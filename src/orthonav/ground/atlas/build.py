@@ -50,15 +50,12 @@ _POINTS = 17  # points along a side of a sheet at which it is compared with a se
 
 @dataclass(frozen=True)
 class AtlasRequest:
-    """What to build into an atlas.
-
-    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
-    others are the atlas's, or the defaults (`gsd_m`: that of the imagery). `route`, `band_m`: area:
-    a search band around a route, in metres. Without bounds or route all imagery is the area.
-    `replace`: rebuild sheets of other imagery or program versions instead of refusing them. `dem`,
-    `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and what
-    its heights count from.
-    """
+    """What to build into an atlas. `recipe`: fields of `AtlasRecipe` that were requested, `coarse`
+    with some or all of its own; the others are the atlas's, or the defaults (`gsd_m`: that of the
+    imagery). `route`, `band_m`: area: a search band around a route, in metres. Without bounds or
+    route all imagery is the area. `replace`: rebuild sheets of other imagery or program versions
+    instead of refusing them. `dem`, `dem_datum`: terrain model of which sheets get a terrain layer
+    where it has heights, and what its heights count from."""
 
     url: str  # the atlas, a folder or an fsspec URL, created where it does not exist
     orthos: Sequence[Path]  # files and folders of orthophotos; the first covers the next
@@ -77,10 +74,8 @@ class AtlasRequest:
 
 @dataclass(frozen=True)
 class SheetTask:
-    """A sheet to be built, with all that a worker on another machine needs.
-
-    `dem`, `dem_datum`: terrain model and what its heights count from, as for a map.
-    """
+    """A sheet to be built, with all that a worker on another machine needs. `dem`, `dem_datum`:
+    terrain model and what its heights count from, as for a map."""
 
     sheet: Sheet  # its description, without tiles and area yet
     atlas: str  # folder or URL of the atlas
@@ -110,10 +105,7 @@ def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> 
 
 def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> list[SheetTask]:
     """A task for each sheet of an area that imagery may touch, from south to north, west to east.
-
-    `mosaic`: that of the orthophotos of the request. Raises `AreaError` where there is no sheet,
-    and for recipes by which no sheet could be built.
-    """
+    `mosaic`: that of the orthophotos of the request."""
     imagery = Imagery(mosaic)
     names = sorted(_names(recipe, imagery, request))
     if not names:
@@ -149,10 +141,8 @@ def request_digest(
     dem_datum: str | None = None,
 ) -> str:
     """Digest of what a sheet depends on: recipe, versions, the imagery under it, and the terrain.
-
     Each file counts with its name, size and second of change, in the order in which files cover
-    each other; its folder does not count, as it may differ between machines.
-    """
+    each other; its folder does not count, as it may differ between machines."""
     stamps = [
         [Path(name).name, size, changed_ns // 10**9]
         for source in part.sources
@@ -258,10 +248,8 @@ def _overlap(bounds_deg: Extent, other: Extent) -> bool:
 
 
 def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: float) -> None:
-    """Raise `AreaError` for recipes by which this sheet cannot be built with any imagery.
-
-    An `AreaError` of a worker then means that there is no imagery.
-    """
+    """Raise `AreaError` for recipes by which this sheet cannot be built with any imagery. An
+    `AreaError` of a worker then means that there is no imagery."""
     area = Area.from_bounds(bounds_deg)
     grid = grid_of(
         area, min(imagery_gsd_m, recipe.gsd_m), recipe.gsd_m, recipe.tile_px, recipe.overlap
@@ -273,11 +261,9 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
-    """The files and folders that a worker needs to read the same pixels as from all of them.
-
-    All of them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from
-    many files together.
-    """
+    """The files and folders that a worker needs to read the same pixels as from all of them. All of
+    them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from many
+    files together."""
     common = any(each is not None for each in mosaic.stretches)
     if common or any(source.marked_alpha for source in mosaic.sources):
         return tuple(orthos)
@@ -311,11 +297,8 @@ Status = Literal["built", "unchanged", "empty", "failed"]
 
 @dataclass(frozen=True)
 class SheetResult:
-    """The result of one sheet and its cost.
-
-    `status`: `built`; `unchanged`, it was there already; `empty`, there is no imagery; `failed`.
-    `size_bytes`, `area_km2`, `tiles`: of the sheet.
-    """
+    """The result of one sheet and its cost. `status`: `built`; `unchanged`, it was there already;
+    `empty`, there is no imagery; `failed`. `size_bytes`, `area_km2`, `tiles`: of the sheet."""
 
     sheet: str  # name
     status: Status
@@ -370,9 +353,7 @@ class BuildReport:
 
     def to_plain(self, cpu_hour_price: float | None = None) -> dict[str, Any]:
         """Sums and rates as plain values; `cpu_hour_price` is the price of an hour of a core.
-
-        `core_s` is how long workers were busy with sheets, which is what machines are paid for.
-        """
+        `core_s` is how long workers were busy with sheets, which is what machines are paid for."""
         built = [each for each in self.results if each.status == "built"]
         tried = [each for each in self.results if each.status != "unchanged"]
         wall_s = self.wall_s or time.monotonic() - self.started_s
@@ -438,13 +419,11 @@ def build_atlas(
     progress: Progress = no_progress,
     report: Callable[[str], None] = log.info,
 ) -> BuildReport:
-    """Build the missing sheets with a runner that was entered, and report the results.
-
-    A sheet that fails is listed in the result, and the others are built. `progress` is called
-    with a stage and its share done, `report` with lines for people. Raises `AreaError`,
-    `ImageryError`, `MissingFileError`; `AtlasError` where present sheets are of other imagery or
-    versions; `WorkerError` where workers have other versions; `StorageError`.
-    """
+    """Build the missing sheets with a runner that was entered, and report the results. A sheet that
+    fails is listed in the result, and the others are built. `progress` is called with a stage and
+    its share done, `report` with lines for people. Raises `AreaError`, `ImageryError`,
+    `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
+    `WorkerError` where workers have other versions; `StorageError`."""
     started_s = time.monotonic()
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
@@ -500,11 +479,7 @@ def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, 
 
 
 def build_sheet(task: SheetTask) -> SheetResult:
-    """Build a sheet and put it into the atlas. Depends only on the task and the imagery.
-
-    Raises `WorkerError` where this program has other versions than the task, `AtlasError` where it
-    sees other imagery, `ImageryError`, `OutputError`, `StorageError`.
-    """
+    """Build a sheet and put it into the atlas. Depends only on the task and the imagery."""
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     wanted = task.sheet
     if differences := version_differences(wanted.made_by, versions()):
@@ -619,11 +594,8 @@ def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards.
-
-    It is locked while this process lives; folders of processes that were killed are removed first.
-    Raises `OutputError`.
-    """
+    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards. It is
+    locked while this process lives; folders of processes that were killed are removed first."""
     root = Path(tempfile.gettempdir())
     for path in root.glob(f"{SCRATCH}*/{_LOCK}"):
         with contextlib.suppress(OSError), path.open("r+") as lock:
@@ -642,10 +614,8 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _peak_bytes() -> int:
-    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown.
-
-    Linux's own count: that of getrusage includes the parent's.
-    """
+    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown. Linux's
+    own count: that of getrusage includes the parent's."""
     with contextlib.suppress(OSError):
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         for line in status.splitlines():

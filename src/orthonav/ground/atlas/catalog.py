@@ -57,10 +57,8 @@ def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
 @dataclass(frozen=True)
 class CoarseRecipe:
     """The coarse tiles in which a view is searched in the whole atlas: wide, at low resolution.
-
     `overlap`: share that neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views
-    are found (docs/decisions, the atlas). Raises `AtlasError` for impossible values.
-    """
+    are found (docs/decisions, the atlas)."""
 
     gsd_m: float = 8.0  # metres per pixel, above 0
     tile_px: int = 128  # width of a tile
@@ -78,10 +76,7 @@ class CoarseRecipe:
 @dataclass(frozen=True)
 class AtlasRecipe:
     """How every sheet is made; fields and defaults not listed here are those of `BuildRequest`.
-
-    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior. Raises
-    `AtlasError` and `AreaError` for impossible values.
-    """
+    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior."""
 
     gsd_m: float  # metres per pixel
     tile_px: int = 256
@@ -130,11 +125,8 @@ _SAME_PLACE_DEG = 1e-9  # a tenth of a millimetre: rounding only
 
 
 class Atlas:
-    """An existing atlas. The list of sheets is read once, and again on request.
-
-    Several processes may put sheets into it at the same time. Raises `StorageError` where the
-    storage fails.
-    """
+    """An existing atlas. The list of sheets is read once, and again on request. Several processes
+    may put sheets into it at the same time."""
 
     def __init__(self, store: Store, recipe: AtlasRecipe) -> None:
         self.store = store
@@ -154,11 +146,7 @@ class Atlas:
 
     @classmethod
     def open_or_create(cls, url: str | Path, recipe: AtlasRecipe) -> "Atlas":
-        """Open an atlas, or create it where there is none.
-
-        Raises `AtlasError` with the differences where it has another recipe, and where the folder
-        holds other files.
-        """
+        """Open an atlas, or create it where there is none."""
         store = Store(str(url))
         if store.size(CATALOG) is None:
             if _is_free(store):
@@ -197,12 +185,9 @@ class Atlas:
         return min(west), min(south), max(east), max(north)
 
     def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
-        """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`.
-
-        Nothing is written where the same files of the same request are there already. Safe with
-        several processes; after a kill the sheet is as before or as described. Raises `AtlasError`
-        where the sheet does not belong to the lattice, `MissingFileError`.
-        """
+        """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`. Nothing is
+        written where the same files of the same request are there already. Safe with several
+        processes; after a kill the sheet is as before or as described."""
         sheet_id = described.id
         stored = {key: _stored(key, sheet_id, Path(path)) for key, path in sorted(files.items())}
         there = self._revisions(sheet_id)
@@ -300,11 +285,7 @@ def copy_sheets(
     progress: Progress = no_progress,
 ) -> tuple[list[str], list[str]]:
     """Copy sheets of one atlas into another of the same recipe: names of copied sheets, and of
-    those that were there and left unchanged.
-
-    With `replace` sheets that differ are replaced. Raises `AtlasError` where the recipes differ or
-    a sheet is not in the source.
-    """
+    those that were there and left unchanged. With `replace` sheets that differ are replaced."""
     atlas.require_recipe(source.recipe)
     found, there = source.sheets(), atlas.sheets(refresh=True)
     unknown = [each for each in sheet_ids or () if each not in found]

@@ -69,9 +69,7 @@ class SerialRunner:
 
 class RayRunner:
     """Runs items on a Ray cluster: a local one, started and stopped here, or one at an address.
-
-    `workers`: greatest number of items at a time, None: the number of cores.
-    """
+    `workers`: greatest number of items at a time, None: the number of cores."""
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
         if workers is not None and workers < 1:
@@ -100,10 +98,8 @@ class RayRunner:
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
         """Each item with its result, when it is finished; closing the iterator stops the others.
-
         With `gpu` each item has a GPU to itself, where there are any. Items whose process died are
-        tried again `RETRIES` times.
-        """
+        tried again `RETRIES` times."""
         has_gpu = gpu and self._ray.cluster_resources().get("GPU", 0) >= 1
         task = self._task(num_cpus=1, num_gpus=1 if has_gpu else 0)
         waiting = iter(items)

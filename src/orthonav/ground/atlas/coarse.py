@@ -44,11 +44,9 @@ _SLACK_DEG = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CoarseTiles:
-    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only.
-
-    `bounds_deg`: box of the sheet: west, south, east, north. `centres_latlon_deg` (N, 2) float64; N
-    is 0 where no tile shows enough imagery.
-    """
+    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only. `bounds_deg`: box
+    of the sheet: west, south, east, north. `centres_latlon_deg` (N, 2) float64; N is 0 where no
+    tile shows enough imagery."""
 
     recipe: CoarseRecipe  # how they were made
     bounds_deg: Extent
@@ -71,10 +69,7 @@ def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
 
 
 def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
-    """The coarse tiles whose centres lie in a box, made from the imagery with one thread.
-
-    Raises `AreaError` for impossible recipes, `ImageryError` where the imagery cannot be read.
-    """
+    """The coarse tiles whose centres lie in a box, made from the imagery with one thread."""
     area = Area.from_bounds(bounds_deg)
     grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
@@ -104,10 +99,8 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
 
 
 def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
-    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number.
-
-    The bytes are the same every time. Raises as `make_coarse`, and `OutputError`.
-    """
+    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number. The
+    bytes are the same every time."""
     made = make_coarse(mosaic, bounds_deg, recipe)
     arrays: dict[str, NDArray[Any]] = {
         "centres_latlon_deg": made.centres_latlon_deg,
@@ -127,10 +120,7 @@ def tile_count(path: Path) -> int:
 
 
 def read_coarse(path: Path) -> CoarseTiles:
-    """The coarse tiles in a file, completely checked.
-
-    Raises `MissingFileError`, and `AtlasError` where `write_coarse` cannot have written it.
-    """
+    """The coarse tiles in a file, completely checked."""
     path = require_file(path, "coarse tiles")
     try:
         with safe_open(path, framework="numpy") as stored:

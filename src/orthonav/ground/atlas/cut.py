@@ -128,9 +128,7 @@ def check_covered(
     allow_holes: bool,
 ) -> None:
     """Warn where sheets under an area are missing; `AtlasError` where they lie under the route.
-
-    With `allow_holes` that is a warning too. Raises `AreaError` where no part is covered.
-    """
+    With `allow_holes` that is a warning too."""
     tiles = _some_tiles(area, grid)
     lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
     covered = np.any([source.covers(lat, lon) for source in sources], axis=0)
@@ -147,9 +145,7 @@ def check_covered(
 
 def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool) -> None:
     """Warn where the sheets under an area show no imagery; `AtlasError` where the route is there.
-
-    With `allow_holes` that is a warning too.
-    """
+    With `allow_holes` that is a warning too."""
     route = grid.tiles_rc(_route_en_m(area, grid)).clip(0, [grid.rows - 1, grid.cols - 1])
     tiles, lacks = _some_tiles(area, grid), "has no imagery in the atlas"
     on_route, bare = (
@@ -289,10 +285,8 @@ def pooled_tiles(
     confidences: Sequence[LogisticConfidence], shares: Sequence[float], more_tiles: float
 ) -> LogisticConfidence | None:
     """Confidence of tile search on a map made of sheets in these shares; None without sheets.
-
     `more_tiles`: tiles of the map over tiles of a sheet. As many times more tiles resemble a view
-    by chance, and the odds of the best tile are lower by that factor.
-    """
+    by chance, and the odds of the best tile are lower by that factor."""
     if not confidences:
         return None
     bias = float(np.average([each.bias for each in confidences], weights=shares))
@@ -309,10 +303,8 @@ def pooled_tiles(
 
 
 def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> RegisteredConfidence | None:
-    """Confidence of registered views on a map made of sheets; None without sheets.
-
-    It is the usual one, with the scores of chance of the sheet where they are highest.
-    """
+    """Confidence of registered views on a map made of sheets; None without sheets. It is the usual
+    one, with the scores of chance of the sheet where they are highest."""
     if not confidences:
         return None
     chances = Chances(
@@ -366,11 +358,8 @@ def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
 
 
 def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> TerrainParts | None:
-    """The terrain layer of a map cut from sheets; None where none of them has one.
-
-    A place has the height of the sheet whose box holds it, else of one that reaches over its
-    border. Raises `MapFileError` for a damaged layer.
-    """
+    """The terrain layer of a map cut from sheets; None where none of them has one. A place has the
+    height of the sheet whose box holds it, else of one that reaches over its border."""
     layers = [(each, each.terrain) for each in members if each.terrain is not None]
     if not layers:
         return None
@@ -412,11 +401,9 @@ def cut_map(
     progress: Progress = no_progress,
 ) -> BuildResult:
     """Cut the map of an area, which may be the band of a route, and write it to `out` as a whole.
-
     Missing sheets under the route are an error unless `allow_holes`; other missing sheets are a
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
-    or cannot be cut from, `StorageError`, `OutputError`.
-    """
+    or cannot be cut from, `StorageError`, `OutputError`."""
     out = Path(out)
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
@@ -435,11 +422,7 @@ def cut_map(
 
 
 def cut_in_memory(atlas: Atlas, area: Area) -> MapFile:
-    """The map of an area, flown at once and never written; missing sheets are holes in it.
-
-    Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged or cannot
-    be cut from, `StorageError`.
-    """
+    """The map of an area, flown at once and never written; missing sheets are holes in it."""
     cutter = _MapCutter(atlas, area)
     cutter.read(no_progress, 1)
     manifest, arrays = _learnt(cutter, 1, no_progress)
@@ -464,7 +447,7 @@ class _MapCutter:
         self.preview = Preview(grid, PREVIEW_PX)
 
     def read(self, progress: Progress, workers: int) -> None:
-        """Resample all blocks with `workers` threads. Raises `AtlasError` for a damaged sheet."""
+        """Resample all blocks with `workers` threads."""
         blocks = blocks_of_area(self.area, self.grid, self._layout)
         with one_opencv_thread():
             made = in_order(blocks, lambda: nullcontext(self._made), workers)

@@ -148,11 +148,9 @@ Counted = tuple[Sheet, int]  # a sheet and the number of its coarse tiles
 def make_index(
     atlas: Atlas, progress: Progress = no_progress, rebuild: bool = False
 ) -> IndexManifest | None:
-    """Bring the index of an atlas up to date; None where its sheets have no coarse tiles.
-
-    The same sheets give the same bytes where the index is rebuilt, or built for the first time.
-    Raises `AtlasError`, `StorageError`, `MissingExtraError`.
-    """
+    """Bring the index of an atlas up to date; None where its sheets have no coarse tiles. The same
+    sheets give the same bytes where the index is rebuilt, or built for the first time. Raises
+    `AtlasError`, `StorageError`, `MissingExtraError`."""
     atlas.sheets(refresh=True)
     sheets = indexed_sheets(atlas)
     if not sheets:
@@ -273,10 +271,8 @@ class _IndexBuilder:
     def _tiles(
         self, sheets: Sequence[Sheet], stage: str, shares: Iterator[float], step: int = 1
     ) -> Iterator[tuple[NDArray[np.float64], Features]]:
-        """Places (n, 2) and features of every `step`-th tile of sheets, some at a time.
-
-        `shares`: share of the stage that is done after each sheet.
-        """
+        """Places (n, 2) and features of every `step`-th tile of sheets, some at a time. `shares`:
+        share of the stage that is done after each sheet."""
         for sheet in sheets:
             tiles = read_coarse(self._atlas.path(sheet, "coarse"))
             for start in range(0, len(tiles.valid), step * BATCH_TILES):
@@ -322,7 +318,7 @@ def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> 
 
 
 def load_whitening(path: Path) -> WhitenedEmbedder:
-    """The whitening of an index; raises `AtlasError`."""
+    """The whitening of an index."""
     try:
         parts = load_file(path)
         mean, basis = parts["mean"], parts["basis"]

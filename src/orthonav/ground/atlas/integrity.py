@@ -57,13 +57,10 @@ def check_atlas(
     clean: bool = False,
     min_age_s: float = MIN_AGE_S,
 ) -> list[Problem]:
-    """All problems of an atlas by name; empty where it is whole.
-
-    `deep` reads every file, verifies its checksum, opens it and compares it with the recipe.
-    `clean` removes leftovers older than `min_age_s` (files that no item names, temporary files,
-    replaced revisions) and rewrites a stale snapshot; nothing else is changed. Raises
-    `StorageError` where the storage fails.
-    """
+    """All problems of an atlas by name; empty where it is whole. `deep` reads every file, verifies
+    its checksum, opens it and compares it with the recipe. `clean` removes leftovers older than
+    `min_age_s` (files that no item names, temporary files, replaced revisions) and rewrites a stale
+    snapshot; nothing else is changed."""
     store, clean_s = atlas.store, min_age_s if clean else None
     items, broken = read_items(store)
     files = _files(store)
@@ -179,10 +176,8 @@ def _file_problems(
     remedy: str,
     content: Callable[[Path], Problem | None] = lambda path: None,
 ) -> Iterator[Problem]:
-    """The problem of a file that is `size` bytes long, None where it is missing.
-
-    `content` finds that of the content of a file whose checksum is right.
-    """
+    """The problem of a file that is `size` bytes long, None where it is missing. `content` finds
+    that of the content of a file whose checksum is right."""
     if size is None:
         yield Problem("missing file", file.name, remedy)
     elif size != file.size_bytes:

@@ -44,10 +44,7 @@ _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of an atlas: its name in the atlas, its size in bytes and its SHA-256 (hex).
-
-    Raises `AtlasError` for an impossible size or digest.
-    """
+    """A file of an atlas: its name in the atlas, its size in bytes and its SHA-256 (hex)."""
 
     name: str
     size_bytes: int
@@ -63,11 +60,8 @@ class StoredFile:
 @dataclass(frozen=True)
 class Sheet:
     """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
-    building, so that the same sheet is the same bytes everywhere.
-
-    `imagery`: its orthophotos, as the manifest of a map describes them. `files`: its files by kind:
-    `map`, `coarse`.
-    """
+    building, so that the same sheet is the same bytes everywhere. `imagery`: its orthophotos, as
+    the manifest of a map describes them. `files`: its files by kind: `map`, `coarse`."""
 
     id: str  # name in the lattice, as r001526c001392
     bounds_deg: Extent  # its box in the lattice: west, south, east, north
@@ -82,10 +76,7 @@ class Sheet:
     files: Mapping[str, StoredFile] = field(default_factory=dict)
 
     def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
-        """The sheet with its files, as it will be read back.
-
-        Raises `AtlasError` where it could not be.
-        """
+        """The sheet with its files, as it will be read back."""
         data = canonical(replace(self, revision=revision, files=files).to_item())
         return self.from_item(json.loads(data), data)
 
@@ -140,11 +131,8 @@ class Sheet:
 
     @classmethod
     def from_item(cls, plain: Any, data: bytes) -> "Sheet":
-        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from.
-
-        Raises `AtlasError` unless every value is possible and writing the sheet gives `data`. That
-        also refuses values of another type, which are converted here.
-        """
+        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. That also
+        refuses values of another type, which are converted here."""
         try:
             properties = plain["properties"]
             own = properties["orthonav:sheet"]
@@ -200,11 +188,9 @@ def canonical(plain: Any) -> bytes:
 
 
 def parsed(data: bytes, what: str) -> Any:
-    """Plain values of JSON; raises `AtlasError` naming `what` where it is not JSON.
-
-    The caller must compare the bytes with the canonical ones, which also excludes repeated keys
-    and numbers that are not finite.
-    """
+    """Plain values of JSON; raises `AtlasError` naming `what` where it is not JSON. The caller must
+    compare the bytes with the canonical ones, which also excludes repeated keys and numbers that
+    are not finite."""
     try:
         return json.loads(data.decode(), parse_int=_integer)
     except (ValueError, RecursionError) as error:
@@ -223,10 +209,7 @@ def split_name(name: str) -> tuple[str, int] | None:
 
 
 def read_item(name: str, data: bytes, plain: Any = None) -> Sheet:
-    """The sheet in the item file `name`; `plain` are its values if already parsed.
-
-    Raises `AtlasError` where the file is damaged or does not agree with its name.
-    """
+    """The sheet in the item file `name`; `plain` are its values if already parsed."""
     if len(data) > MAX_ITEM_BYTES:
         raise AtlasError(f"{len(data)} bytes, at most {MAX_ITEM_BYTES} are allowed: items/{name}")
     plain = parsed(data, f"items/{name}") if plain is None else plain
@@ -264,11 +247,8 @@ def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
 
 
 def _times(dates: tuple[str, ...]) -> dict[str, Any]:
-    """`datetime` and related properties, one of which STAC requires.
-
-    A single day is a date; a year, a month or several dates are a range; unknown dates are the
-    epoch, marked as unknown.
-    """
+    """`datetime` and related properties, one of which STAC requires. A single day is a date; a
+    year, a month or several dates are a range; unknown dates are the epoch, marked as unknown."""
     spans = [span for span in map(_span, dates) if span is not None]
     if not spans:
         return {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}
@@ -310,11 +290,9 @@ _READ_AT_ONCE = 1000  # one page of a listing of S3
 
 
 def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
-    """All items by file name, and the errors of damaged items by file name.
-
-    Where a sheet has several items, the last in the order of names is current. Items of a remote
-    atlas that are in the snapshot are not read one by one; they are checked in the same way.
-    """
+    """All items by file name, and the errors of damaged items by file name. Where a sheet has
+    several items, the last in the order of names is current. Items of a remote atlas that are in
+    the snapshot are not read one by one; they are checked in the same way."""
     names = {name: size for name, size in store.names(ITEMS).items() if split_name(name)}
     if len(names) > MAX_ITEMS:
         raise AtlasError(f"more than {MAX_ITEMS} items: {store}")

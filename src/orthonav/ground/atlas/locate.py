@@ -67,11 +67,8 @@ REPLAYED = 4  # latest views of a place that a track begins with
 
 @dataclass(frozen=True, eq=False)
 class FoundPlace:
-    """A place on which several views agree.
-
-    `seen`: the latest of these views, each with the place of its camera, the last one that of the
-    view found.
-    """
+    """A place on which several views agree. `seen`: the latest of these views, each with the place
+    of its camera, the last one that of the view found."""
 
     seen: tuple[tuple[View, Placement], ...]
     std_m: float  # standard deviation of such a place, per axis
@@ -96,11 +93,7 @@ class PlaceFinder:
         self._views = {}
 
     def find(self, view: View) -> FoundPlace | NoFix:
-        """The place on which this view and earlier ones agree; until then the reason why not.
-
-        Raises `CameraError` where the image is not of the camera's size, `StorageError` where
-        sheets cannot be fetched.
-        """
+        """The place on which this view and earlier ones agree; until then the reason why not."""
         recipe = self._search.recipe
         refused = check_view(view, recipe.gsd_m, self._heading_known)
         if refused is not None:
@@ -224,9 +217,7 @@ prediction is no reason to confirm the track again (docs/decisions/atlas.md)."""
 
 class LocalTrack:
     """The track of one aircraft from a found place on. Mutable; not to be shared between threads.
-
-    `fix`: the position at the last view, None where that view does not show the map there.
-    """
+    `fix`: the position at the last view, None where that view does not show the map there."""
 
     def __init__(self, atlas: Atlas, found: FoundPlace, *, heading_known: bool) -> None:
         self._atlas = atlas
@@ -283,10 +274,8 @@ class LocalTrack:
         self.fix = replace(seen, confidence=confidence) if confidence >= LIKELY else None
 
     def _can_follow(self, telemetry: Telemetry, half_view_m: float) -> bool:
-        """Whether the aircraft is near enough to the expected place to be sought there.
-
-        A view that may reach beyond the map gets another one.
-        """
+        """Whether the aircraft is near enough to the expected place to be sought there. A view that
+        may reach beyond the map gets another one."""
         fix = self._last
         seconds = max(0.0, (telemetry.time_ns - self._time_ns) / 1e9)
         velocity = np.array([fix.evidence["vel_east_mps"], fix.evidence["vel_north_mps"]])
@@ -345,11 +334,7 @@ class AtlasLocator:
         return self._outcome(reason)
 
     def locate(self, view: View) -> Fix | NoFix:
-        """Where a view was taken, once views agree; until then the reason why not.
-
-        Raises `CameraError` where the image is not of the camera's size, `StorageError` where
-        sheets cannot be fetched.
-        """
+        """Where a view was taken, once views agree; until then the reason why not."""
         self._follow(lambda track: track.locate(view))
         if self._track is not None and self._track.fix is not None:
             self._finder.restart()

@@ -63,10 +63,8 @@ MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
 
 
 class TileSearch:
-    """The index of an atlas with its shards mapped. Not to be shared between threads.
-
-    `unknown` names the sheets that are not in the index, which are not found.
-    """
+    """The index of an atlas with its shards mapped. Not to be shared between threads. `unknown`
+    names the sheets that are not in the index, which are not found."""
 
     def __init__(self, atlas: Atlas) -> None:
         if atlas.recipe.coarse is None:
@@ -96,11 +94,9 @@ class TileSearch:
         self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
     ) -> list[Placement]:
         """The tiles most similar to a view under any of the poses, best first, apart from each
-        other: their centres, which are the middle of the ground that the view shows.
-
-        `view`: rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log
-        scale of each.
-        """
+        other: their centres, which are the middle of the ground that the view shows. `view`:
+        rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log scale of
+        each."""
         embedded = embed_poses(
             self._embedder,
             self._representation,
@@ -152,10 +148,8 @@ class SearchRegion(Placement):
 
 @dataclass(frozen=True, eq=False)
 class SheetMatch(Placement):
-    """The placement of a view registered on a sheet.
-
-    `confidence`: what the sheet makes of the evidence, None where it has learnt nothing.
-    """
+    """The placement of a view registered on a sheet. `confidence`: what the sheet makes of the
+    evidence, None where it has learnt nothing."""
 
     evidence: Mapping[str, float]  # scores of the match and of its rivals
     confidence: RegisteredConfidence | None
@@ -194,8 +188,7 @@ class SheetRegistrar:
         self._sheet = functools.lru_cache(maxsize=MAX_OPEN)(self._opened)
 
     def near(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
-        """The usable sheets within reach of the middle of a view. Raises `StorageError` where a
-        sheet cannot be fetched."""
+        """The usable sheets within reach of the middle of a view."""
         frame = LocalFrame(*region.middle_latlon_deg)
         reach_m = region.reach_m + BORDER_SHARE * side_m
         lats, lons = frame.latlon_from_en(np.array([[-reach_m, -reach_m], [reach_m, reach_m]]))
@@ -358,11 +351,8 @@ LEAST = 1e-5  # least and greatest (1 - LEAST) probability of a match, for finit
 
 
 class ViewMatches:
-    """The matches of a view `side_m` wide.
-
-    `found`: the strongest of each place, strongest first. `compared`: the regions of candidates
-    that were finished, or searched.
-    """
+    """The matches of a view `side_m` wide. `found`: the strongest of each place, strongest first.
+    `compared`: the regions of candidates that were finished, or searched."""
 
     def __init__(self, side_m: float) -> None:
         self._apart_m = RIVAL_SHARE * side_m
@@ -436,11 +426,9 @@ def against(
     rivals: Sequence[Mapping[str, float]],
     looks: Sequence[float] = (),
 ) -> dict[str, float]:
-    """The evidence of a match with the best other match of the whole atlas as its rival.
-
-    `looks`: scores, at the level where views are judged, of places that were not finished. The
-    finest level counts only where the strongest rival was compared there too.
-    """
+    """The evidence of a match with the best other match of the whole atlas as its rival. `looks`:
+    scores, at the level where views are judged, of places that were not finished. The finest level
+    counts only where the strongest rival was compared there too."""
     made = dict(evidence)
     for rival, value in (("rival", "strength"), ("look_rival", "look")):
         made[rival] = max([made[rival], *(each[value] for each in rivals)])

@@ -53,10 +53,8 @@ _MAX_TEXT = 300
 
 class Store:
     """The files of one atlas by name (`folder/file`). Can be pickled and used by several threads.
-
     Every failure is a `StorageError` with its cause, or `MissingExtraError` where the package of a
-    protocol is not installed. `str()` gives the address without a password.
-    """
+    protocol is not installed. `str()` gives the address without a password."""
 
     def __init__(self, url: str) -> None:
         match = _PROTOCOL.match(url)
@@ -80,9 +78,7 @@ class Store:
 
     def names(self, folder: str = "", prefix: str = "") -> dict[str, int]:
         """Names of the files of a folder that begin with `prefix`, sorted, and their sizes.
-
-        Subfolders are left out. Empty where there is no such folder.
-        """
+        Subfolders are left out. Empty where there is no such folder."""
         found: dict[str, int] = {}
         with storage_errors(self.shown(folder), "list the files of the atlas"):
             folder = checked_name(folder) if folder else ""
@@ -142,10 +138,8 @@ class Store:
             return {name: found[path] for name, path in zip(names, paths, strict=True)}
 
     def fetch(self, name: str, size: int, sha256: str) -> Path:
-        """A local file with that content, verified once: the file itself or a cached copy.
-
-        Several processes may use the cache at the same time.
-        """
+        """A local file with that content, verified once: the file itself or a cached copy. Several
+        processes may use the cache at the same time."""
         if self.is_local:
             return self._verified_path(name, size, sha256)
         folder, limit_bytes = cache_folder(), cache_limit_bytes()
@@ -320,7 +314,7 @@ def cache_folder() -> Path:
 
 
 def cache_limit_bytes() -> int:
-    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB. Raises `StorageError`."""
+    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB."""
     gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
     try:
         return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
@@ -346,11 +340,9 @@ def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
 
 @contextmanager
 def storage_errors(place: str, action: str) -> Iterator[None]:
-    """Turn errors raised inside into `StorageError` with the cause.
-
-    `place`: address to show to people, without a password. `action`: what was attempted, a verb and
-    its object. Every exception is converted: the libraries behind fsspec raise many kinds.
-    """
+    """Turn errors raised inside into `StorageError` with the cause. `place`: address to show to
+    people, without a password. `action`: what was attempted, a verb and its object. Every exception
+    is converted: the libraries behind fsspec raise many kinds."""
     try:
         yield
     except OrthonavError as error:

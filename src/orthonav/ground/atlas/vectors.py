@@ -64,11 +64,8 @@ def one_thread() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class VectorRecipe:
-    """How vectors are assigned to lists and coded.
-
-    `list_bits`: there are 2 ** `list_bits` lists, half of the bits from either half of a vector;
-    even, 2 to 20.
-    """
+    """How vectors are assigned to lists and coded. `list_bits`: there are 2 ** `list_bits` lists,
+    half of the bits from either half of a vector; even, 2 to 20."""
 
     dims: int  # components per vector, even
     list_bits: int = 14
@@ -105,11 +102,9 @@ class VectorRecipe:
 
 @dataclass(frozen=True, eq=False)
 class Quantizers:
-    """The trained quantizers that all shards of an index share.
-
-    `rotation` (D, D): rotates vectors so that variance is spread evenly over the quantizers.
-    `halves` (2, sqrt(lists), D / 2): list centres of each half of a rotated vector.
-    """
+    """The trained quantizers that all shards of an index share. `rotation` (D, D): rotates vectors
+    so that variance is spread evenly over the quantizers. `halves` (2, sqrt(lists), D / 2): list
+    centres of each half of a rotated vector."""
 
     recipe: VectorRecipe  # how they were made
     rotation: Array
@@ -125,7 +120,7 @@ class Quantizers:
 
     @classmethod
     def load(cls, path: Path) -> "Quantizers":
-        """Read what `save` wrote; raises `AtlasError`."""
+        """Read what `save` wrote."""
         try:
             with safe_open(path, framework="numpy") as stored:
                 recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
@@ -197,10 +192,8 @@ def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
 
 
 def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers:
-    """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes.
-
-    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used.
-    """
+    """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes. At
+    most `MAX_TRAINING_VECTORS` evenly spaced vectors are used."""
     step = max(1, -(-len(sample) // MAX_TRAINING_VECTORS))
     taken = np.asarray(sample[::step], dtype=np.float32)
     rotation = _rotation(taken, recipe.quantizers)
@@ -222,11 +215,9 @@ def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers
 
 
 def _rotation(vectors: Array, groups: int) -> Array:
-    """Rotation (D, D) to principal axes, assigned so that the products of the groups' variances
-    are similar (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3).
-
-    The PCAMatrix of FAISS, which balances sums of variances, finds 1 to 4 % fewer vectors.
-    """
+    """Rotation (D, D) to principal axes, assigned so that the products of the groups' variances are
+    similar (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3). The PCAMatrix of
+    FAISS, which balances sums of variances, finds 1 to 4 % fewer vectors."""
     wide = vectors.astype(np.float64)
     variances, axes = np.linalg.eigh(wide.T @ wide / len(wide))
     variances, axes = variances[::-1], axes[:, ::-1]
@@ -291,12 +282,9 @@ class ShardInfo:
 def write_shard(
     folder: Path, name: str, quantizers: Quantizers, batches: Iterable[tuple[Places, Array]]
 ) -> int:
-    """Write a shard of unit vectors and return its number of rows.
-
-    `batches`: latitudes and longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory
-    grows by codes and places, some 40 bytes a vector. Raises `AtlasError` where the vectors are not
-    finite.
-    """
+    """Write a shard of unit vectors and return its number of rows. `batches`: latitudes and
+    longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory grows by codes and places,
+    some 40 bytes a vector."""
     folder.mkdir(parents=True, exist_ok=True)
     dims, index = quantizers.recipe.dims, quantizers.empty_index()
     places_deg = [np.empty((0, 2))]
@@ -443,16 +431,11 @@ def _check_table(
 
 
 class ShardedIndex:
-    """The shards of an index, mapped and searched on one core.
-
-    The id of a vector is the base of its shard plus its row. Not for several threads at once.
-    """
+    """The shards of an index, mapped and searched on one core. The id of a vector is the base of
+    its shard plus its row. Not for several threads at once."""
 
     def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
-        """Open shards and quantizers; `file` gives the path of each of their files.
-
-        Raises `AtlasError` where a file is damaged.
-        """
+        """Open shards and quantizers; `file` gives the path of each of their files."""
         self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
         self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
 
@@ -462,11 +445,9 @@ class ShardedIndex:
     def search(
         self, queries: NDArray[np.float32], k: int, probes: int, rerank: int
     ) -> tuple[Array, Ids]:
-        """Highest scalar products (Q, k) and ids (Q, k) of queries (Q, D), best first.
-
-        `probes` lists of every shard are scanned. The `rerank` best by code, over all shards, are
-        compared by their stored vectors. Where fewer are found: id -1 and product -inf.
-        """
+        """Highest scalar products (Q, k) and ids (Q, k) of queries (Q, D), best first. `probes`
+        lists of every shard are scanned. The `rerank` best by code, over all shards, are compared
+        by their stored vectors. Where fewer are found: id -1 and product -inf."""
         queries = np.ascontiguousarray(queries, dtype=np.float32)
         rotated = self.quantizers.rotated(queries)
         lists, centre_scores = self.quantizers.nearest_lists(rotated, probes)

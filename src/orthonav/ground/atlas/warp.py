@@ -253,9 +253,7 @@ def _corners(block: Block) -> Array:
 
 def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
     """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
-
-    Index 0, 0 is the first of the block, and the first of the raster of the sheet.
-    """
+    Index 0, 0 is the first of the block, and the first of the raster of the sheet."""
     linear = affine[:, :2]
     first = linear @ [block.col + middle, block.row + middle] + affine[:, 2] - middle
     return np.column_stack([linear, first / spacing])

@@ -16,12 +16,9 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A reference area in its own local plane.
-
-    `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` the area is the
-    search band around it: the width of each leg, or `band_m` metres for legs without one.
-    Without a route it is the whole extent.
-    """
+    """A reference area in its own local plane. `extent_en_m` is (west, south, east, north) in
+    metres of `frame`. With `route` the area is the search band around it: the width of each leg, or
+    `band_m` metres for legs without one. Without a route it is the whole extent."""
 
     frame: LocalFrame
     extent_en_m: Extent
@@ -30,10 +27,7 @@ class Area:
 
     @classmethod
     def from_bounds(cls, bounds_deg: Extent) -> "Area":
-        """Area of a latitude/longitude box (west, south, east, north in degrees).
-
-        Raises `AreaError` for an invalid box; names swapped latitude and longitude.
-        """
+        """Area of a latitude/longitude box (west, south, east, north in degrees)."""
         west, south, east, north = unwrapped(bounds_deg)
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
             hint = swapped_bounds_hint((west, south, east, north))
@@ -50,10 +44,8 @@ class Area:
 
     @classmethod
     def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
-        """Smallest north-up box around outline points, in a plane centred on that box.
-
-        Longitudes are unwrapped near the first point, so the outline may cross the antimeridian.
-        """
+        """Smallest north-up box around outline points, in a plane centred on that box. Longitudes
+        are unwrapped near the first point, so the outline may cross the antimeridian."""
         lon_deg = lon_deg - 360 * np.round((lon_deg - lon_deg[0]) / 360)
         frame = LocalFrame(
             round(float(lat_deg.min() + lat_deg.max()) / 2, 7),
@@ -66,10 +58,8 @@ class Area:
 
     @classmethod
     def from_route(cls, route: Route, band_m: float | None = None) -> "Area":
-        """Search band around `route`, `band_m` metres wide for legs without a width of their own.
-
-        Raises `AreaError` if a leg has no band, or if the area does not fit into one sheet.
-        """
+        """Search band around `route`, `band_m` metres wide for legs without a width of their
+        own."""
         if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
             raise AreaError(f"search band must be wider than 0 m, got {band_m}")
         bands_m = route.bands_m(band_m)
@@ -106,10 +96,7 @@ class Area:
 
 
 def unwrapped(bounds_deg: Extent) -> Extent:
-    """West, south, east, north with west below east, which is above 180 across the antimeridian.
-
-    Raises `AreaError` for a box that is empty, inverted or not finite.
-    """
+    """West, south, east, north with west below east, which is above 180 across the antimeridian."""
     west, south, east, north = bounds_deg
     if west > east + 180:  # as in GeoJSON (RFC 7946, 5.2)
         east += 360

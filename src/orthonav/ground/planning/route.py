@@ -52,12 +52,9 @@ TABLE_1 = {
 
 
 def preset(text: str) -> Route:
-    """The route that `paper:A@46.6,1.9` or `paper:A@46.6,1.9,30` names.
-
-    A straight line of the trajectory's length about that centre, flown at its height, with its
-    search band; the bearing is in degrees clockwise from north, 90 where it is not given. Raises
-    `RouteError`.
-    """
+    """The route that `paper:A@46.6,1.9` or `paper:A@46.6,1.9,30` names. A straight line of the
+    trajectory's length about that centre, flown at its height, with its search band; the bearing is
+    in degrees clockwise from north, 90 where it is not given."""
     name, _, where = text.removeprefix(PREFIX).partition("@")
     shape = TABLE_1.get(name.upper())
     if shape is None:
@@ -132,12 +129,9 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 
 
 def read_route(path: Path) -> Route:
-    """Read a route from a file of one of the formats in `docs/routes.md`.
-
-    `FILE#NAME` selects a line by its name, or else its number from 1, if a file holds several;
-    `paper:B@46.6,1.9,30` is a preset. Raises `MissingFileError` or `RouteError` (naming found and
-    expected content).
-    """
+    """Read a route from a file of one of the formats in `docs/routes.md`. `FILE#NAME` selects a
+    line by its name, or else its number from 1, if a file holds several; `paper:B@46.6,1.9,30` is a
+    preset. Raises `MissingFileError` or `RouteError` (naming found and expected content)."""
     if str(path).startswith(PREFIX):
         return preset(str(path))
     path, name = _name_apart(Path(path))
@@ -183,11 +177,8 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
 
 
 def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
-    """The line of that name, else of that number, from 1; without a name the only one.
-
-    With `first`, the first of several unnamed lines, with a warning. Raises `RouteError`, which
-    lists numbers and names.
-    """
+    """The line of that name, else of that number, from 1; without a name the only one. With
+    `first`, the first of several unnamed lines, with a warning."""
     if name is not None:
         named = [route for route in found if route.name == name]
         number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
@@ -235,10 +226,8 @@ def beyond_bands_m(
     bands_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
-
     `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)
-    legs. The result is the minimum over the legs of the distance to the leg minus half its band.
-    """
+    legs. The result is the minimum over the legs of the distance to the leg minus half its band."""
     starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
     legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
     length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)
@@ -263,9 +252,7 @@ def within_bands(
     margin_m: float,
 ) -> NDArray[np.bool_]:
     """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
-
-    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs.
-    """
+    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs."""
     if len(points_en_m) <= _FEW_POINTS:
         return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
     order = np.argsort(points_en_m[:, 0], kind="stable")
@@ -293,10 +280,8 @@ def within_bands(
 def along_polyline_en_m(
     line_en_m: NDArray[np.float64], spacing_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees.
-
-    The first position is the first vertex; a route of one vertex gives one position, course 0.
-    """
+    """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees. The
+    first position is the first vertex; a route of one vertex gives one position, course 0."""
     legs = np.diff(line_en_m, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
     keep = lengths > 0

@@ -33,11 +33,8 @@ _TRIES = 4  # numbers of columns tried for one row before rows are made lower
 
 def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
     """Boxes (west, south, east, north in degrees) that each fit a sheet and together fill the box.
-
     Rows of equal height, from south to north; each row is divided into the number of equal boxes
-    its width requires, from west to east. Raises `AreaError` for an invalid box, or for more than
-    `MAX_SHEETS` boxes; names swapped latitude and longitude.
-    """
+    its width requires, from west to east."""
     west, south, east, north = unwrapped(bounds_deg)
     if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
         hint = swapped_bounds_hint((west, south, east, north))
@@ -92,13 +89,10 @@ def _wrapped(lon_deg: float) -> float:
 
 
 def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
-    """Parts of a route, in order, whose search bands each fit a sheet.
-
-    The route is divided at waypoints, each part as long as possible. A leg too long for a sheet is
-    divided into equal pieces on the great circle. Each part begins at the end of the previous one.
-    Parts are named sheet-1, sheet-2 and so on. Raises `AreaError`, also for more than
-    `MAX_ROUTE_SHEETS` parts.
-    """
+    """Parts of a route, in order, whose search bands each fit a sheet. The route is divided at
+    waypoints, each part as long as possible. A leg too long for a sheet is divided into equal
+    pieces on the great circle. Each part begins at the end of the previous one. Parts are named
+    sheet-1, sheet-2 and so on."""
     bands_m = route.bands_m(band_m)
     if bands_m is None or _route_fits(route, band_m):
         Area.from_route(route, band_m)  # raises if a band is missing
@@ -250,10 +244,8 @@ class WorldSheets:
         return -180 + col * step, south, -180 + (col + 1) * step, north
 
     def over(self, bounds_deg: Extent) -> Iterator[str]:
-        """Names of the sheets that intersect a box, from south to north and west to east.
-
-        A box with west > east crosses the antimeridian.
-        """
+        """Names of the sheets that intersect a box, from south to north and west to east. A box
+        with west > east crosses the antimeridian."""
         west, south, east, north = bounds_deg
         if west > east:
             east += 360

@@ -57,10 +57,8 @@ class Caution:
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """Footprint of a vertical view of flat ground.
-
-    `width_m`, `height_m`: sides of the footprint.
-    """
+    """Footprint of a vertical view of flat ground. `width_m`, `height_m`: sides of the
+    footprint."""
 
     agl_m: float  # height above ground
     width_m: float
@@ -101,11 +99,9 @@ class ViewPlan:
 
 
 def suited_map(view: ViewPlan) -> tuple[float, int]:
-    """Suitable ground resolution (m) and tile width (px) of a map for a view.
-
-    The coarsest round resolution at which the view covers a whole tile, with the widest tile for
-    which this is neither finer than the view itself nor than `FINEST_IMAGERY_M`.
-    """
+    """Suitable ground resolution (m) and tile width (px) of a map for a view. The coarsest round
+    resolution at which the view covers a whole tile, with the widest tile for which this is neither
+    finer than the view itself nor than `FINEST_IMAGERY_M`."""
     finest_m = max(FINEST_IMAGERY_M, view.gsd_m)
     for tile_px in TILE_SIZES_PX:
         gsd_m = _nice_below(view.short_m / tile_px)
@@ -188,11 +184,8 @@ _LEAST_POINTS = 2_500
 
 @dataclass(frozen=True)
 class MapEstimate:
-    """Estimate for a map of one sheet.
-
-    `build_s`: time of the default build on one desktop core, with registration; training a network
-    takes hours more.
-    """
+    """Estimate for a map of one sheet. `build_s`: time of the default build on one desktop core,
+    with registration; training a network takes hours more."""
 
     area_km2: float  # area covered by tile centres
     imagery_km2: float  # area of the pixels under the tiles
@@ -210,12 +203,9 @@ def estimate_map(
     registration: bool = True,
     maps: int = 1,
 ) -> MapEstimate:
-    """Estimate for the map that `orthonav build` makes of an area.
-
-    Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is smaller
-    where this is one of many `maps`. Imagery is assumed everywhere. Raises `AreaError` as
-    `TileGrid.covering` does.
-    """
+    """Estimate for the map that `orthonav build` makes of an area. Tiles are counted if that is
+    cheap, else estimated from a sample (within 2 %), which is smaller where this is one of many
+    `maps`. Imagery is assumed everywhere."""
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
     raster = (
@@ -250,10 +240,8 @@ def _share(
     cells: tuple[int, int] | None = None,
 ) -> float:
     """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
-
     Computed from the centres of its `cells` (rows, columns), or of at most about `room` if those
-    are more.
-    """
+    are more."""
     if area.route is None:
         return 1.0
     room = min(room, max(_LEAST_POINTS, _PAIRS // area.route.legs))
@@ -279,12 +267,9 @@ _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 
 @dataclass(frozen=True)
 class LegProfile:
-    """A leg over terrain.
-
-    `ground_m`: minimum and maximum terrain height above mean sea level along it. `relief`: largest
-    difference of terrain height within a view centred on the leg or on an edge of its search band,
-    as a share of the height above ground; 0 below `LANDING_M`.
-    """
+    """A leg over terrain. `ground_m`: minimum and maximum terrain height above mean sea level along
+    it. `relief`: largest difference of terrain height within a view centred on the leg or on an
+    edge of its search band, as a share of the height above ground; 0 below `LANDING_M`."""
 
     leg: int  # number, from 1
     length_m: float  # its length
@@ -300,12 +285,8 @@ def profile(
     view_m: float,
     terrain: TerrainHeights,
 ) -> list[LegProfile]:
-    """Height above ground and relief of each leg.
-
-    `bands_m`: search bands of the legs. `agl_m`: constant height above ground for legs without
-    known heights. `view_m`: width of a view. Raises `RouteError` if a height is unknown, or if the
-    terrain does not cover the route.
-    """
+    """Height above ground and relief of each leg. `bands_m`: search bands of the legs. `agl_m`:
+    constant height above ground for legs without known heights. `view_m`: width of a view."""
     spacing_m = max(view_m / 2, float(leg_lengths_m(route).sum()) / MAX_POSITIONS, 1.0)
     home_m = route.home_amsl_m
     if home_m is None:

@@ -170,12 +170,10 @@ class SimulateRequest:
 
 @dataclass(frozen=True)
 class _Pose:
-    """True pose of the camera at one view.
-
-    `reported_deg`: heading, pitch and roll as reported, but for noise and bias of the telemetry.
-    `reported_en_mps`: reported velocity over ground, None if not reported.
-    `home_m`, `amsl_m`: height above take-off and above sea level, None if not reported.
-    """
+    """True pose of the camera at one view. `reported_deg`: heading, pitch and roll as reported, but
+    for noise and bias of the telemetry. `reported_en_mps`: reported velocity over ground, None if
+    not reported. `home_m`, `amsl_m`: height above take-off and above sea level, None if not
+    reported."""
 
     position_en_m: Array
     yaw_deg: float

@@ -61,10 +61,7 @@ class Coverage:
         return not (part & (inside > 0)).any()
 
     def box_en_m(self) -> tuple[float, float, float, float]:
-        """West, south, east, north of a box that is fully covered by imagery.
-
-        Raises `AreaError` if the imagery is too fragmented.
-        """
+        """West, south, east, north of a box that is fully covered by imagery."""
         height, width = self._missing.shape
         left, top, right, bottom = 0, 0, width, height
         while left < right and top < bottom:
@@ -89,11 +86,9 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class GroundImagery:
-    """Imagery in a local plane.
-
-    `west_m`, `north_m`: its north-west corner. `mirror_px`: box (left, top, right, bottom) that is
-    mirrored at its sides to fill pixels without imagery, None for no filling.
-    """
+    """Imagery in a local plane. `west_m`, `north_m`: its north-west corner. `mirror_px`: box (left,
+    top, right, bottom) that is mirrored at its sides to fill pixels without imagery, None for no
+    filling."""
 
     raster: SheetRaster  # the resampled imagery
     west_m: float
@@ -134,10 +129,7 @@ def reflected(index: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64
 
 
 def ground_below_m(terrain: TerrainHeights, frame: LocalFrame, places_en_m: Array) -> Array:
-    """Heights of the ground (N,) above mean sea level below places (N, 2) of a plane.
-
-    Raises `AreaError` where one is unknown.
-    """
+    """Heights of the ground (N,) above mean sea level below places (N, 2) of a plane."""
     lat, lon = frame.latlon_from_en(places_en_m)
     found = terrain(lat, lon)
     unknown = np.flatnonzero(~np.isfinite(found))
@@ -153,10 +145,8 @@ def reported_heights(
     telemetry: Telemetry, agl_m: float, home_m: float | None, amsl_m: float
 ) -> Telemetry:
     """The telemetry with heights above sea and take-off in place of a measured one above ground.
-
     `agl_m`, `home_m`, `amsl_m`: true heights; all are reported with the error of that above ground.
-    As in imports without a terrain, the height above take-off stands for that above ground.
-    """
+    As in imports without a terrain, the height above take-off stands for that above ground."""
     error_m = telemetry.agl_m - agl_m
     above_home_m = None if home_m is None else round(home_m + error_m, 3)
     return replace(
@@ -173,10 +163,8 @@ def surface_of(
     extent_en_m: tuple[float, float, float, float],
     posting_m: float,
 ) -> Raster:
-    """Heights over a plane, west, south, east, north; holes have the height of their border.
-
-    Level ground at 0 without `terrain`. Raises `AreaError` where no height is known.
-    """
+    """Heights over a plane, west, south, east, north; holes have the height of their border. Level
+    ground at 0 without `terrain`."""
     west, south, east, north = extent_en_m
     across = max(east - west, north - south)
     if terrain is None:

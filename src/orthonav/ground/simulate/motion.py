@@ -26,11 +26,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Wind:
-    """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts.
-
-    Gusts are an Ornstein-Uhlenbeck process per axis with the standard deviation `GUST_STD` (a share
-    of the wind speed) and the time constant `GUST_TIME_S`.
-    """
+    """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts. Gusts
+    are an Ornstein-Uhlenbeck process per axis with the standard deviation `GUST_STD` (a share of
+    the wind speed) and the time constant `GUST_TIME_S`."""
 
     speed_mps: float
     from_deg: float = 270.0
@@ -83,11 +81,8 @@ def windy_path(
     rng: np.random.Generator,
     most: int,
 ) -> FlownPath:
-    """Path along the polyline (M, 2) in wind, with a crab angle and a varying ground speed.
-
-    Views are `spacing_m / airspeed_mps` seconds apart, at most `most` + 1. Raises `FlightError` if
-    the strongest gust is as fast as the aircraft, or if the flight takes more than `MAX_STEPS`.
-    """
+    """Path along the polyline (M, 2) in wind, with a crab angle and a varying ground speed. Views
+    are `spacing_m / airspeed_mps` seconds apart, at most `most` + 1."""
     if wind.strongest_mps >= airspeed_mps:
         raise FlightError(
             f"wind of {wind.speed_mps:g} m/s, {wind.strongest_mps:.3g} m/s in gusts, is too strong "
@@ -159,11 +154,9 @@ def gauss_markov(step: float, count: int, rng: np.random.Generator) -> Array:
 
 
 def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
-    """Velocities (N, 2) as reported by odometry with a drifting scale and direction.
-
-    The scale error (a share) and the direction error (rad) have the standard deviation `drift` and
-    the time constant `DRIFT_TIME_S`.
-    """
+    """Velocities (N, 2) as reported by odometry with a drifting scale and direction. The scale
+    error (a share) and the direction error (rad) have the standard deviation `drift` and the time
+    constant `DRIFT_TIME_S`."""
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
     off = drift * gauss_markov(step_s / DRIFT_TIME_S, len(times_s), rng)
     cos, sin = np.cos(off[:, 1]), np.sin(off[:, 1])
@@ -173,10 +166,8 @@ def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Gen
 
 
 def rounded(line_en_m: Array, radius_m: float) -> Array:
-    """The polyline (M, 2) with rounded corners; arcs are tighter at short legs.
-
-    About-turns are left unchanged.
-    """
+    """The polyline (M, 2) with rounded corners; arcs are tighter at short legs. About-turns are
+    left unchanged."""
     if len(line_en_m) < 3:
         return line_en_m
     parts = [line_en_m[:1]]
@@ -218,10 +209,8 @@ def direction(course_deg: float) -> Array:
 
 
 def horizon_errors(std_deg: float, times_s: Array, rng: np.random.Generator) -> Array:
-    """True minus reported pitch and roll (N, 2) along a route, deg, at evenly spaced times (N,).
-
-    A first-order Gauss-Markov process of this standard deviation.
-    """
+    """True minus reported pitch and roll (N, 2) along a route, deg, at evenly spaced times (N,). A
+    first-order Gauss-Markov process of this standard deviation."""
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
     return std_deg * gauss_markov(step_s / HORIZON_TIME_S, len(times_s), rng)
 

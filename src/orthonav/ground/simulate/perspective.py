@@ -143,10 +143,8 @@ def seen_view(
     finer: int = 2,
 ) -> tuple[NDArray[np.uint8], Array]:
     """What a camera sees (H, W) or (H, W, C) uint8, and the ground points (h, w, 3) of its rays.
-
     `position_m` (3,): east, north and above the zero of `heights`. `finer`: rays along both sides
-    of a pixel.
-    """
+    of a pixel."""
     ground = met(heights, rays_enu(camera, attitude_deg, finer), position_m)
     return coloured(imagery, ground, camera, position_m), ground
 
@@ -155,9 +153,7 @@ def coloured(
     imagery: Raster, ground_m: Array, camera: Camera, position_m: Array
 ) -> NDArray[np.uint8]:
     """The picture (H, W) or (H, W, C) of ground points (h, w, 3), of one or more rays a pixel.
-
-    Where a ray stands for more than a pixel of the imagery, this is averaged.
-    """
+    Where a ray stands for more than a pixel of the imagery, this is averaged."""
     range_m = np.linalg.norm(ground_m - position_m, axis=-1)
     drop_m = np.maximum(position_m[2] - ground_m[..., 2], 1e-3)
     ray_px = camera.width_px / ground_m.shape[1]
@@ -180,9 +176,7 @@ def random_relief(
     shape: tuple[int, int], posting_m: float, slope: float, shortest_m: float, seed: int
 ) -> NDArray[np.float32]:
     """Heights (H, W) of random hills from 0 up with a slope (root mean square of the gradient).
-
-    Wavelengths from `shortest_m` up; amplitudes grow with them.
-    """
+    Wavelengths from `shortest_m` up; amplitudes grow with them."""
     rng = np.random.default_rng(seed)
     rows, cols = np.fft.fftfreq(shape[0], posting_m), np.fft.rfftfreq(shape[1], posting_m)
     frequency = np.hypot(rows[:, None], cols)

@@ -65,10 +65,8 @@ class Good:
 
 @dataclass(frozen=True)
 class Step(Good):
-    """Spoofed by a step of `metres` to `bearing_deg` at `at_s`.
-
-    It takes `over_s`, and the velocity follows it; with 0 it is sudden, and the velocity does not.
-    """
+    """Spoofed by a step of `metres` to `bearing_deg` at `at_s`. It takes `over_s`, and the velocity
+    follows it; with 0 it is sudden, and the velocity does not."""
 
     at_s: float = 60.0
     metres: float = 30.0
@@ -176,7 +174,7 @@ RECEIVERS: Table = MappingProxyType(  # receivers that `orthonav simulate --rece
 
 
 def receiver_of(text: str) -> Good:
-    """The receiver that `name:field=value,...` describes; raises `VariantError`."""
+    """The receiver that `name:field=value,...` describes."""
     made: Good = make_variant(RECEIVERS, text)
     return made
 

@@ -59,10 +59,8 @@ class Clouds:
     def before(
         self, number: int, camera: Camera, attitude: tuple[float, float, float, float], en_m: Array
     ) -> CloudLayer | None:
-        """Clouds between a view and the ground, None if it is clear.
-
-        `attitude`: heading, pitch, roll (deg) and height (m). `en_m`: position (2,).
-        """
+        """Clouds between a view and the ground, None if it is clear. `attitude`: heading, pitch,
+        roll (deg) and height (m). `en_m`: position (2,)."""
         degree, stretch = self.degree(number), int(self._stretch[number])
         if degree <= 0:
             return None
@@ -133,10 +131,7 @@ def _enlarged(part: Array, size: tuple[int, int]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class ViewEffects:
-    """Image degradation.
-
-    Raises `FlightError` outside these ranges.
-    """
+    """Image degradation."""
 
     exposure_std: float = 0.15  # standard deviation of the logarithm of the exposure, 0..1
     blur_px: float = 0.6  # standard deviation of the blur in pixels, 0..50
@@ -162,12 +157,9 @@ def render_view(
     rng: np.random.Generator,
     clouds: CloudLayer | None = None,
 ) -> NDArray[np.uint8]:
-    """Image (H, W, 3) of flat ground.
-
-    `ground_rgb` (h, w, 3) is an orthophoto with `gsd_m` metres per pixel; `ground_corner_en_m` is
-    its north-west corner, metres from the nadir of the camera. `attitude`: yaw, pitch, roll (deg)
-    and height (m).
-    """
+    """Image (H, W, 3) of flat ground. `ground_rgb` (h, w, 3) is an orthophoto with `gsd_m` metres
+    per pixel; `ground_corner_en_m` is its north-west corner, metres from the nadir of the camera.
+    `attitude`: yaw, pitch, roll (deg) and height (m)."""
     picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
     return degraded(picture, effects, rng, clouds)
 

@@ -33,10 +33,7 @@ _METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
 
 
 def read_delimited(data: bytes) -> list[Route]:
-    """The route of a table with a header, whose band is that of the leg which begins at the row.
-
-    Raises `RouteError`.
-    """
+    """The route of a table with a header, whose band is that of the leg which begins at the row."""
     stream = io.StringIO(decoded(data), newline=None)
     header = stream.readline(MAX_LINE_CHARS)
     stream.seek(0)

@@ -43,11 +43,8 @@ _Place = tuple[float, float, Height | None]
 
 
 def read_markup(data: bytes, kind: str, root: str) -> Element:
-    """The root of a document, with namespaces removed from its tags: `gx:Track` is Track.
-
-    `kind`: of the document, for messages. Raises `RouteError` on invalid XML, another root, a
-    DOCTYPE, more than `MAX_ELEMENTS` elements or more than `MAX_DEPTH` levels.
-    """
+    """The root of a document, with namespaces removed from its tags: `gx:Track` is Track. `kind`:
+    of the document, for messages."""
     if not data.strip():
         raise RouteError(f"{kind} file is empty")
     builder = _Builder(kind)
@@ -98,10 +95,8 @@ class _Builder(TreeBuilder):
 
 
 def read_gpx(data: bytes) -> list[Route]:
-    """All routes (`rte`), and after them all tracks (`trk`), the segments of each joined.
-
-    Heights are above mean sea level. Raises `RouteError` where there are only waypoints.
-    """
+    """All routes (`rte`), and after them all tracks (`trk`), the segments of each joined. Heights
+    are above mean sea level."""
     root = read_markup(data, "GPX", "gpx")
     planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
     flown = [
@@ -145,10 +140,7 @@ def _degrees(point: Element, name: str) -> float:
 
 def read_kmz(data: bytes) -> list[Route]:
     """Lines and tracks of the archive's `doc.kml`, else of its only KML file; of a mission of DJI
-    its waylines.
-
-    Raises `RouteError`, also on archives that would unpack to more than `MAX_KML_BYTES`.
-    """
+    its waylines."""
     _check_archive(data)
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
@@ -245,10 +237,7 @@ def _check_archive(data: bytes) -> None:
 
 
 def read_wpml(data: bytes) -> list[Route]:
-    """The waylines of a mission, one route per folder, their waypoints by index.
-
-    Raises `RouteError`, also for a height mode that is not known.
-    """
+    """The waylines of a mission, one route per folder, their waypoints by index."""
     root = read_markup(data, "WPML", "kml")
     folders = list(root.iter("Folder"))
     found = [route for folder in folders for route in _waylines(folder)]

@@ -64,11 +64,8 @@ _HEIGHT_FRAMES: dict[int, HeightFrame] = {
 
 @dataclass(frozen=True)
 class MissionItem:
-    """A mission item.
-
-    `lat_deg`, `lon_deg`: position, None if it has none. `pattern`: number shared by all items of
-    one survey or corridor, which is flown as a whole.
-    """
+    """A mission item. `lat_deg`, `lon_deg`: position, None if it has none. `pattern`: number shared
+    by all items of one survey or corridor, which is flown as a whole."""
 
     command: int  # MAV_CMD
     frame: int  # MAV_FRAME, the reference of `height_m`
@@ -97,13 +94,10 @@ def height_frame(frame: int) -> HeightFrame:
 
 
 def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
-    """The route of a mission. Raises `RouteError` if no item has a position.
-
-    As in autopilots, a position of 0, 0 or none means the current position, so a take-off without
-    a position is at home. A return to launch ends the route at home. Jumps are not followed; a
-    circle is replaced by its centre. Items with a position that are left out are named: those after
-    the return, and those whose command is not known.
-    """
+    """The route of a mission. As in autopilots, a position of 0, 0 or none means the current
+    position, so a take-off without a position is at home. A return to launch ends the route at
+    home. Jumps are not followed; a circle is replaced by its centre. Items with a position that are
+    left out are named: those after the return, and those whose command is not known."""
     stops: list[MissionItem] = []
     left_out: list[str] = []
     remaining = iter(items)

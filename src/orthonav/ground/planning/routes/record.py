@@ -40,12 +40,9 @@ def require_few_waypoints(count: int) -> None:
 
 @dataclass(frozen=True)
 class Height:
-    """Height of a waypoint.
-
-    `height_m`: metres above the reference. `frame`: the reference, "agl" (terrain below the
-    waypoint), "home" (terrain at the take-off position), "amsl" (mean sea level), "hae" (the WGS 84
-    ellipsoid), or None if the file does not state it.
-    """
+    """Height of a waypoint. `height_m`: metres above the reference. `frame`: the reference, "agl"
+    (terrain below the waypoint), "home" (terrain at the take-off position), "amsl" (mean sea
+    level), "hae" (the WGS 84 ellipsoid), or None if the file does not state it."""
 
     height_m: float
     frame: HeightFrame | None = None
@@ -63,16 +60,13 @@ class Height:
 
 @dataclass(frozen=True)
 class Route:
-    """Waypoints joined by straight legs; raises `RouteError` if invalid.
-
-    Leg i goes from waypoint i to waypoint i + 1; a route of one waypoint has one leg of length 0.
-
-    `waypoints`: `(lat_deg, lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360. `heights`:
-    one per waypoint, None if unknown; empty if the file has none. `leg_bands_m`: full width of the
-    search band per leg in metres, None for the default; empty if the file has none. `home_amsl_m`:
-    height of the take-off position above mean sea level, metres, None if unknown. `left_out`: what
-    of the file has a position and is not part of the route, by name.
-    """
+    """Waypoints joined by straight legs; raises `RouteError` if invalid. Leg i goes from waypoint i
+    to waypoint i + 1; a route of one waypoint has one leg of length 0. `waypoints`: `(lat_deg,
+    lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360. `heights`: one per waypoint, None if
+    unknown; empty if the file has none. `leg_bands_m`: full width of the search band per leg in
+    metres, None for the default; empty if the file has none. `home_amsl_m`: height of the take-off
+    position above mean sea level, metres, None if unknown. `left_out`: what of the file has a
+    position and is not part of the route, by name."""
 
     waypoints: tuple[tuple[float, float], ...]
     heights: tuple[Height | None, ...] = ()
@@ -131,10 +125,8 @@ class Route:
         return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
 
     def bands_m(self, default_m: float | None) -> tuple[float, ...] | None:
-        """Width of the search band of each leg, `default_m` for legs without one.
-
-        None if a leg has none and there is no default.
-        """
+        """Width of the search band of each leg, `default_m` for legs without one. None if a leg has
+        none and there is no default."""
         if not self.leg_bands_m:
             return None if default_m is None else (default_m,) * self.legs
         bands = [default_m if band is None else band for band in self.leg_bands_m]
@@ -184,7 +176,7 @@ def numbers_in(text: str) -> list[float]:
 
 
 def decoded(data: bytes) -> str:
-    """Text of UTF-8 bytes, with or without a byte order mark. Raises `RouteError`."""
+    """Text of UTF-8 bytes, with or without a byte order mark."""
     if not data.strip():
         raise RouteError("route file is empty")
     try:
