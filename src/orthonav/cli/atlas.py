@@ -52,9 +52,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--deep", action="store_true", help="read every file, verify its checksum and its recipe"
     )
     check.add_argument(
-        "--clean",
-        action="store_true",
-        help="remove leftovers of interrupted builds",
+        "--clean", action="store_true", help="remove leftovers of interrupted builds"
     )
     check.add_argument(
         "--min-age-h",
@@ -341,11 +339,7 @@ def _check(options: argparse.Namespace) -> int:
     atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
         found = check_atlas(
-            atlas,
-            options.deep,
-            shown,
-            clean=options.clean,
-            min_age_s=options.min_age_h * 3600,
+            atlas, options.deep, shown, clean=options.clean, min_age_s=options.min_age_h * 3600
         )
     left = [problem for problem in found if not problem.removed]
     if options.json:

@@ -78,10 +78,7 @@ def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
 
 
 def flight_heights(
-    options: argparse.Namespace,
-    opened: "MapFile",
-    flight: "Recording",
-    dem: "Dem | None",
+    options: argparse.Namespace, opened: "MapFile", flight: "Recording", dem: "Dem | None"
 ) -> "FlownHeights | None":
     """Heights above ground of the views of a recorded flight; None without a terrain. What is
     assumed about heights is logged once."""

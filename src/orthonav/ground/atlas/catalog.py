@@ -348,11 +348,7 @@ def _catalog(recipe: AtlasRecipe) -> bytes:
                 {"rel": "root", "href": "./atlas.json", "type": "application/json"},
                 {"rel": "items", "href": f"./{SNAPSHOT}", "type": "application/geo+json"},
             ],
-            "orthonav:atlas": {
-                "format": FORMAT,
-                "schema": SCHEMA,
-                "recipe": recipe.to_plain(),
-            },
+            "orthonav:atlas": {"format": FORMAT, "schema": SCHEMA, "recipe": recipe.to_plain()},
         }
     )
 

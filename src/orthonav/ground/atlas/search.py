@@ -98,12 +98,7 @@ class TileSearch:
         rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log scale of
         each."""
         embedded = embed_poses(
-            self._embedder,
-            self._representation,
-            view.grey,
-            view.valid,
-            poses,
-            self.recipe.tile_px,
+            self._embedder, self._representation, view.grey, view.valid, poses, self.recipe.tile_px
         )
         queries = half_whitened(self._embedder, embedded)
         per_pose = min(PER_POSE, len(self._index))

@@ -207,10 +207,7 @@ def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers
     halves, codebook = (faiss().vector_to_array(each.pq.centroids) for each in (coarse, index))
     shapes = _shapes(recipe)
     return Quantizers(
-        recipe,
-        rotation,
-        halves.reshape(shapes["halves"]),
-        codebook.reshape(shapes["codebook"]),
+        recipe, rotation, halves.reshape(shapes["halves"]), codebook.reshape(shapes["codebook"])
     )
 
 

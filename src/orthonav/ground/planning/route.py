@@ -221,9 +221,7 @@ def distance_to_polyline_m(
 
 
 def beyond_bands_m(
-    points_en_m: NDArray[np.float64],
-    line_en_m: NDArray[np.float64],
-    bands_m: NDArray[np.float64],
+    points_en_m: NDArray[np.float64], line_en_m: NDArray[np.float64], bands_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
     `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)

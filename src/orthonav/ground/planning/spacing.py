@@ -233,11 +233,7 @@ def estimate_map(
 
 
 def _share(
-    area: Area,
-    box_en_m: Extent,
-    margin_m: float,
-    room: int,
-    cells: tuple[int, int] | None = None,
+    area: Area, box_en_m: Extent, margin_m: float, room: int, cells: tuple[int, int] | None = None
 ) -> float:
     """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
     Computed from the centres of its `cells` (rows, columns), or of at most about `room` if those

@@ -245,10 +245,7 @@ def read_wpml(data: bytes) -> list[Route]:
         raise RouteError("WPML holds no wayline with waypoints")
     read = {mark for folder in folders for mark in folder.iterfind("Placemark[Point]")}
     points = [
-        (
-            _called("placemark", mark, "index"),
-            numbers_in(mark.findtext("Point/coordinates") or ""),
-        )
+        (_called("placemark", mark, "index"), numbers_in(mark.findtext("Point/coordinates") or ""))
         for mark in root.iterfind(".//Placemark[Point]")
         if mark not in read
     ]
