@@ -178,7 +178,6 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Build, print a summary; returns 1 where a sheet failed."""
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
     from orthonav.ground.planning.route import read_route
 

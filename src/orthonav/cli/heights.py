@@ -17,7 +17,6 @@ log = logging.getLogger(__name__)
 
 
 def dem_of(options: argparse.Namespace) -> "Dem | None":
-    """The terrain model of `--dem`, None without one."""
     from orthonav.core.errors import FlightError
 
     if options.dem is None:

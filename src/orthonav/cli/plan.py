@@ -124,7 +124,6 @@ def _sheets(
 
 
 def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
-    """The view from `--agl-m`, else from the lowest height of the route."""
     from orthonav.core.errors import CameraError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.planning.spacing import DEFAULT_CAMERA, ViewPlan
@@ -156,7 +155,6 @@ def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
 
 
 def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float, int]:
-    """Ground resolution and tile width: from the options, else chosen for the view."""
     from orthonav.core.errors import AreaError
     from orthonav.ground.planning.spacing import suited_map, suited_tile_px
 

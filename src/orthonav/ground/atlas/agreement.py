@@ -16,34 +16,25 @@ from numpy.typing import NDArray
 from orthonav.core.geo.frames import LocalFrame, distances_m
 
 # Values without another source were chosen with `benchmarks.atlas_lost` at d63ac91.
-MAX_SPEED_MPS = 120.0
-"""Faster than the aircraft that this program is for; a slower limit would exclude some."""
+MAX_SPEED_MPS = 120.0  # faster than the aircraft that this program is for
 SLACK_M = 60.0  # errors of two registered positions, seven pixels of 8 m
 TURN_RATE_RAD_S = math.radians(12.0)  # four times a standard-rate turn (3 deg/s)
 TURN_SLACK_RAD = math.radians(12.0)  # errors of two registered headings
-SCALE_SLACK = 0.12
-"""Greatest difference of log scale between two views of a chain, besides climbing."""
+SCALE_SLACK = 0.12  # greatest difference of log scale between two views, besides climbing
 CLIMB_PER_S = 0.02  # change of log scale per second: 20 m/s at 1000 m
-MIN_NEW = 0.15
-"""Share of a view that must be new ground for it to count: hovering proves nothing. The track
-weighs views in the same way (docs/decisions/tracking.md)."""
+MIN_NEW = 0.15  # share of a view that must be new ground (docs/decisions/tracking.md)
 ANCHORS = 30  # places that counted and are remembered: circling over them proves nothing more
-MAX_REACH_M = 5_000.0
-"""A chain whose aircraft may be farther from the expected place is dropped: no gap is bridged
-blindly."""
+MAX_REACH_M = 5_000.0  # a chain whose aircraft may be farther away is dropped
 MIN_VELOCITY_S = 0.5  # views closer in time do not give a velocity
 AGILE_MPS = 10.0  # the velocity may change by so much, and by half, between two views
-MISSED = 1.6
-"""Nats that a view which does not support a chain costs it: exp(-1.6) is 0.2, `1 - FOUND`."""
+MISSED = 1.6  # nats that a view without support costs a chain: exp(-1.6) is 0.2, `1 - FOUND`
 CHANCE = 0.05  # least probability that a wrong place lies by chance where a chain expects the view
 FOUND = 0.8  # probability that the right place is found where a chain expects the view
 MAX_LOG_ODDS = 5.0  # no single view counts more than this: odds of 150
 MAX_CHAINS = 12
 HOPELESS = 9.0  # chains less likely than the best by more nats are dropped
-MIN_VIEWS = 1.7
-"""Views of new ground that must agree before there is a fix: two views that overlap by 30 %."""
-MAX_CHAIN_LOG_ODDS = 14.0
-"""Chains remember no more nats, so that a chain that became wrong is given up after some views."""
+MIN_VIEWS = 1.7  # views of new ground that must agree: two that overlap by 30 %
+MAX_CHAIN_LOG_ODDS = 14.0  # so that a chain that became wrong is given up after some views
 
 
 @dataclass(frozen=True)
@@ -79,7 +70,6 @@ class Chain:
     missed: int = 0  # views since the latest place that did not support the chain
 
     def latest(self, count: int) -> tuple[PlaceEvidence, ...]:
-        """The latest places that counted, and the last one; at most `count`."""
         places = self.anchors if self.anchors[-1] is self.last else (*self.anchors, self.last)
         return places[-count:]
 
@@ -176,7 +166,6 @@ class Agreement:
 
 
 def _support(place: PlaceEvidence, gain: float) -> float:
-    """Nats by which a view found at an expected place supports the chain."""
     return min(place.log_odds, MAX_LOG_ODDS) + gain
 
 

@@ -240,7 +240,6 @@ def _along(
 
 
 def _overlap(bounds_deg: Extent, other: Extent) -> bool:
-    """Whether two boxes share more than an edge."""
     west, south, east, north = bounds_deg
     shift = 360 * round(((other[0] + other[2]) / 2 - (west + east) / 2) / 360)
     across = min(east + shift, other[2]) - max(west + shift, other[0])
@@ -392,7 +391,6 @@ class BuildReport:
 
 
 def duration(seconds: float) -> str:
-    """A time for people: `2 h 05 min`."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -406,8 +404,7 @@ def _rate(value: float, by: float, digits: int = 4) -> float | None:
 log = logging.getLogger(__name__)
 
 PROGRESS_EVERY_S = 10.0  # between two lines of progress
-GIVE_UP_AFTER = 8
-"""Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
+GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
 SCRATCH = "orthonav-sheet-"  # names of temporary folders begin with it
 _LOCK = "in-use"
 LEARNT = ("autoencoder", "caevl", "triplet")  # methods for which a worker is given a GPU
@@ -471,7 +468,6 @@ def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
 
 
 def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
-    """The requested fields of the recipe; those of the coarse tiles completed."""
     fields = dict(request.recipe)
     if isinstance(fields.get("coarse"), Mapping):
         fields["coarse"] = replace(coarse or CoarseRecipe(), **fields["coarse"])
@@ -479,7 +475,6 @@ def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, 
 
 
 def build_sheet(task: SheetTask) -> SheetResult:
-    """Build a sheet and put it into the atlas. Depends only on the task and the imagery."""
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     wanted = task.sheet
     if differences := version_differences(wanted.made_by, versions()):
@@ -504,7 +499,6 @@ def build_sheet(task: SheetTask) -> SheetResult:
 
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
-    """The sheet, which is now in the atlas; None where it has no imagery."""
     recipe = asdict(task.recipe)
     del recipe["sheet_km"], recipe["coarse"]
     name, bounds_deg = task.sheet.id, task.sheet.bounds_deg

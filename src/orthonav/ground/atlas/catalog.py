@@ -69,7 +69,6 @@ class CoarseRecipe:
 
     @property
     def tile_m(self) -> float:
-        """Width of a tile in metres."""
         return self.gsd_m * self.tile_px
 
 
@@ -102,7 +101,6 @@ class AtlasRecipe:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "AtlasRecipe":
-        """Inverse of `to_plain`; raises `AtlasError` for unknown fields and impossible values."""
         try:
             values = {each.name: plain[each.name] for each in fields(cls)}
             coarse = values.pop("coarse")
@@ -111,7 +109,6 @@ class AtlasRecipe:
             raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
 
     def differences(self, other: "AtlasRecipe") -> list[str]:
-        """The fields that differ, each as `name: this, not that`."""
         mine, theirs = self.to_plain(), other.to_plain()
         return [
             f"{name}: {mine[name]}, not {theirs[name]}"
@@ -146,7 +143,6 @@ class Atlas:
 
     @classmethod
     def open_or_create(cls, url: str | Path, recipe: AtlasRecipe) -> "Atlas":
-        """Open an atlas, or create it where there is none."""
         store = Store(str(url))
         if store.size(CATALOG) is None:
             if _is_free(store):
@@ -177,7 +173,6 @@ class Atlas:
 
     @property
     def bounds_deg(self) -> Extent | None:
-        """West, south, east, north of all sheets, never across the antimeridian; None if empty."""
         boxes = [sheet.bounds_deg for sheet in self.sheets().values()]
         if not boxes:
             return None
@@ -224,7 +219,6 @@ class Atlas:
             self._sheets.pop(sheet_id, None)
 
     def path(self, sheet: Sheet, kind: str = "map") -> Path:
-        """A local path of a file of a sheet, verified: a copy where the atlas is remote."""
         found = sheet.files.get(kind)
         if found is None:
             raise AtlasError(f"sheet {sheet.id} has no {kind}: {self.store}")
@@ -234,7 +228,6 @@ class Atlas:
         self.store.write(SNAPSHOT, snapshot_of(self.sheets(refresh=True).values()))
 
     def require_recipe(self, recipe: AtlasRecipe) -> "Atlas":
-        """This atlas; raises `AtlasError` with the differences where it has another recipe."""
         if differences := self.recipe.differences(recipe):
             raise AtlasError(
                 "all sheets of an atlas are made alike; this one has "
@@ -254,7 +247,6 @@ class Atlas:
             )
 
     def _revisions(self, sheet_id: str) -> dict[str, Sheet | None]:
-        """The items of one sheet by file name; None for damaged ones."""
         names = self.store.names(ITEMS, f"{sheet_id}.")
         found, broken = read_some(self.store, names)
         return {**found, **dict.fromkeys(broken)}

@@ -39,8 +39,6 @@ ENVIRONMENT = {  # environment of the workers, as the command line sets it for i
 
 @dataclass(frozen=True)
 class Failure:
-    """Why an item failed: name and text of the error, and the traceback of an unexpected one."""
-
     kind: str
     text: str
     trace: str = ""
@@ -50,13 +48,11 @@ class SerialRunner:
     at_once = 1  # number of items that run at the same time
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """The result of a function on every machine, each with the machine's name: here on one."""
         return [("this machine", probe())]
 
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Each item with its result, in order; `gpu` has no effect."""
         for item in items:
             yield item, attempted(work, item)
 

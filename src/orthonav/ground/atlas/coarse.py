@@ -32,8 +32,7 @@ from orthonav.ground.planning.sheets import in_box
 
 FORMAT = "orthonav-coarse"
 SCHEMA = 1
-EDGES = "gradient"
-"""Representation of coarse tiles and of views searched among them, independent of the maps'."""
+EDGES = "gradient"  # of coarse tiles and of views searched among them, independent of the maps'
 POOLING = WhitenedRecipe()
 MAX_TILES = 1_000_000  # greatest number of a sheet: 45 km with tiles 50 m apart are 800,000
 MAX_FEATURES = 16_384  # greatest number per tile: 16 x 16 cells of 64 channels
@@ -120,7 +119,6 @@ def tile_count(path: Path) -> int:
 
 
 def read_coarse(path: Path) -> CoarseTiles:
-    """The coarse tiles in a file, completely checked."""
     path = require_file(path, "coarse tiles")
     try:
         with safe_open(path, framework="numpy") as stored:
@@ -138,10 +136,7 @@ def read_coarse(path: Path) -> CoarseTiles:
 
 
 class _NoCrops(CropSampler):
-    """A sampler without crops: coarse tiles are not calibrated."""
-
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        """No places (0, 2)."""
         return np.zeros((0, 2), np.intp)
 
 

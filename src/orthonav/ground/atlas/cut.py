@@ -178,7 +178,6 @@ def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:
 
 
 def _some_tiles(area: Area, grid: TileGrid) -> NDArray[np.intp]:
-    """Tiles (N, 2) in an area, all or evenly spaced; at least one near its middle."""
     step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MAX_TILES))))
     tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T.astype(np.intp)
     inside = area.contains(grid.centres_en_m(tiles), grid.stride_m * np.sqrt(0.5))
@@ -197,8 +196,7 @@ def _route_en_m(area: Area, grid: TileGrid) -> Array:
     return np.concatenate(parts)
 
 
-CACHE_BYTES = 24 * 2**20
-"""Decoded chunks cached of each sheet: those along the border of a row of blocks."""
+CACHE_BYTES = 24 * 2**20  # decoded chunks of each sheet: those along the border of a row of blocks
 REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
 
 DECIDING = 0.5, 0.99  # thresholds of acceptance lie in this range of probabilities
@@ -237,7 +235,6 @@ def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
 def pooled_manifest(
     members: Sequence[SheetSource], shares: NDArray[np.float64], sheet: SheetInfo
 ) -> Manifest:
-    """Manifest of a map with that sheet, cut from sheets that make up these shares of it."""
     manifests = [member.manifest for member in members]
     tiles = float(np.average([each.sheets[0].tiles for each in manifests], weights=shares))
     known = [
@@ -314,7 +311,6 @@ def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> Registered
 
 
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
-    """All orthophotos of all sheets, each once, by date and name."""
     sources = {json.dumps(each, sort_keys=True): each for one in manifests for each in one.imagery}
 
     def place(key: str) -> tuple[str, str, str]:
@@ -447,7 +443,6 @@ class _MapCutter:
         self.preview = Preview(grid, PREVIEW_PX)
 
     def read(self, progress: Progress, workers: int) -> None:
-        """Resample all blocks with `workers` threads."""
         blocks = blocks_of_area(self.area, self.grid, self._layout)
         with one_opencv_thread():
             made = in_order(blocks, lambda: nullcontext(self._made), workers)
@@ -510,7 +505,6 @@ def _learnt(
 def _shares(
     area: Area, centres_en_m: NDArray[np.float64], members: Sequence[SheetSource]
 ) -> NDArray[np.float64]:
-    """Share of the tiles in the box of each sheet; equal shares where there are none."""
     lat, lon = area.frame.latlon_from_en(centres_en_m)
     boxes = [each.sheet.bounds_deg for each in members]
     found = np.array([np.count_nonzero(in_box(box, lat, lon)) for box in boxes], np.float64)

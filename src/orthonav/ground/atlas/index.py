@@ -42,15 +42,12 @@ FOLDER = "index"
 MANIFEST = f"{FOLDER}/index.json"
 FORMAT = "orthonav-index"
 SCHEMA = 2  # 2: shards have no manifests of their own
-MAX_ROWS = 10**6
-"""Rows of a sheet: as many as it may have coarse tiles (`orthonav.ground.atlas.coarse`)."""
+MAX_ROWS = 10**6  # rows of a sheet: `orthonav.ground.atlas.coarse.MAX_TILES`
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
 
 
 @dataclass(frozen=True)
 class IndexManifest:
-    """What an index consists of; `files` has all its files by their names in the folder."""
-
     recipe: VectorRecipe
     shards: tuple[ShardInfo, ...]
     files: Mapping[str, StoredFile]
@@ -122,10 +119,8 @@ def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list
 
 
 WHITENING_NAME = "whitening.safetensors"
-MAX_TRAINING_TILES = 40_000
-"""Tiles that the whitening is learnt from: twice those of a map (`MAX_LEARNT_TILES`)."""
-SHARD_ROWS = 10_000_000
-"""Rows of a shard, at most: 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)."""
+MAX_TRAINING_TILES = 40_000  # of the whitening: twice those of a map (`MAX_LEARNT_TILES`)
+SHARD_ROWS = 10_000_000  # 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)
 REBUILD_SHARE = 0.3
 FEW_ROWS = 200_000
 """The index is rebuilt where more than this share of the rows is new or gone, or where it has so
@@ -134,13 +129,10 @@ POWER = 0.5
 """Exponent of the whitening: full whitening (1) does not recognize a place an eighth of a tile off.
 On 2,500 generated km2 half whitening ranks the right tile first for 87 instead of 83 % of views of
 another year."""
-MANY_TILES, MANY_DIMS = 3_000_000, 64
-"""Above this number of tiles so many components are stored: half of the time and memory of a
-search."""
+MANY_TILES, MANY_DIMS = 3_000_000, 64  # above so many tiles, so many components
 MIN_TILES = 16  # fewer tiles than codes of a quantizer cannot train it
 BATCH_TILES = 4096
-LEARN_PASSES = 3
-"""Passes over the coarse tiles: mean and scatter of the features, sample of the vectors."""
+LEARN_PASSES = 3  # mean and scatter of the features, sample of the vectors
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
 Counted = tuple[Sheet, int]  # a sheet and the number of its coarse tiles
 
@@ -298,14 +290,12 @@ def _groups(counted: Sequence[Counted]) -> list[list[Counted]]:
 
 
 def _shortened(embedder: WhitenedEmbedder, dims: int) -> WhitenedEmbedder:
-    """The embedder with at most `dims` components, an even number: quantizers code halves."""
     dims = min(dims, embedder.dims)
     basis = np.ascontiguousarray(embedder.basis[:, : dims - dims % 2])
     return replace(embedder, basis=basis)
 
 
 def vectors_of(embedder: WhitenedEmbedder, features: Features) -> NDArray[np.float32]:
-    """Unit vectors (N, D) of features and weights (N, F)."""
     return half_whitened(embedder, embedder.features(*features))
 
 
@@ -318,7 +308,6 @@ def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> 
 
 
 def load_whitening(path: Path) -> WhitenedEmbedder:
-    """The whitening of an index."""
     try:
         parts = load_file(path)
         mean, basis = parts["mean"], parts["basis"]

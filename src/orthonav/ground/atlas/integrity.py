@@ -95,7 +95,6 @@ def check_atlas(
 
 
 def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float | None) -> Problem:
-    """A file that is left over; removed where it has that age, None never."""
     if min_age_s is None:
         return Problem(kind, name, detail)
     age_s = store.age_s(name)
@@ -106,7 +105,6 @@ def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float 
 
 
 def _snapshot_problems(store: Store, sheets: Iterable[Sheet], clean: bool) -> Iterator[Problem]:
-    """A snapshot that does not show these sheets; rewritten with `clean`."""
     expected = snapshot_of(sorted(sheets, key=lambda sheet: sheet.id))
     size = store.size(SNAPSHOT)
     if size is None or (
@@ -255,7 +253,6 @@ def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[
 
 
 def _same(own: object, other: object) -> bool:
-    """Whether values are equal, numbers but for rounding."""
     if isinstance(own, int | float) and isinstance(other, int | float):
         return math.isclose(own, other, rel_tol=1e-6)
     return own == other

@@ -24,8 +24,7 @@ from orthonav.ground.planning.area import Extent
 SCHEMA = 1
 STAC_VERSION = "1.0.0"
 COLLECTION = "orthonav-atlas"
-MAX_ITEM_BYTES = 2**20
-"""A guard for memory: items have some 2 kB, 60 bytes more for each further orthophoto."""
+MAX_ITEM_BYTES = 2**20  # a guard for memory: 2 kB, 60 bytes more for each further orthophoto
 MAX_REVISION = 9999  # what four digits of a file name hold
 MAX_DIGITS = 20  # digits of an integer: 64 bits. Python needs quadratic time for longer ones.
 MAX_TILES = 10**9  # a guard against impossible values: tiles 1.5 m apart on a sheet of 45 km
@@ -44,8 +43,6 @@ _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of an atlas: its name in the atlas, its size in bytes and its SHA-256 (hex)."""
-
     name: str
     size_bytes: int
     sha256: str
@@ -76,7 +73,6 @@ class Sheet:
     files: Mapping[str, StoredFile] = field(default_factory=dict)
 
     def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
-        """The sheet with its files, as it will be read back."""
         data = canonical(replace(self, revision=revision, files=files).to_item())
         return self.from_item(json.loads(data), data)
 
@@ -174,7 +170,6 @@ class Sheet:
 
 
 def reason(error: Exception) -> str:
-    """What is wrong with plain values that could not be read, for people."""
     if isinstance(error, TypeError | AttributeError):
         return "a value is of another kind than expected"
     return described(error)
@@ -198,18 +193,15 @@ def parsed(data: bytes, what: str) -> Any:
 
 
 def item_name(sheet_id: str, revision: int, data: bytes) -> str:
-    """File name of an item: sheet, revision, and the first digits of the digest of its bytes."""
     return f"{sheet_id}.{revision:04d}.{hashlib.sha256(data).hexdigest()[:12]}.json"
 
 
 def split_name(name: str) -> tuple[str, int] | None:
-    """Sheet and revision in the file name of an item; None for any other file."""
     match = _ITEM_NAME.fullmatch(name)
     return (match.group(1), int(match.group(2))) if match else None
 
 
 def read_item(name: str, data: bytes, plain: Any = None) -> Sheet:
-    """The sheet in the item file `name`; `plain` are its values if already parsed."""
     if len(data) > MAX_ITEM_BYTES:
         raise AtlasError(f"{len(data)} bytes, at most {MAX_ITEM_BYTES} are allowed: items/{name}")
     plain = parsed(data, f"items/{name}") if plain is None else plain
@@ -228,7 +220,6 @@ def file_name(key: str, sheet_id: str, sha256: str) -> str:
 
 
 def sheet_of_file(name: str) -> str | None:
-    """The sheet that a file name in any folder of the atlas begins with; None for other names."""
     sheet = name.rpartition("/")[2].partition(".")[0]
     return sheet if _SHEET.fullmatch(sheet) else None
 
@@ -284,8 +275,7 @@ log = logging.getLogger(__name__)
 
 ITEMS, SNAPSHOT = "items", "items.geojson"
 MAX_SNAPSHOT_BYTES = 2**30  # a guard for memory: 500,000 items of 2 kB
-MAX_ITEMS = 10**6
-"""A guard for memory: seven times the sheets of a country at 20 cm (docs/country.md)."""
+MAX_ITEMS = 10**6  # a guard for memory: seven times a country at 20 cm (docs/country.md)
 _READ_AT_ONCE = 1000  # one page of a listing of S3
 
 
@@ -307,7 +297,6 @@ def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
 
 
 def _read_snapshot(store: Store, names: Mapping[str, int]) -> dict[str, Sheet]:
-    """The sheets of the snapshot whose items exist; none where it is missing or damaged."""
     wanted = len(names) > 1 and not store.is_local  # items of a folder are read as fast
     size = store.size(SNAPSHOT) if wanted else None
     if size is None or size > MAX_SNAPSHOT_BYTES:

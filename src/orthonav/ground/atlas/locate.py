@@ -52,16 +52,11 @@ LOG_SCALES = (-0.06, 0.06)
 """Headings and log scales under which coarse tiles are searched: each
 view has a pose that is off by 4 deg and 6 % at most, for scales within 12 %."""
 KNOWN_SIGMAS = 2.0  # standard deviations of a reported heading that are searched to either side
-REACH_STRIDES = 0.8
-"""Strides of the coarse tiles around a candidate that are searched: more than half a diagonal."""
+REACH_STRIDES = 0.8  # of coarse tiles, searched around a candidate: over half a diagonal
 TURN_STD_RAD = math.radians(4.0)  # of the heading of a candidate: half of `TURN_STEP_DEG`
 VIEW_TILES = (0.6, 2.5)  # least and greatest side of a view, in coarse tiles
-FOLLOWED, FOLLOWED_NATS = 4, 4.0
-"""Chains whose expected places are searched: at most so many, and not less likely than the best by
-more nats."""
-START_PX = 5.0
-"""Standard deviation of a found place, in pixels of the sheets: half of the radius within which
-their confidence counts a place as right."""
+FOLLOWED, FOLLOWED_NATS = 4, 4.0  # chains whose expected places are searched
+START_PX = 5.0  # of a found place: half of the radius within which confidence counts it right
 REPLAYED = 4  # latest views of a place that a track begins with
 
 
@@ -93,7 +88,6 @@ class PlaceFinder:
         self._views = {}
 
     def find(self, view: View) -> FoundPlace | NoFix:
-        """The place on which this view and earlier ones agree; until then the reason why not."""
         recipe = self._search.recipe
         refused = check_view(view, recipe.gsd_m, self._heading_known)
         if refused is not None:
@@ -185,7 +179,6 @@ class PlaceFinder:
 
 
 def rectified(view: View, gsd_m: float) -> RectifiedView:
-    """The view rectified to `gsd_m` metres per pixel, its own heading up."""
     return rectify_footprint(downsampled(view, gsd_m), gsd_m=gsd_m, multiple_px=1)
 
 
@@ -296,7 +289,6 @@ class LocalTrack:
         return True
 
     def _cut(self, middle: LocalFrame, reach_m: float) -> tuple[Area, Localizer]:
-        """A map around a place that shows all within reach, and its area."""
         half_m = reach_m + AHEAD_M
         area = Area(middle, (-half_m, -half_m, half_m, half_m))
         localizer = Localizer(cut_in_memory(self._atlas, area))
@@ -329,12 +321,10 @@ class AtlasLocator:
         return self._state.value
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        """The outcome of a view that cannot be used: `reason`."""
         self._follow(lambda track: track.passed(telemetry, reason))
         return self._outcome(reason)
 
     def locate(self, view: View) -> Fix | NoFix:
-        """Where a view was taken, once views agree; until then the reason why not."""
         self._follow(lambda track: track.locate(view))
         if self._track is not None and self._track.fix is not None:
             self._finder.restart()
@@ -346,7 +336,6 @@ class AtlasLocator:
         return self._outcome()
 
     def _follow(self, take_in: Callable[[LocalTrack], bool]) -> None:
-        """Let the track, if there is one, take in a view; forget a track that has ended."""
         if self._track is None:
             return
         try:

@@ -57,8 +57,7 @@ MOST_EFFORT = 0.085, 1500
 """Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
 finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
 (`benchmarks.atlas_search` at d63ac91)."""
-APART_STRIDES = 1.5
-"""Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
+APART_STRIDES = 1.5  # tiles nearer to each other are one place: the eight neighbours of a tile
 MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
 
 
@@ -123,12 +122,8 @@ class TileSearch:
 log = logging.getLogger(__name__)
 
 MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
-BORDER_SHARE = 0.25
-"""Sheets reach half a tile beyond their box: a sheet is
-searched where the middle of a view may lie up to this share of its side outside the box."""
-WIDEST = 1.25
-"""On level ground all of a view of up to this scale lies on the part of a sheet where it is
-registered."""
+BORDER_SHARE = 0.25  # of its side that the middle of a view may lie outside the box of a sheet
+WIDEST = 1.25  # greatest scale at which all of a view lies on the part of a sheet, on level ground
 
 
 @dataclass(frozen=True)
@@ -168,7 +163,6 @@ class PyramidPart:
     def read(
         self, level: int, row: int, col: int, height: int, width: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of a window."""
         first = (self.row >> level) + row, (self.col >> level) + col
         return self.whole.read(level, *first, height, width)
 
@@ -183,7 +177,6 @@ class SheetRegistrar:
         self._sheet = functools.lru_cache(maxsize=MAX_OPEN)(self._opened)
 
     def near(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
-        """The usable sheets within reach of the middle of a view."""
         frame = LocalFrame(*region.middle_latlon_deg)
         reach_m = region.reach_m + BORDER_SHARE * side_m
         lats, lons = frame.latlon_from_en(np.array([[-reach_m, -reach_m], [reach_m, reach_m]]))
@@ -335,9 +328,7 @@ class JudgedRegion:
         return SheetMatch(*place, found.scores, self.sheet.confidence)
 
 
-SEARCHED = 4
-"""At most so many candidates are searched: the right one and the best rivals are among them
-(docs/decisions/atlas.md)."""
+SEARCHED = 4  # candidates: the right one and the best rivals (docs/decisions/atlas.md)
 PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""

@@ -35,8 +35,7 @@ GRACE_S = 600.0  # files used within this time are not removed: a process may be
 _OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
 """There a file appears when it is complete; elsewhere it is moved to its name."""
 _FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
-_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}
-"""Protocols that refuse to replace a file unless `overwrite` is passed."""
+_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}  # refuse to replace a file unless told
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
 _PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 _PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
@@ -183,7 +182,6 @@ class Store:
                 fs.rm_file(remote_path)
 
     def shown(self, name: str) -> str:
-        """The address of a file, without a password."""
         return f"{self}/{name:.200}" if name else str(self)
 
     def _path(self, name: str, follow: bool = True) -> Path:
@@ -288,7 +286,6 @@ def checked_name(name: str) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file, as hex."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -305,7 +302,6 @@ def _require(path: Path, size: int, sha256: str, shown: str) -> None:
 
 
 def cache_folder() -> Path:
-    """The folder of the cache: `ORTHONAV_CACHE`, otherwise the cache folder of the user."""
     own = os.environ.get("ORTHONAV_CACHE")
     if own:
         return Path(own).expanduser()
@@ -314,7 +310,6 @@ def cache_folder() -> Path:
 
 
 def cache_limit_bytes() -> int:
-    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB."""
     gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
     try:
         return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES

@@ -34,8 +34,7 @@ from orthonav.core.extras import needed
 Array = NDArray[np.float32]
 
 QUANTIZERS_NAME = "quantizers.safetensors"
-MAX_TRAINING_VECTORS = 200_000
-"""Vectors that quantizers are trained on, as in `benchmarks.atlas_search` at d63ac91."""
+MAX_TRAINING_VECTORS = 200_000  # as in `benchmarks.atlas_search` at d63ac91
 POINTS_PER_CENTRE = 4096
 """Training vectors per centre, if there are as many. FAISS's default, 256, loses 2 to 4 points of
 recall where lists or codes have few centres (2e5 of `benchmarks.atlas_fields` at d63ac91)."""
@@ -46,7 +45,6 @@ FORMAT = "orthonav-vectors"
 
 
 def faiss() -> Any:
-    """The module FAISS; raises `MissingExtraError` where it is not installed."""
     return needed("faiss", "atlas", "searching an atlas")
 
 
@@ -120,7 +118,6 @@ class Quantizers:
 
     @classmethod
     def load(cls, path: Path) -> "Quantizers":
-        """Read what `save` wrote."""
         try:
             with safe_open(path, framework="numpy") as stored:
                 recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
@@ -254,8 +251,6 @@ class Part:
 
 @dataclass(frozen=True)
 class ShardInfo:
-    """A shard: its name, the id of its first row, and the sheets in it, row after row."""
-
     name: str
     base: int
     parts: tuple[Part, ...]
@@ -266,7 +261,6 @@ class ShardInfo:
 
     @property
     def retired_rows(self) -> NDArray[np.int64]:
-        """Rows (N,) of retired parts, in order."""
         ends = np.cumsum([part.rows for part in self.parts]).tolist()
         retired = [
             np.arange(end - part.rows, end, dtype=np.int64)
@@ -432,7 +426,6 @@ class ShardedIndex:
     its shard plus its row. Not for several threads at once."""
 
     def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
-        """Open shards and quantizers; `file` gives the path of each of their files."""
         self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
         self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
 
@@ -474,7 +467,6 @@ class ShardedIndex:
         return out
 
     def place_deg(self, number: int) -> tuple[float, float] | None:
-        """Latitude and longitude of an id; None where it is in no shard."""
         for shard in self._shards:
             if shard.info.base <= number < shard.info.base + shard.info.rows:
                 lat, lon = shard.places_deg[number - shard.info.base].tolist()

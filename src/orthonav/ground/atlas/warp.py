@@ -31,11 +31,8 @@ from orthonav.ground.planning.area import Extent
 
 KERNEL_PX = 3  # margin of cubic interpolation, 2 pixels, and one more for rounding
 EDGE_POINTS = 16  # points along an edge of a box, which is not straight in another plane
-FILL_PX = 5
-"""Pixels by which imagery is extended beyond its edge: the kernel of cubic interpolation."""
-OWN_BONUS = 0.01
-"""A cell is taken from the sheet that shows most of it; this advantage decides ties for the sheet
-whose box holds it."""
+FILL_PX = 5  # kernel of cubic interpolation: imagery is extended beyond its edge
+OWN_BONUS = 0.01  # decides ties between sheets for the one whose box holds the cell
 _SHIFT = 6  # fractional bits of polygon corners in OpenCV
 Array = NDArray[np.float64]
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
@@ -179,13 +176,11 @@ def outline(box: Extent, points: int) -> Array:
 
 
 def _px_from_latlon(frame: LocalFrame, grid: TileGrid, lat_deg: Array, lon_deg: Array) -> Array:
-    """Column and row (N, 2) of places on the raster of a grid."""
     points = frame.en_from_latlon(lat_deg, lon_deg)
     return np.asarray((points - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m])
 
 
 def _latlon_from_px(frame: LocalFrame, grid: TileGrid, px: Array) -> tuple[Array, Array]:
-    """Inverse of `_px_from_latlon`."""
     places = [grid.west_m, grid.north_m] + px * [grid.gsd_m, -grid.gsd_m]
     return frame.latlon_from_en(places)
 
@@ -211,7 +206,6 @@ def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
 
 
 def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest box around the true pixels of a mask (H, W), or None."""
     rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return None

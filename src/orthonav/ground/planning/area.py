@@ -27,7 +27,6 @@ class Area:
 
     @classmethod
     def from_bounds(cls, bounds_deg: Extent) -> "Area":
-        """Area of a latitude/longitude box (west, south, east, north in degrees)."""
         west, south, east, north = unwrapped(bounds_deg)
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
             hint = swapped_bounds_hint((west, south, east, north))
@@ -96,7 +95,6 @@ class Area:
 
 
 def unwrapped(bounds_deg: Extent) -> Extent:
-    """West, south, east, north with west below east, which is above 180 across the antimeridian."""
     west, south, east, north = bounds_deg
     if west > east + 180:  # as in GeoJSON (RFC 7946, 5.2)
         east += 360
@@ -109,7 +107,6 @@ def unwrapped(bounds_deg: Extent) -> Extent:
 
 
 def require_one_area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> None:
-    """Raise `AreaError` where both a route and bounds are given, or a band without a route."""
     if route is not None and bounds_deg is not None:
         raise AreaError("give either a route with a search band or bounds, not both")
     if route is None and band_m is not None:

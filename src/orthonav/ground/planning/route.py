@@ -94,8 +94,7 @@ __all__ = [
     "within_bands",
 ]
 
-MAX_ROUTE_BYTES = 20_000_000
-"""Twice as much as 100,000 waypoints take; JSON and XML take some 20 times their size in memory."""
+MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
 MAX_LISTED = 20
 _PAIRS_AT_ONCE = 2**18
 _FEW_POINTS = 64
@@ -166,7 +165,6 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _name_apart(path: Path) -> tuple[Path, str | None]:
-    """The file and the line name after `#`; an existing file may have `#` in its name."""
     text = str(path)
     if path.exists():
         return path, None

@@ -24,8 +24,7 @@ from orthonav.ground.planning.area import Area, Extent, unwrapped
 from orthonav.ground.planning.route import Height, Route, leg_lengths_m
 
 MAX_SHEETS = 10_000  # limit of the program; 2500 km2 each, so 25 million km2
-MAX_ROUTE_SHEETS = 500
-"""Limit for a route: more than once around the Earth with bands of less than 10 km."""
+MAX_ROUTE_SHEETS = 500  # more than once around the Earth with bands of less than 10 km
 _DEGREE_M = 110_574.0  # shortest degree of latitude, at the equator (WGS84)
 _LON_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 _TRIES = 4  # numbers of columns tried for one row before rows are made lower
@@ -60,7 +59,6 @@ def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
 
 
 def _row(west: float, south: float, east: float, north: float) -> list[Extent]:
-    """Boxes of a row; empty if the row is too high for boxes of any width."""
     widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
     width_m = (east - west) * _LON_DEGREE_M * math.cos(math.radians(widest))
     least = max(1, int(width_m / MAX_SHEET_M))
@@ -84,7 +82,6 @@ def _box_fits(bounds_deg: Extent) -> bool:
 
 
 def _wrapped(lon_deg: float) -> float:
-    """A longitude in -180..180; values inside are returned unchanged."""
     return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
 
 
@@ -196,8 +193,7 @@ def _too_many(count: int) -> AreaError:
     return AreaError(f"area needs {count:,} sheets, more than the limit of {MAX_SHEETS:,}")
 
 
-LARGEST_SIDE_M = 0.9 * MAX_SHEET_M
-"""The box around a sheet is wider than the sheet, because meridians converge."""
+LARGEST_SIDE_M = 0.9 * MAX_SHEET_M  # boxes are wider than sheets: meridians converge
 SMALLEST_SIDE_M = 200.0
 _MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
 _PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)

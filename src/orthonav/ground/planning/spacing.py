@@ -19,25 +19,19 @@ from orthonav.core.geo.ground import TerrainHeights
 from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.route import Route, leg_lengths_m
 
-TILE_SIZES_PX = (256, 128, 64)
-"""Tile widths to choose from, widest first; 256 px is the default of `build`."""
-GOOD_VIEW_PX = 144.0
-"""Size of a view, in map pixels, at which registration ends; smaller views register less well."""
+TILE_SIZES_PX = (256, 128, 64)  # to choose from; 256 is the default of `build`
+GOOD_VIEW_PX = 144.0  # size of a view in map pixels at which registration ends
 LEAST_VIEW_PX = 24.0
 LEAST_TILE_SHARE = 0.4
 MOST_COARSER = 4.0  # the localizer refuses views beyond these three limits: too_small, too_coarse
 FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)
 LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
-MOST_RELIEF = 0.05
-"""Relief within a view, as a share of the height, above which the flat-ground model fails: equal to
-the standard deviation of the reported height in all benchmarks."""
+MOST_RELIEF = 0.05  # within a view, as a share of the height: the std of reported heights
 VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
 TRACKED_PER_S = 10.0  # views per second while tracking on one desktop core: docs/benchmarks.md
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 by 51 degrees, usual for small drones."""
+DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)  # 65 by 51 deg
 DEFAULT_PRIOR_STD_M = 150.0  # about 5 km of dead reckoning with an error of 3 %
-BAND_PRIORS = 4.0
-"""Width of a band that is not given, in standard deviations of the prior: two to each side."""
+BAND_PRIORS = 4.0  # width of a band that is not given: two deviations of the prior to each side
 MIN_BAND_VIEWS = 0.5  # a band is checked at least so many sides of a view wide
 _NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)  # mantissas of round ground resolutions
 
@@ -49,8 +43,6 @@ def default_band_m(view_m: float, prior_std_m: float | None = DEFAULT_PRIOR_STD_
 
 @dataclass(frozen=True)
 class Caution:
-    """A warning about a plan: `code` for programs, `text` for people."""
-
     code: str
     text: str
 
@@ -78,12 +70,10 @@ class ViewPlan:
 
     @property
     def short_m(self) -> float:
-        """The shorter side in metres."""
         return min(self.width_m, self.height_m)
 
     @property
     def side_m(self) -> float:
-        """Root of the area in metres."""
         return math.sqrt(self.width_m * self.height_m)
 
     @property
@@ -169,8 +159,7 @@ def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
 
 
 TILE_BYTES = 273.0  # embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles
-LAYER_BYTES_PER_PX = 0.15, 0.35
-"""Registration layer, all levels: minimum and maximum of real imagery, docs/map-format.md."""
+LAYER_BYTES_PER_PX = 0.15, 0.35  # of real imagery, docs/map-format.md
 BUILD_FIXED_S = 40.0
 BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
@@ -178,8 +167,7 @@ for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s fo
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
 _PAIRS = 1_000_000_000  # limit on pairs of points and legs, which bounds the time of an estimate
 _MOST_POINTS = 200_000
-_LEAST_POINTS = 2_500
-"""Points sampled at most and at least: a standard error of the share of 0.1 % to 1 %."""
+_LEAST_POINTS = 2_500  # points sampled: a standard error of the share of 0.1 % to 1 %
 
 
 @dataclass(frozen=True)
@@ -254,8 +242,7 @@ def _share(
 
 Array = NDArray[np.float64]
 MAX_POSITIONS = 2000  # sampled positions along a route at most
-LANDING_M = 30.0
-"""Height above ground below which the aircraft takes off or lands; views there are not judged."""
+LANDING_M = 30.0  # above ground, below which the aircraft takes off or lands
 _BELOW_GROUND_M = 2.0  # tolerance for errors of the terrain model
 _ACROSS = (0.0, -0.5, 0.5)
 _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
@@ -295,7 +282,6 @@ def profile(
 
 
 def _leg_m(route: Route, leg: int) -> tuple[LocalFrame, float, Array]:
-    """A local plane at a leg, its length, and both ends in the plane (2, 2)."""
     ends = route.part(leg, min(leg + 1, len(route.waypoints) - 1))
     frame = LocalFrame(*ends.waypoints[0])
     points = ends.points_en_m(frame)

@@ -49,8 +49,7 @@ from orthonav.ground.simulate.receiver import Good, samples_of, solutions
 from orthonav.ground.simulate.render import Clouds, ViewEffects, degraded, render_view
 
 MAX_VIEWS = 1_000_000  # sanity limit
-TRIES_PER_VIEW = 400
-"""Random positions tried per view; suffices if 2 % of them are covered by imagery."""
+TRIES_PER_VIEW = 400  # suffices if 2 % of random positions are covered by imagery
 MAX_PITCH_DEG = 65.0
 MARGIN_PX = 4  # margin of the ground window: radius of the bicubic kernel, and rounding
 Array = NDArray[np.float64]
@@ -298,7 +297,6 @@ def _ground(
     corner: tuple[float, float, float],
     coverage: Coverage,
 ) -> GroundImagery:
-    """The raster with `corner` (west, north, pixel size, metres), mirrored if requested."""
     west_m, north_m, gsd_m = corner
     if not (request.beyond or request.in_perspective):
         return GroundImagery(raster, west_m, north_m, gsd_m)
@@ -467,7 +465,6 @@ def _picture(
     pose: _Pose,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """The image of the camera (H, W, 3), rendered from the window of imagery under it."""
     camera, attitude = request.camera, pose.attitude
     cover = None
     if clouds is not None:

@@ -61,7 +61,6 @@ class Coverage:
         return not (part & (inside > 0)).any()
 
     def box_en_m(self) -> tuple[float, float, float, float]:
-        """West, south, east, north of a box that is fully covered by imagery."""
         height, width = self._missing.shape
         left, top, right, bottom = 0, 0, width, height
         while left < right and top < bottom:

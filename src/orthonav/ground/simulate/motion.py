@@ -18,8 +18,7 @@ DRIFT_TIME_S = 300.0  # time constant of the odometry error, which hardly change
 ARC_STEP_DEG = 2.0  # angle between the points of an arc
 SHARPEST_DEG = 179.0  # sharper corners are flown as turns on the spot
 LONGEST_STEP_S = 0.5  # longest time step with constant wind and course
-HORIZON_TIME_S = 15.0
-"""Correlation time of the horizon. Errors of real autopilots change within 10 to 30 s."""
+HORIZON_TIME_S = 15.0  # errors of real autopilots change within 10 to 30 s
 MAX_STEPS = 1_000_000  # limit of the time steps of a flight in wind: 139 hours
 Array = NDArray[np.float64]
 
@@ -47,7 +46,6 @@ class Wind:
 
     @property
     def velocity_en_mps(self) -> Array:
-        """Mean velocity of the air over ground (2,)."""
         return -self.speed_mps * direction(self.from_deg)
 
 
@@ -131,7 +129,6 @@ def _too_long() -> FlightError:
 
 
 def _moving_air(wind: Wind, step_s: float, rng: np.random.Generator) -> Iterator[Array]:
-    """Velocity of the air (2,) at successive steps, infinitely many."""
     std, most = GUST_STD * wind.speed_mps, LARGEST_GUST * wind.speed_mps
     for gust in _wandering(step_s / GUST_TIME_S, rng):
         added = gust * std
@@ -149,7 +146,6 @@ def _wandering(step: float, rng: np.random.Generator) -> Iterator[Array]:
 
 
 def gauss_markov(step: float, count: int, rng: np.random.Generator) -> Array:
-    """`count` values (N, 2) of the process of `_wandering`."""
     return np.array([value for value, _ in zip(_wandering(step, rng), range(count), strict=False)])
 
 

@@ -15,16 +15,14 @@ from orthonav.core.variants import Table, Variant, make_variant
 from orthonav.ground.simulate.motion import direction, gauss_markov
 
 RATE_HZ = 5.0  # rate of solutions: the default of autopilots
-ERROR_STD_M, ERROR_TAU_S = 2.0, 180.0
-"""Slowly varying error per axis (ionosphere, orbits) and its correlation time."""
+ERROR_STD_M, ERROR_TAU_S = 2.0, 180.0  # slowly varying, per axis: ionosphere, orbits
 NOISE_STD_M = 0.3  # noise per axis from solution to solution
 MULTIPATH_PER_HOUR, MULTIPATH_M, MULTIPATH_S = 20.0, 6.0, (5.0, 60.0)
 """Rate, largest size and duration of steps by multipath."""
 VELOCITY_NOISE_MPS, VELOCITY_DRIFT_MPS, VELOCITY_TAU_S = 0.05, 0.08, 60.0
 """Noise and slowly varying error of the Doppler velocity per axis."""
 LATENCY_S = 0.12  # age of a solution at its timestamp, of which the receiver does not know
-STATED_STD_M = 1.5
-"""Standard deviation that the receiver states: less than its error, as receivers do."""
+STATED_STD_M = 1.5  # less than its error, as receivers do
 SATELLITES = 16
 _LIMITS = {  # largest values of a receiver's fields; the least is 0
     "std_m": 100.0,
@@ -174,7 +172,6 @@ RECEIVERS: Table = MappingProxyType(  # receivers that `orthonav simulate --rece
 
 
 def receiver_of(text: str) -> Good:
-    """The receiver that `name:field=value,...` describes."""
     made: Good = make_variant(RECEIVERS, text)
     return made
 
@@ -228,7 +225,6 @@ def samples_of(track: GnssTrack, frame: LocalFrame) -> Iterator[GnssSample]:
 
 
 def _multipath(times: Array, rng: np.random.Generator) -> Array:
-    """Offsets (N, 2) that come and go in steps."""
     off = np.zeros((len(times), 2))
     hours = (times[-1] - times[0]) / 3600
     for _ in range(rng.poisson(MULTIPATH_PER_HOUR * hours)):

@@ -22,8 +22,7 @@ EDGE = 0.25  # share of a stretch, at each end, over which the clouds close
 BROKEN = 0.3  # share of the stretches whose clouds never close
 HEIGHT = 0.5  # height of the clouds as a share of the aircraft's
 SOFTNESS = 0.25  # width of a cloud edge, as a share of the range of cloud cover
-TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0
-"""Period of the cloud texture, in its pixels and in lengths of a view."""
+TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0  # period: pixels, lengths of a view
 BLOB_PX = 40.0  # size of the largest clouds in pixels of the texture
 GRID = 8  # clouds are rendered at this fraction of the resolution of the view
 Array = NDArray[np.float64]
@@ -37,7 +36,6 @@ class CloudLayer:
     grey: NDArray[np.float32]
 
     def over(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (H, W, 3) with the clouds in front."""
         behind = picture * (1 - self.opacity[..., None])
         return np.asarray(behind + (self.opacity * self.grey)[..., None], dtype=np.uint8)
 
@@ -131,8 +129,6 @@ def _enlarged(part: Array, size: tuple[int, int]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class ViewEffects:
-    """Image degradation."""
-
     exposure_std: float = 0.15  # standard deviation of the logarithm of the exposure, 0..1
     blur_px: float = 0.6  # standard deviation of the blur in pixels, 0..50
     noise_std: float = 2.0  # standard deviation of the sensor noise in grey levels, 0..128
@@ -170,7 +166,6 @@ def degraded(
     rng: np.random.Generator,
     clouds: CloudLayer | None = None,
 ) -> NDArray[np.uint8]:
-    """A perfect image (H, W, 3) with clouds, blur, exposure and noise."""
     if clouds is not None:
         picture = clouds.over(picture)
     if effects.blur_px > 0:

@@ -27,13 +27,11 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
 _BAND = ("band_m",)
 _MODE = ("altitudemode", "altitude_mode")  # column of Litchi
 _FRAME_OF_MODE: dict[float, HeightFrame] = {0: "home", 1: "agl"}
-_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")
-"""Unit that ends the name of a column, as in altitude(m)."""
+_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
 _METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
 
 
 def read_delimited(data: bytes) -> list[Route]:
-    """The route of a table with a header, whose band is that of the leg which begins at the row."""
     stream = io.StringIO(decoded(data), newline=None)
     header = stream.readline(MAX_LINE_CHARS)
     stream.seek(0)
@@ -95,7 +93,6 @@ def _metres_of(column: str) -> float:
 def _frames(
     names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
 ) -> list[HeightFrame | None]:
-    """Reference of the height of each row, by its altitude mode; None without such a column."""
     column = _column(names, _MODE)
     if column is None:
         return [None] * len(rows)

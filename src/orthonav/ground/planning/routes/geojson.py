@@ -54,7 +54,6 @@ def _is_place(place: Any) -> bool:
 
 
 def to_geojson(routes: Sequence[Route]) -> str:
-    """Routes as a GeoJSON document: a feature, or a collection of several."""
     features = [_feature(route) for route in routes]
     plain = features[0] if len(features) == 1 else _collection(features)
     return json.dumps(plain, allow_nan=False) + "\n"
@@ -119,7 +118,6 @@ def _bands_m(band: Any, legs: int) -> tuple[float | None, ...]:
 
 
 def _position(point: Any) -> tuple[float, float, float | None]:
-    """Latitude, longitude and height of a position; only numbers are accepted, not `"12"`."""
     numbers = isinstance(point, list) and all(type(value) in (int, float) for value in point[:3])
     if not numbers or len(point) < 2:
         raise RouteError(

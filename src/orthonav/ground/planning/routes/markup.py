@@ -67,7 +67,6 @@ def read_markup(data: bytes, kind: str, root: str) -> Element:
 
 
 def text_of(element: Element, tag: str) -> str | None:
-    """Text of the first child with a tag; None if there is none or it is empty."""
     return (element.findtext(tag) or "").strip() or None
 
 
@@ -202,7 +201,6 @@ def _kml_routes(mark: Element) -> list[Route]:
 
 
 def _line(element: Element) -> Iterator[_Place]:
-    """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces at commas are accepted."""
     frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
     text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
     text = text.replace(" ,", ",").replace(", ", ",")

@@ -30,7 +30,6 @@ def left_out_text(left_out: Sequence[str]) -> str:
 
 
 def require_few_waypoints(count: int) -> None:
-    """Raise `RouteError` for more than `MAX_WAYPOINTS`; readers ask before they make them."""
     if count > MAX_WAYPOINTS:
         raise RouteError(
             f"route has at least {count:,} waypoints, at most {MAX_WAYPOINTS:,} are read; "
@@ -150,7 +149,6 @@ def number(value: Any, what: str) -> float:
 
 
 def number_or_none(value: Any, what: str) -> float | None:
-    """As `number`; None for null, NaN and missing values."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return None
     return number(value, what)
@@ -176,7 +174,6 @@ def numbers_in(text: str) -> list[float]:
 
 
 def decoded(data: bytes) -> str:
-    """Text of UTF-8 bytes, with or without a byte order mark."""
     if not data.strip():
         raise RouteError("route file is empty")
     try:
