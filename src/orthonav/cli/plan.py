@@ -1,6 +1,7 @@
 """`orthonav plan`: derive map requirements from a route, a camera and a height."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
+    number = partial(parser.add_argument, type=float)
     add_area(
         parser,
         parser.add_mutually_exclusive_group(required=True),
@@ -31,15 +33,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: 1280 x "
         "960 px, 65 by 51 deg",
     )
-    parser.add_argument("--agl-m", type=float, help="height above ground (default: from the route)")
-    parser.add_argument("--speed-mps", type=float, help="ground speed")
-    parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: from the view)"
-    )
+    number("--agl-m", help="height above ground (default: from the route)")
+    number("--speed-mps", help="ground speed")
+    number("--gsd-m", help="ground resolution, metres per pixel (default: from the view)")
     parser.add_argument("--tile-px", type=int, help="width of a tile (default: from the view)")
-    parser.add_argument(
+    number(
         "--overlap",
-        type=float,
         default=0.875,
         metavar="FRACTION",
         help="overlap of neighbouring tiles, as a fraction of their width (default 0.875)",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.core.geo.swapped import swapped_bounds_hint
-from orthonav.ground.planning.route import Route, within_bands
+from orthonav.ground.planning.route import Array, Route, within_bands
 
 Extent = tuple[float, float, float, float]
 
@@ -42,7 +42,7 @@ class Area:
         return cls.from_outline(edge_lat, edge_lon)
 
     @classmethod
-    def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
+    def from_outline(cls, lat_deg: Array, lon_deg: Array) -> "Area":
         """Smallest north-up box around outline points, in a plane centred on that box. Longitudes
         are unwrapped near the first point, so the outline may cross the antimeridian."""
         lon_deg = lon_deg - 360 * np.round((lon_deg - lon_deg[0]) / 360)
@@ -74,9 +74,7 @@ class Area:
         extent = _checked((float(west), float(south), float(east), float(north)))
         return cls(box.frame, extent, route, band_m or 0.0)
 
-    def contains(
-        self, points_en_m: NDArray[np.float64], margin_m: float = 0.0
-    ) -> NDArray[np.bool_]:
+    def contains(self, points_en_m: Array, margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Mask `(N,)` of the local points `(N, 2)` inside, or at most `margin_m` outside."""
         if self.route is not None:
             return within_bands(points_en_m, *self._bands, margin_m)
@@ -86,7 +84,7 @@ class Area:
         return np.asarray(((points_en_m >= low) & (points_en_m <= high)).all(axis=1))
 
     @cached_property
-    def _bands(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _bands(self) -> tuple[Array, Array]:
         """Vertices of the route (M, 2) in the plane, and the band width of each leg."""
         assert self.route is not None
         bands_m = self.route.bands_m(self.band_m or None)

@@ -28,6 +28,7 @@ from orthonav.ground.planning.routes.markup import read_gpx, read_kml, read_kmz,
 from orthonav.ground.planning.routes.mission import is_plan, is_wpl, plan_route, read_plan, read_wpl
 from orthonav.ground.planning.routes.record import Height, Route, json_object, left_out_text
 
+Array = NDArray[np.float64]
 PREFIX = "paper:"
 EAST_DEG = 90.0
 _FORM = f"{PREFIX}A@LAT,LON[,BEARING]"
@@ -205,22 +206,18 @@ def _listed(found: list[Route]) -> str:
     return ", ".join(shown) + (", .." if len(found) > MAX_LISTED else "")
 
 
-def leg_lengths_m(route: Route) -> NDArray[np.float64]:
+def leg_lengths_m(route: Route) -> Array:
     """Length in metres of each leg of a route, along the ellipsoid; `[0]` for one waypoint."""
     places = np.array(route.waypoints)
     return distances_m(places[:-1], places[1:]) if len(places) > 1 else np.zeros(1)
 
 
-def distance_to_polyline_m(
-    points_en_m: NDArray[np.float64], line_en_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def distance_to_polyline_m(points_en_m: Array, line_en_m: Array) -> Array:
     """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
     return beyond_bands_m(points_en_m, line_en_m, np.zeros(max(1, len(line_en_m) - 1)))
 
 
-def beyond_bands_m(
-    points_en_m: NDArray[np.float64], line_en_m: NDArray[np.float64], bands_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def beyond_bands_m(points_en_m: Array, line_en_m: Array, bands_m: Array) -> Array:
     """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
     `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)
     legs. The result is the minimum over the legs of the distance to the leg minus half its band."""
@@ -242,10 +239,7 @@ def beyond_bands_m(
 
 
 def within_bands(
-    points_en_m: NDArray[np.float64],
-    line_en_m: NDArray[np.float64],
-    bands_m: NDArray[np.float64],
-    margin_m: float,
+    points_en_m: Array, line_en_m: Array, bands_m: Array, margin_m: float
 ) -> NDArray[np.bool_]:
     """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
     Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs."""
@@ -273,9 +267,7 @@ def within_bands(
     return found
 
 
-def along_polyline_en_m(
-    line_en_m: NDArray[np.float64], spacing_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def along_polyline_en_m(line_en_m: Array, spacing_m: float) -> tuple[Array, Array]:
     """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees. The
     first position is the first vertex; a route of one vertex gives one position, course 0."""
     legs = np.diff(line_en_m, axis=0)

@@ -21,7 +21,7 @@ from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M, WGS84_A_M
 from orthonav.core.geo.swapped import swapped_bounds_hint, swapped_hint
 from orthonav.ground.planning.area import Area, Extent, unwrapped
-from orthonav.ground.planning.route import Height, Route, leg_lengths_m
+from orthonav.ground.planning.route import Array, Height, Route, leg_lengths_m
 
 MAX_SHEETS = 10_000  # limit of the program; 2500 km2 each, so 25 million km2
 MAX_ROUTE_SHEETS = 500  # more than once around the Earth with bands of less than 10 km
@@ -177,7 +177,7 @@ def _on_great_circle(
         yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
 
 
-def _direction(place: tuple[float, float]) -> NDArray[np.float64]:
+def _direction(place: tuple[float, float]) -> Array:
     lat, lon = (math.radians(value) for value in place)
     return np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
@@ -262,9 +262,7 @@ class WorldSheets:
         return -90 + row * 180 / self.rows, -90 + (row + 1) * 180 / self.rows
 
 
-def in_box(
-    bounds_deg: Extent, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def in_box(bounds_deg: Extent, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
     """Which places lie in a box, its southern and western border included; of any shape."""
     west, south, east, north = bounds_deg
     turned = (lon_deg - west) % 360

@@ -113,38 +113,45 @@ def _nice_below(value: float) -> float:
 
 
 def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
-    found = []
-    tile_m = gsd_m * tile_px
+    tile_m, coarser = gsd_m * tile_px, view.gsd_m / gsd_m
     share, across_px = view.tile_share(tile_m), view.across_px(gsd_m)
-    coarser = view.gsd_m / gsd_m
-    if view.short_m < LOW_VIEW_M:
-        found.append(
-            Caution(
-                "low",
-                f"a view is only {view.short_m:.0f} m across: over forest or one large field it "
-                "shows no lasting structure, and relief displacement of trees and houses is large; "
-                "fly higher",
-            )
-        )
-    if coarser > MOST_COARSER:
-        text = f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse)"
-        found.append(Caution("too_coarse", f"{text}; build coarser, or fly lower"))
-    if across_px < LEAST_VIEW_PX:
-        text = f"a view is {across_px:.0f} map pixels across: refused below {LEAST_VIEW_PX:.0f}"
-        found.append(Caution("too_small", f"{text}; build finer, or fly higher"))
-    elif across_px < GOOD_VIEW_PX * 0.999:
-        text = f"a view is {across_px:.0f} map pixels across, fewer than {GOOD_VIEW_PX:.0f}"
-        found.append(Caution("few_pixels", f"{text}; build finer, or fly higher"))
-    if share < LEAST_TILE_SHARE:
-        text = f"a view covers {share:.0%} of a tile: tile search refuses below "
-        found.append(Caution("tile_too_large", f"{text}{LEAST_TILE_SHARE:.0%}; use smaller tiles"))
-    elif share < 0.999:
-        text = f"a view covers {share:.0%} of a tile of {tile_m:.0f} m; best is a whole tile"
-        found.append(Caution("part_of_tile", text))
-    if gsd_m < FINEST_IMAGERY_M * 0.999:
-        text = f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)"
-        found.append(Caution("fine_imagery", text))
-    return found
+    across = f"a view is {across_px:.0f} map pixels across"
+    covers = f"a view covers {share:.0%} of a tile"
+    little, part = across_px < LEAST_VIEW_PX, share < LEAST_TILE_SHARE
+    cautions = {
+        "low": (
+            view.short_m < LOW_VIEW_M,
+            f"a view is only {view.short_m:.0f} m across: over forest or one large field it shows "
+            "no lasting structure, and relief displacement of trees and houses is large; fly "
+            "higher",
+        ),
+        "too_coarse": (
+            coarser > MOST_COARSER,
+            f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse); "
+            "build coarser, or fly lower",
+        ),
+        "too_small": (
+            little,
+            f"{across}: refused below {LEAST_VIEW_PX:.0f}; build finer, or fly higher",
+        ),
+        "few_pixels": (
+            not little and across_px < GOOD_VIEW_PX * 0.999,
+            f"{across}, fewer than {GOOD_VIEW_PX:.0f}; build finer, or fly higher",
+        ),
+        "tile_too_large": (
+            part,
+            f"{covers}: tile search refuses below {LEAST_TILE_SHARE:.0%}; use smaller tiles",
+        ),
+        "part_of_tile": (
+            not part and share < 0.999,
+            f"{covers} of {tile_m:.0f} m; best is a whole tile",
+        ),
+        "fine_imagery": (
+            gsd_m < FINEST_IMAGERY_M * 0.999,
+            f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)",
+        ),
+    }
+    return [Caution(code, text) for code, (applies, text) in cautions.items() if applies]
 
 
 def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:

@@ -203,7 +203,7 @@ def simulate_flight(
     mosaic = Mosaic.open(request.orthos)
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
-    agl_m = _height_m(request, mosaic)
+    agl_m = request.agl_m or 256 * mosaic.gsd_m / min(request.camera.extent)
     west, south, east, north = area.extent_en_m
     gsd_m = max(mosaic.gsd_m, request.camera.gsd_m(agl_m) * 0.75)
     raster = mosaic.sheet(
@@ -250,23 +250,17 @@ def simulate_flight(
 def _check(request: SimulateRequest) -> None:
     if (request.route is None) == (request.random is None):
         raise FlightError("give either a route or a number of random positions")
-    if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
-        raise FlightError(
-            f"number of random positions must be 1 to {MAX_VIEWS}, got {request.random}"
-        )
-    if request.seed < 0:
-        raise FlightError(f"seed must be 0 or more, got {request.seed}")
-    if not 0 <= request.turn_radius_m <= 100_000:
-        raise FlightError(f"turn radius must be 0 to 100,000 m, got {request.turn_radius_m}")
-    if not 0 <= request.cloud_share <= 1:
-        raise FlightError(
-            f"cloud_share must be 0 to 1 (a fraction of the views), got {request.cloud_share}"
-        )
-    if not 0 <= request.camera_pitch_deg <= MAX_PITCH_DEG:
-        raise FlightError(
-            f"the camera must look 0 to {MAX_PITCH_DEG:g} deg ahead of straight down, "
-            f"got {request.camera_pitch_deg}"
-        )
+    limits: dict[str, tuple[float | None, float, float]] = {
+        "number of random positions": (request.random, 1, MAX_VIEWS),
+        "height above ground": (request.agl_m, 1, 50_000),
+        "seed": (request.seed, 0, math.inf),
+        "turn radius": (request.turn_radius_m, 0, 100_000),
+        "cloud_share": (request.cloud_share, 0, 1),  # of the views
+        "camera pitch": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
+    }
+    for what, (value, least, most) in limits.items():
+        if value is not None and not least <= value <= most:
+            raise FlightError(f"{what} must be {least:,} to {most:,g}, got {value}")
     if request.cloud_share and request.camera_pitch_deg:
         raise FlightError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
@@ -279,16 +273,6 @@ def _check(request: SimulateRequest) -> None:
     given = [name for name, value in on_a_route.items() if value]
     if request.route is None and given:
         raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
-
-
-def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
-    camera = request.camera
-    if request.agl_m is None:
-        side_m = 256 * mosaic.gsd_m
-        return side_m / min(camera.extent)
-    if not 1 <= request.agl_m <= 50_000:
-        raise FlightError(f"height above ground must be 1 to 50,000 m, got {request.agl_m}")
-    return request.agl_m
 
 
 def _ground(

@@ -55,12 +55,9 @@ def _is_place(place: Any) -> bool:
 
 def to_geojson(routes: Sequence[Route]) -> str:
     features = [_feature(route) for route in routes]
-    plain = features[0] if len(features) == 1 else _collection(features)
+    collection = {"type": "FeatureCollection", "features": features}
+    plain = features[0] if len(features) == 1 else collection
     return json.dumps(plain, allow_nan=False) + "\n"
-
-
-def _collection(features: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"type": "FeatureCollection", "features": features}
 
 
 def _feature(route: Route) -> dict[str, Any]:

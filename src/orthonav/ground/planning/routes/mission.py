@@ -15,7 +15,7 @@ Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml.
 import io
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from orthonav.core.errors import RouteError
@@ -77,13 +77,6 @@ class MissionItem:
     band_m: float | None = None  # search band between items of one pattern
 
 
-@dataclass(frozen=True)
-class Home:
-    lat_deg: float
-    lon_deg: float
-    amsl_m: float | None = None
-
-
 def height_frame(frame: int) -> HeightFrame:
     if frame not in _HEIGHT_FRAMES:
         raise RouteError(
@@ -93,7 +86,7 @@ def height_frame(frame: int) -> HeightFrame:
     return _HEIGHT_FRAMES[frame]
 
 
-def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
+def route_of(items: Iterable[MissionItem], home: MissionItem | None) -> Route:
     """The route of a mission. As in autopilots, a position of 0, 0 or none means the current
     position, so a take-off without a position is at home. A return to launch ends the route at
     home. Jumps are not followed; a circle is replaced by its centre. Items with a position that are
@@ -104,13 +97,13 @@ def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
     for item in remaining:
         if item.command == RETURN_HOME:
             if home is not None:
-                stops.append(_at_home(home))
+                stops.append(replace(home, height_m=None))
             break
         if item.command in FLOWN and _has_place(item):
             height_frame(item.frame)
             stops.append(item)
         elif item.command in (TAKEOFF, VTOL_TAKEOFF) and home is not None:
-            stops.append(_at_home(home))
+            stops.append(replace(home, height_m=None))
         elif _is_lost(item):
             left_out.append(_named(item))
     left_out += [f"{_named(item)} after the return" for item in remaining if _is_lost(item)]
@@ -126,13 +119,9 @@ def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
         tuple((stop.lat_deg or 0.0, stop.lon_deg or 0.0) for stop in stops),
         heights,
         bands if any(bands) else (),
-        home_amsl_m=None if home is None else home.amsl_m,
+        home_amsl_m=None if home is None else home.height_m,
         left_out=tuple(left_out),
     )
-
-
-def _at_home(home: Home) -> MissionItem:
-    return MissionItem(WAYPOINT, 0, home.lat_deg, home.lon_deg)
 
 
 def _has_place(item: MissionItem) -> bool:
@@ -183,13 +172,14 @@ def plan_route(plain: dict[str, Any]) -> Route:
     return route_of(flown, home)
 
 
-def _plan_home(raw: Any) -> Home | None:
+def _plan_home(raw: Any) -> MissionItem | None:
     if not isinstance(raw, list) or len(raw) < 2:
         return None
     lat, lon = (number(raw[index], "plannedHomePosition") for index in (0, 1))
     if lat == 0 and lon == 0:
         return None
-    return Home(lat, lon, number_or_none(raw[2] if len(raw) > 2 else None, "height of home"))
+    height_m = number_or_none(raw[2] if len(raw) > 2 else None, "height of home")
+    return MissionItem(WAYPOINT, 0, lat, lon, height_m)
 
 
 def _plan_items(raw: Any, index: int) -> list[MissionItem]:
@@ -301,8 +291,7 @@ def read_wpl(data: bytes) -> list[Route]:
     home = None
     if version[2] == "110" and items and items[0].number == 0 and items[0].command in _HOMES:
         first, *items = items
-        if first.lat_deg or first.lon_deg:
-            home = Home(first.lat_deg or 0.0, first.lon_deg or 0.0, first.height_m)
+        home = first if _has_place(first) else None
     return [route_of(items, home)]
 
 
