@@ -147,7 +147,6 @@ def test_impossible_plans_are_refused(run, table, camera, dem, arguments, messag
 
 @pytest.mark.long
 def test_the_bands_of_a_route_are_built_and_it_is_flown(run, make_ortho, tmp_path):
-    """The tiles of the map are those that the plan counted; `simulate` reads the same file."""
     ortho = make_ortho(tmp_path / "past.tif", gsd_m=2.0)  # 800 m across
     lon, lat = Transformer.from_crs(2154, 4326, always_xy=True).transform(700_400, 6_599_600)
     frame = LocalFrame(lat, lon)

@@ -10,20 +10,17 @@ COARSE = (5.0, 64, 0.875)
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """Folder of the copies of remote files."""
     monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
 @pytest.fixture(scope="module")
 def ortho(make_ortho, tmp_path_factory):
-    """An orthophoto of 400 x 400 m at 1 m, all valid."""
     return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
 
 
 @pytest.fixture(scope="module")
 def atlas(area, made_once):
-    """An atlas of the first date with its index; read-only."""
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
     from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
     from orthonav.ground.atlas.cluster import SerialRunner

@@ -49,7 +49,6 @@ def fewer_crops(monkeypatch):
 
 @pytest.fixture(scope="module")
 def built(ortho, tmp_path_factory):
-    """An atlas of it, which nobody changes, and what building it came to."""
     place = tmp_path_factory.mktemp("built") / "atlas"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
@@ -64,7 +63,6 @@ def made(place, *orthos, **request):
 
 
 def content(place):
-    """All files of an atlas by name."""
     paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
     return {str(path.relative_to(place)): path.read_bytes() for path in paths}
 
@@ -221,7 +219,6 @@ def test_a_worker_that_sees_other_imagery_refuses(ortho, tmp_path):
 def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     ortho, tmp_path, monkeypatch, run, built
 ):
-    """Full while the map of one sheet is copied; a bug while another is built."""
     full, broken = built[1].names("built")[:2]
     copied, make = shutil.copyfile, building.build_map
 
@@ -313,22 +310,6 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
     for area in ({"bounds_deg": (south, west, north, east)}, {"route": turned, "band_m": 10.0}):
         with pytest.raises(AreaError, match="seem to be swapped"):
             planned(**area)
-
-
-def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
-    """So that neither its map nor its digest changes with imagery outside it."""
-    import rasterio
-    from rasterio.transform import Affine
-
-    near = make_ortho(tmp_path / "near.tif")
-    far = make_ortho(tmp_path / "far.tif")
-    with rasterio.open(far, "r+") as data:
-        data.transform = Affine(1, 0, 702_000, 0, -1, 6_600_000)
-    both = plan_sheets(AtlasRequest("atlas", [near, far]), RECIPE, Mosaic.open([near, far]))
-    alone = plan_sheets(AtlasRequest("atlas", [near]), RECIPE, Mosaic.open([near]))
-    by_name = {task.sheet.id: task for task in both}
-    assert [by_name[task.sheet.id] for task in alone] == alone
-    assert {task.orthos for task in both} == {(near,), (far,)}
 
 
 def test_imagery_across_the_antimeridian_has_sheets_on_both_sides(ortho):

@@ -147,7 +147,6 @@ def test_ray_is_required_only_where_it_is_used(monkeypatch):
 
 @pytest.fixture
 def two_nodes(ray):
-    """A cluster of two nodes of one core each, on this machine."""
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(
@@ -214,7 +213,6 @@ def test_a_killed_driver_resumes_when_run_again(two_nodes, ortho, tmp_path, with
 
 
 def at_work():
-    """Processes of Ray that are at an item."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:

@@ -24,7 +24,6 @@ WORLD = WorldSheets(250.0)
 
 @pytest.fixture(scope="module")
 def mosaic(make_ortho, tmp_path_factory):
-    """Imagery of 800 x 800 m."""
     rng = np.random.default_rng(3)
     grey = np.kron(rng.integers(20, 235, (80, 80)), np.ones((10, 10))).astype(np.uint8)
     return Mosaic.open([make_ortho(tmp_path_factory.mktemp("ortho") / "wide.tif", grey)])
@@ -39,13 +38,11 @@ def middle(mosaic):
 
 @pytest.fixture(scope="module")
 def box_deg(middle):
-    """A sheet in the middle of it."""
     return WORLD.bounds_deg(WORLD.name_at(*middle))
 
 
 @pytest.fixture(scope="module")
 def stored(mosaic, box_deg, tmp_path_factory):
-    """The file with its coarse tiles."""
     path = tmp_path_factory.mktemp("coarse") / "sheet.safetensors"
     assert write_coarse(mosaic, box_deg, RECIPE, path) > 20
     return path
@@ -83,7 +80,6 @@ def test_every_place_is_within_half_a_stride_of_one_centre_of_its_sheet_or_the_n
 
 
 def test_features_are_those_of_the_pixels_there(mosaic, box_deg, stored):
-    """Against one tile read and pooled on its own."""
     read = read_coarse(stored)
     index = len(read.valid) // 2
     size = RECIPE.tile_px

@@ -24,16 +24,9 @@ from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
-from orthonav.ground.atlas.cut import (
-    box_deg,
-    check_shown,
-    cut_in_memory,
-    cut_map,
-    pooled_registered,
-    pooled_tiles,
-)
+from orthonav.ground.atlas.cut import check_shown, cut_in_memory, cut_map, pooled_tiles
 from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.warp import Warp, _turn
+from orthonav.ground.atlas.warp import Warp
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -63,7 +56,6 @@ def middle(ortho):
 
 @pytest.fixture(scope="module")
 def names(middle):
-    """The sheets around that corner."""
     found = sorted(RECIPE.sheets.over(bounds_around(middle, 190)))
     assert len(found) in (4, 5)
     return found
@@ -71,7 +63,6 @@ def names(middle):
 
 @pytest.fixture(scope="module")
 def folder(ortho, names, middle, tmp_path_factory):
-    """An atlas of them, not to be changed."""
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
     atlas = Atlas.open_or_create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
@@ -112,7 +103,6 @@ def put(atlas, name, path):
 
 @pytest.fixture
 def atlas(folder, tmp_path):
-    """A copy of the atlas, to be changed."""
     return Atlas.open(str(shutil.copytree(folder, tmp_path / "atlas")))
 
 
@@ -131,7 +121,6 @@ def line(frame, *points_en_m):
 
 @pytest.fixture(scope="module")
 def cut(folder, middle, tmp_path_factory):
-    """A map across all of these sheets."""
     out = tmp_path_factory.mktemp("cut") / "cut.onav"
     cut_map(Atlas.open(str(folder)), out, area_around(middle, 150), workers=1)
     return open_map(out)
@@ -226,18 +215,6 @@ def test_views_are_placed_across_the_borders_of_sheets(cut, ortho, registration)
         place = sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
         where = sheet.grid.west_m + col, sheet.grid.north_m - row
         assert np.hypot(*(place - where)) < (2 if registration else 12)
-
-
-def test_the_manifest_names_the_sheets(cut, folder, names):
-    manifest, atlas = cut.manifest, Atlas.open(str(folder))
-    sheets = [open_map(sheet_file(atlas, name)).manifest for name in names]
-    assert set(manifest.recipe["cut_from"]) == set(names)
-    assert manifest.recipe["embed"] == sheets[0].recipe["embed"]
-    assert [source["date"] for source in manifest.imagery] == ["2019-06"]
-    assert manifest.radius_m == sheets[0].radius_m
-    assert manifest.view["position_std_m"] == max(s.view["position_std_m"] for s in sheets)
-    assert manifest.registration["radius_m"] == 35.0
-    assert not any(name.startswith("sheet0/cells") for name in cut.arrays)
 
 
 def test_imagery_of_all_sheets_is_named_once(atlas, names, middle, tmp_path):
@@ -389,27 +366,12 @@ def test_impossible_requests_are_refused(folder, middle, tmp_path):
         cut_map(atlas, own, area, workers=1)
 
 
-def test_the_box_of_an_area_goes_across_the_antimeridian():
-    area = Area.from_bounds((179.99, 10.0, -179.99, 10.02))
-    west, south, east, north = box_deg(area, 100.0)
-    assert 179.98 < west < 179.99 and -179.99 < east < -179.98
-    assert 9.99 < south < 10.0 and 10.02 < north < 10.03
-
-
 TILES = [LogisticConfidence(-6.2, (11.0, 12.0)), LogisticConfidence(-4.2, (5.6, 21.7))]
 REGISTERED = [
     RegisteredConfidence.usual(Chances(40.0, 18.0, 54.0)),
     RegisteredConfidence.usual(Chances(49.0, 17.0, 60.0)),
 ]
 SHARES = [0.3, 0.7]
-
-
-def test_one_sheet_keeps_its_confidence():
-    assert pooled_tiles(TILES[:1], [1.0], 1.0) == TILES[0]
-    assert pooled_registered(REGISTERED[:1]) == REGISTERED[0]
-    alike = pooled_tiles([TILES[0]] * 3, [0.2, 0.5, 0.3], 0.5)
-    assert alike.bias == pytest.approx(TILES[0].bias, abs=1e-9)
-    assert alike.weights == pytest.approx(TILES[0].weights)
 
 
 def test_the_confidence_of_tiles_never_exceeds_the_mean_of_the_sheets():
@@ -421,29 +383,6 @@ def test_the_confidence_of_tiles_never_exceeds_the_mean_of_the_sheets():
             if 0.55 < mean < 0.985:
                 assert pooled(evidence) <= mean + 0.02
     assert pooled({"score": 0.9, "margin": 0.3}) > 0.9
-
-
-def test_more_tiles_lower_the_odds():
-    same, more = (pooled_tiles(TILES, SHARES, times) for times in (1.0, 4.0))
-    assert same.bias - more.bias == pytest.approx(math.log(4))
-    assert pooled_tiles(TILES, SHARES, 0.25) == same
-
-
-@pytest.mark.parametrize("angle_deg", [-3.0, 0.5, 10.0])
-def test_harmonics_rotate_with_the_plane(angle_deg):
-    """Stripes, and stripes as a plane turned by an angle has them."""
-    rows, cols = np.mgrid[:96, :96] - 47.5
-    valid = np.ones(rows.shape, bool)
-
-    def means(turned_deg):
-        at = math.radians(30 + turned_deg)
-        stripes = 128 + 60 * np.sin((cols * math.cos(at) + rows * math.sin(at)) / 5)
-        maps = OrientedGradients()(np.rint(stripes).astype(np.uint8), valid)
-        return maps[:, 16:-16, 16:-16].mean(axis=(1, 2))
-
-    there = means(angle_deg)[None, None].copy()
-    _turn(there, math.radians(angle_deg))
-    assert np.abs(there[0, 0] - means(0)).max() < 0.02 * means(0)[0]
 
 
 def test_the_affine_agrees_with_the_geodesy():

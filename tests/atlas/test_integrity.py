@@ -2,9 +2,7 @@
 
 import hashlib
 import json
-import os
 import shutil
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +27,6 @@ DAYS_S = 24 * 3600
 
 
 def described(sheet, tiles=7, dates=("2020-06-14",)):
-    """The description of a sheet."""
     imagery = ({"name": "BD ORTHO", "attribution": "IGN", "licence": "Etalab-2.0"},)
     bounds = RECIPE.sheets.bounds_deg(sheet)
     return Sheet(sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"})
@@ -37,13 +34,11 @@ def described(sheet, tiles=7, dates=("2020-06-14",)):
 
 @pytest.fixture(params=["folder", "memory"])
 def place(request, tmp_path):
-    """Where an atlas may lie."""
     yield str(tmp_path / "atlas") if request.param == "folder" else "memory://test/atlas"
     fsspec.filesystem("memory").store.clear()
 
 
 def two_sheets(url, tmp_path):
-    """An atlas of two sheets whose maps are none."""
     atlas = Atlas.open_or_create(url, RECIPE)
     for sheet in (HERE, EAST):
         (tmp_path / "file").write_text(f"map of {sheet}")
@@ -53,18 +48,15 @@ def two_sheets(url, tmp_path):
 
 @pytest.fixture
 def atlas(place, tmp_path):
-    """An atlas of two sheets, near and far."""
     return two_sheets(place, tmp_path)
 
 
 @pytest.fixture
 def near(tmp_path):
-    """The same in a folder."""
     return two_sheets(tmp_path / "atlas", tmp_path)
 
 
 def found(atlas, **how):
-    """Kinds and names of what is wrong."""
     return [(problem.kind, problem.name) for problem in check_atlas(atlas, **how)]
 
 
@@ -108,14 +100,6 @@ def test_old_leftovers_are_removed(atlas):
     assert len(gone) == 4 and all(each.removed for each in gone)
     assert found(atlas) == [] and atlas.store.read("sheets/notes.onav") == b"x"
     assert len(atlas.sheets(refresh=True)) == 2
-
-
-def test_the_age_of_local_files(near):
-    orphan = Path(near.url, "sheets", f"{HERE}.0123456789ab.onav")
-    orphan.touch()
-    os.utime(orphan, (time.time() - 2 * DAYS_S,) * 2)
-    assert [each.removed for each in check_atlas(near, clean=True)] == [True]
-    assert not orphan.exists()
 
 
 def second_revision(atlas, missing=False):
@@ -215,8 +199,6 @@ def test_a_full_disk_is_reported(near, monkeypatch):
 
 @pytest.fixture
 def real(map_path, tmp_path, place):
-    """Function that puts a real map into an atlas of a recipe."""
-
     def make(recipe, tiles=None):
         atlas = Atlas.open_or_create(place, recipe)
         description = described(
@@ -260,7 +242,6 @@ def test_files_that_are_not_maps_are_found(near, tmp_path):
 
 
 def run(capfd, *arguments):
-    """A command: exit code, what it printed."""
     code = main(["atlas", *map(str, arguments), "-q"])
     return code, capfd.readouterr()
 

@@ -32,7 +32,6 @@ def places(flown):
 
 
 def found(views, places, confidence=0.95, moved_m=0.0):
-    """The first views as if they had been found, the places moved to the east."""
     seen = []
     for view, place in zip(views[:BEGUN], places, strict=False):
         lat, lon = LocalFrame(*place).latlon_from_en([moved_m, 0.0])

@@ -25,7 +25,7 @@ from orthonav.ground.atlas.index import (
     stale_sheets,
 )
 from orthonav.ground.atlas.item import canonical
-from orthonav.ground.atlas.locate import AtlasLocator, rectified
+from orthonav.ground.atlas.locate import AtlasLocator
 from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
 from orthonav.ground.atlas.store import Store
 from orthonav.onboard.run import locate_view
@@ -58,13 +58,11 @@ def first_view(flown):
 
 @pytest.fixture
 def copied(atlas, tmp_path):
-    """A copy of the atlas, to be changed."""
     return Atlas.open(shutil.copytree(atlas.url, tmp_path / "copy"))
 
 
 @pytest.mark.long
 def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, run):
-    """The whole command, once."""
     out = tmp_path / "fixes.jsonl"
     done = run("localize", "--atlas", atlas.url, flown, "--out", out, "--heading", "unknown")
     assert done.code == 0, done.err
@@ -93,19 +91,6 @@ def test_a_negative_has_no_confident_fix(locator, first_view):
     mirrored = np.ascontiguousarray(first_view.grey[:, ::-1])
     outcome = locator.locate(dataclasses.replace(first_view, grey=mirrored))
     assert not (isinstance(outcome, Fix) and outcome.confidence > 0.8)
-
-
-def test_the_index_finds_what_comparing_all_tiles_finds(atlas, search, first_view, monkeypatch):
-    coarse = rectified(first_view, search.recipe.gsd_m)
-    poses = [(turn, 0.0) for turn in np.arange(0, 2 * np.pi, 0.3)]
-    found = search.matches(coarse, poses, 10)
-    manifest = read_manifest(atlas)
-    monkeypatch.setattr(search, "_probes", manifest.recipe.lists)
-    monkeypatch.setattr(search, "_rerank", sum(shard.rows for shard in manifest.shards))
-    exact = search.matches(coarse, poses, 10)
-    assert found[0] == exact[0]
-    places = [{(each.lat_deg, each.lon_deg) for each in matches} for matches in (found, exact)]
-    assert len(places[0] & places[1]) >= 9
 
 
 def test_views_of_another_scale_are_refused_with_the_reason(locator, first_view):

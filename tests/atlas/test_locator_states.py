@@ -16,8 +16,6 @@ FOUND = FoundPlace((), 1.0, 0.95)
 
 
 class Finder:
-    """Returns the outcomes given to it, and counts restarts."""
-
     def __init__(self, *_, **__):
         self.outcomes, self.asked, self.restarts = [], 0, 0
 
@@ -30,8 +28,6 @@ class Finder:
 
 
 class Track:
-    """Follows views that are its fixes; `None` is a view that it does not recognize."""
-
     agrees = True
 
     def __init__(self, *_, **__):
@@ -63,21 +59,9 @@ def locator(monkeypatch):
 
 @pytest.fixture
 def tracking(locator):
-    """A locator that has just found a place."""
     locator._finder.outcomes = [FOUND]
     assert (locator.locate("view"), locator.state_name) == ("begun", "tracking")
     return locator
-
-
-def test_views_are_searched_until_a_place_is_found(locator):
-    assert locator.locate("view") is SEARCHING
-    assert locator.state_name == "searching"
-
-
-def test_followed_views_are_not_searched(tracking):
-    before = tracking._finder.asked
-    assert tracking.locate("fix") == "fix"
-    assert (tracking._finder.asked, tracking._finder.restarts) == (before, 1)
 
 
 def test_a_view_without_a_fix_is_searched_and_the_track_goes_on(tracking):

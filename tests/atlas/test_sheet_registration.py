@@ -2,9 +2,7 @@
 where two overlap; and only the strongest candidates are searched."""
 
 import itertools
-import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,15 +13,7 @@ from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import PRIOR_SIGMAS, Prior, View
 from orthonav.ground.atlas.locate import PlaceFinder, rectified
-from orthonav.ground.atlas.search import (
-    SEARCHED,
-    SearchRegion,
-    SheetMatch,
-    SheetRegistrar,
-    TileSearch,
-    ViewMatches,
-    ViewRegistrar,
-)
+from orthonav.ground.atlas.search import SearchRegion, SheetRegistrar, TileSearch, ViewRegistrar
 
 SIDE_M = 300.0
 
@@ -35,7 +25,6 @@ def registrar(atlas):
 
 @pytest.fixture(scope="module")
 def view(flown):
-    """The first view of the flight, and where it was taken."""
     flight = open_flight(flown)
     seen = next(iter(flight.views))
     return View(seen.grey(), flight.camera, seen.telemetry), next(
@@ -45,7 +34,6 @@ def view(flown):
 
 @pytest.fixture(scope="module")
 def candidate(atlas, view):
-    """The best candidate of that view, which is the right place."""
     finder = PlaceFinder(SheetRegistrar(atlas), TileSearch(atlas))
     found = finder._candidates(view[0], rectified(view[0], finder._search.recipe.gsd_m))
     return min(found, key=lambda each: _off_m(each, view[1]))
@@ -72,16 +60,7 @@ def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, can
     assert found.confidence == sheet.confidence
 
 
-def test_a_judged_candidate_is_finished_where_its_region_is_searched(registrar, view, candidate):
-    judged = ViewRegistrar(registrar, view[0], SIDE_M).judged(candidate)
-    assert distances_m([judged.latlon_deg], [view[1]])[0] < 20
-    finished, searched = judged.finished(), judged.searched()
-    assert distances_m([finished.latlon_deg], [searched.latlon_deg])[0] < 2
-    assert finished.evidence["strength"] == pytest.approx(searched.evidence["strength"], rel=0.05)
-
-
 def test_a_place_between_sheets_is_judged_on_one(registrar, atlas):
-    """On its own sheet; on a neighbour that reaches there where that cannot be used."""
     _, south, east, north = next(iter(atlas.sheets().values())).bounds_deg
     name = next(
         name
@@ -96,66 +75,6 @@ def test_a_place_between_sheets_is_judged_on_one(registrar, atlas):
     registrar._usable.discard(name)
     (other,) = registrar.at(region, SIDE_M)
     assert own is not other
-
-
-class Region(SimpleNamespace):
-    """A judged region whose place has a score; `finds`: that of its search."""
-
-    searched_before = 0
-
-    def finished(self):
-        return self._match(self.look)
-
-    def searched(self):
-        Region.searched_before += 1
-        return self._match(self.finds)
-
-    def _match(self, strength):
-        evidence = {
-            **dict.fromkeys(("rival", "look_rival"), 0.0),
-            **dict.fromkeys(("fine", "fine_rival", "detail_ratio"), math.nan),
-            **dict.fromkeys(("local_phase", "local_gradients"), 20.0),
-            **{"strength": strength, "look": strength},
-        }
-        return SheetMatch(*self.latlon_deg, 0.0, 0.0, evidence, None)
-
-
-def _regions(*scores, finds=None):
-    """Regions a tenth of a degree apart."""
-    Region.searched_before = 0
-    found = finds or scores
-    return [
-        Region(latlon_deg=(50 + at / 10, 8.0), look=score, finds=more, region=at)
-        for at, (score, more) in enumerate(zip(scores, found, strict=True))
-    ]
-
-
-def _added(regions):
-    found = ViewMatches(SIDE_M)
-    found.add_candidates(SimpleNamespace(judged=lambda each: each), regions)
-    return found
-
-
-def test_candidates_are_searched_until_one_is_proven():
-    clear = _added(_regions(10.0, 90.0, 11.0, 12.0, 10.0, 9.0))
-    assert Region.searched_before == 1
-    assert clear.found[0].lat_deg == 50.1
-    _added(_regions(*[15.0] * 8))
-    assert Region.searched_before == SEARCHED
-
-
-def test_candidates_that_are_not_finished_are_rivals():
-    alone = _added(_regions(30.0, 8.0, 7.0, 6.0))
-    rivals = _added(_regions(30.0, 14.9, 14.8, 14.7, 14.6))
-    assert len(rivals.found) == 4
-    assert rivals.log_odds(0) < alone.log_odds(0)
-    # No rival of the place that it belongs to.
-    rivals._judged = [SimpleNamespace(latlon_deg=(50.0, 8.001), look=29.0)]
-    before = rivals.log_odds(0)
-    rivals._judged = []
-    assert rivals.log_odds(0) == before
-    rivals._judged = [SimpleNamespace(latlon_deg=(51.0, 8.0), look=29.0)]
-    assert rivals.log_odds(0) < before
 
 
 def test_all_views_of_a_flight_are_found(atlas, registrar, flown):

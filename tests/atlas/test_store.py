@@ -58,7 +58,6 @@ class Trouble(LocalFileSystem):
 
 @pytest.fixture(autouse=True)
 def trouble(monkeypatch):
-    """The far file system `trouble://`; give it errors to raise."""
     monkeypatch.setattr(Trouble, "fails", {})
     fsspec.register_implementation("trouble", Trouble, clobber=True)
     return Trouble.fails
@@ -66,14 +65,12 @@ def trouble(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def no_memory_left():
-    """What a test leaves in `memory://` is gone after it."""
     yield
     fsspec.filesystem("memory").store.clear()
 
 
 @pytest.fixture(params=["folder", "memory", "trouble"])
 def store(request, tmp_path):
-    """An empty place, near and far, with a cache of its own."""
     root = tmp_path / "atlas"
     url = {"folder": str(root), "memory": "memory://test/atlas", "trouble": f"trouble://{root}"}
     return Store(url[request.param])
@@ -263,7 +260,6 @@ def test_a_store_can_be_pickled(store):
 
 @pytest.fixture
 def far(tmp_path):
-    """A far place with a file in it, and its cache."""
     store = Store("memory://test/atlas")
     store.write("sheets/a.onav", b"map of a")
     return store

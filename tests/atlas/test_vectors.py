@@ -1,7 +1,6 @@
 """The index of vectors: against exact search, its files, its shards, what is refused."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from orthonav.core.errors import AtlasError
 from orthonav.ground.atlas.vectors import (
     QUANTIZERS_NAME,
     Part,
-    Quantizers,
     ShardedIndex,
     ShardInfo,
     VectorRecipe,
@@ -22,14 +20,14 @@ DIMS, COUNT = 16, 6000
 RECIPE = VectorRecipe(DIMS, list_bits=6, quantizers=8)
 
 
-def made(count: int, seed: int = 0) -> np.ndarray:
+def made(count, seed=0):
     rng = np.random.default_rng(seed)
     vectors = rng.standard_normal((count, DIMS), dtype=np.float32)
     vectors *= np.arange(1, DIMS + 1, dtype=np.float32) ** -0.3
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def seen(vectors: np.ndarray, count: int = 60) -> np.ndarray:
+def seen(vectors, count=60):
     rng = np.random.default_rng(9)
     queries = vectors[rng.integers(0, len(vectors), count)]
     queries = queries + 0.1 * rng.standard_normal(queries.shape).astype(np.float32)
@@ -42,7 +40,7 @@ def vectors() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def quantizers(vectors: np.ndarray) -> Quantizers:
+def quantizers(vectors):
     return train(vectors, RECIPE)
 
 
@@ -53,32 +51,31 @@ SHARDS = (
 
 
 @pytest.fixture
-def folder(tmp_path: Path, vectors: np.ndarray, quantizers: Quantizers) -> Path:
+def folder(tmp_path, vectors, quantizers):
     quantizers.save(tmp_path / QUANTIZERS_NAME)
     write(tmp_path, "a", quantizers, vectors[:4000])
     write(tmp_path, "b", quantizers, vectors[4000:])
     return tmp_path
 
 
-def write(folder: Path, name: str, quantizers: Quantizers, vectors: np.ndarray) -> None:
+def write(folder, name, quantizers, vectors):
     where = places(len(vectors))
     parts = [slice(start, start + 1500) for start in range(0, len(vectors), 1500)]
     rows = write_shard(folder, name, quantizers, ((where[part], vectors[part]) for part in parts))
     assert rows == len(vectors)
 
 
-def places(count: int) -> np.ndarray:
+def places(count):
     return np.stack([np.arange(count) / 100, -np.arange(count) / 100], axis=1)
 
 
-def exact(vectors: np.ndarray, queries: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Highest products and rows by comparing all stored vectors."""
+def exact(vectors, queries, k):
     products = queries @ vectors.astype(np.float16).astype(np.float32).T
     order = np.argsort(-products, axis=1, kind="stable")[:, :k]
     return np.take_along_axis(products, order, 1), order
 
 
-def test_search_finds_what_exact_search_finds(folder: Path, vectors: np.ndarray) -> None:
+def test_search_finds_what_exact_search_finds(folder, vectors):
     index, queries = ShardedIndex(folder.joinpath, SHARDS), seen(vectors)
     exact_scores, expected = exact(vectors, queries, 10)
     scores, ids = index.search(queries, 10, probes=64, rerank=400)
@@ -89,7 +86,7 @@ def test_search_finds_what_exact_search_finds(folder: Path, vectors: np.ndarray)
     assert np.mean([np.isin(a, b).mean() for a, b in zip(few, expected, strict=True)]) > 0.6
 
 
-def test_one_query_finds_the_same_as_many(folder: Path, vectors: np.ndarray) -> None:
+def test_one_query_finds_the_same_as_many(folder, vectors):
     index, queries = ShardedIndex(folder.joinpath, SHARDS), seen(vectors)
     scores, ids = index.search(queries, 5, probes=20, rerank=200)
     for query in range(10):
@@ -98,7 +95,7 @@ def test_one_query_finds_the_same_as_many(folder: Path, vectors: np.ndarray) -> 
         np.testing.assert_allclose(alone_scores[0], scores[query], atol=1e-6)
 
 
-def test_same_input_same_bytes(tmp_path: Path, vectors: np.ndarray) -> None:
+def test_same_input_same_bytes(tmp_path, vectors):
     for name in ("one", "other"):
         again = train(vectors, RECIPE)
         write(tmp_path / name, "a", again, vectors[:4000])
@@ -109,7 +106,7 @@ def test_same_input_same_bytes(tmp_path: Path, vectors: np.ndarray) -> None:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
 
-def test_retired_rows_are_not_found(folder: Path, vectors: np.ndarray) -> None:
+def test_retired_rows_are_not_found(folder, vectors):
     retired = (
         replace(SHARDS[0], parts=(replace(SHARDS[0].parts[0], retired=True), SHARDS[0].parts[1])),
         SHARDS[1],
@@ -123,7 +120,7 @@ def test_retired_rows_are_not_found(folder: Path, vectors: np.ndarray) -> None:
     np.testing.assert_array_equal(ids[unaffected], before[unaffected])
 
 
-def test_ids_lead_to_vectors_and_places(folder: Path, vectors: np.ndarray) -> None:
+def test_ids_lead_to_vectors_and_places(folder, vectors):
     index = ShardedIndex(folder.joinpath, SHARDS)
     assert len(index) == 6000
     np.testing.assert_allclose(index.vectors(np.array([4001, 7])), vectors[[4001, 7]], atol=1e-3)
@@ -132,9 +129,7 @@ def test_ids_lead_to_vectors_and_places(folder: Path, vectors: np.ndarray) -> No
     assert index.place_deg(6000) is None
 
 
-def test_fewer_vectors_than_requested(
-    tmp_path: Path, vectors: np.ndarray, quantizers: Quantizers
-) -> None:
+def test_fewer_vectors_than_requested(tmp_path, vectors, quantizers):
     write(tmp_path, "few", quantizers, vectors[:3])
     write(tmp_path, "none", quantizers, vectors[:0])
     quantizers.save(tmp_path / QUANTIZERS_NAME)
@@ -147,28 +142,24 @@ def test_fewer_vectors_than_requested(
 @pytest.mark.parametrize(
     "name", ["a.codes", "a.lists.npy", "a.vectors.npy", "a.places.npy", QUANTIZERS_NAME]
 )
-def test_truncated_files_are_refused(folder: Path, name: str) -> None:
+def test_truncated_and_missing_files_are_refused(folder, name):
     contents = (folder / name).read_bytes()
     (folder / name).write_bytes(contents[: len(contents) // 2])
     with pytest.raises(AtlasError):
         ShardedIndex(folder.joinpath, SHARDS)
-
-
-@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.places.npy", QUANTIZERS_NAME])
-def test_missing_files_are_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
-    with pytest.raises(AtlasError, match="cannot be read"):
+    with pytest.raises(AtlasError):
         ShardedIndex(folder.joinpath, SHARDS)
 
 
-def test_damaged_codes_are_refused(folder: Path, vectors: np.ndarray) -> None:
+def test_damaged_codes_are_refused(folder, vectors):
     size = (folder / "a.codes").stat().st_size
     (folder / "a.codes").write_bytes(b"\x7f" * size)
     with pytest.raises(AtlasError, match="damaged"):
         ShardedIndex(folder.joinpath, SHARDS).search(vectors[:1], 5, 64, 100)
 
 
-def test_a_shard_of_another_size_is_refused(folder: Path) -> None:
+def test_a_shard_of_another_size_is_refused(folder):
     other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
     with pytest.raises(AtlasError, match="expected 1500 vectors"):
         ShardedIndex(folder.joinpath, other)

@@ -101,7 +101,6 @@ WAYPOINT = """<Placemark><Point><coordinates>{lon},{lat},0</coordinates></Point>
 
 
 def wayline(mode="relativeToStartPoint", ident=0, order=(0, 1, 2)):
-    """A wayline through `PLACES`, written in this order."""
     marks = "".join(
         WAYPOINT.format(lat=PLACES[i][0], lon=PLACES[i][1], index=i, height=50 + i) for i in order
     )

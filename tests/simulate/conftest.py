@@ -5,5 +5,4 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def coarse_coverage(monkeypatch):
-    """Coverage of few pixels."""
     monkeypatch.setattr("orthonav.ground.simulate.ground.COVERAGE_PX", 256)

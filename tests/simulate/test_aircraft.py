@@ -22,7 +22,6 @@ ALL = Errors(5.0, 0.05, 1.0, 2.0, 40.0)
 
 @pytest.fixture(scope="module")
 def ortho(make_ortho, tmp_path_factory):
-    """800 x 700 m of blots."""
     return make_ortho(tmp_path_factory.mktemp("blots") / "blots.tif", textured((700, 800)))
 
 
@@ -129,21 +128,6 @@ def test_beyond_the_imagery_the_ground_is_mirrored(fly, frame):
     inside, _ = fly("inside", corners=[[0.0, 0.0], [280.0, 16.0]], camera=SEEN, spacing_m=90.0)
     for a, b in zip(views, pictures(inside), strict=False):
         assert np.abs(a.astype(int) - b).mean() < 0.5
-
-
-def test_the_mirror_is_the_border(fly):
-    """Flown out along a row, what is seen comes back the other way round."""
-    edge = 400.0
-    lines = [[edge - 150, 0.0], [edge - 150, 1.0]], [[edge + 146, 0.0], [edge + 146, 1.0]]
-    (inside, _), (outside, _) = (
-        fly(f"f{n}", corners=line, beyond=True, camera=SEEN) for n, line in enumerate(lines)
-    )
-    a, b = read_image(inside.views[0].path), read_image(outside.views[0].path)[:, ::-1]
-    alike = max(
-        np.corrcoef(a[:, 12:-12].ravel(), np.roll(b, shift, axis=1)[:, 12:-12].ravel())[0, 1]
-        for shift in range(-12, 13)
-    )
-    assert alike > 0.9
 
 
 REFUSED = {

@@ -30,7 +30,6 @@ SIZE_PX = 96
 
 
 def plane_of(ortho):
-    """The plane that simulated flights over an orthophoto use."""
     outline = Mosaic.open([ortho]).outline_latlon_deg
     return Area.from_outline(outline[:, 0], outline[:, 1])
 
@@ -59,12 +58,10 @@ def route_of(frame, *points_en_m):
 
 @pytest.fixture(scope="module")
 def exact(area, tmp_path_factory):
-    """A long flight without errors, and its true places."""
     return unseen(area, tmp_path_factory.mktemp("exact") / "f", random=180, seed=9)
 
 
 def ground_at(area, frame, place_en_m, gsd_m=1.0):
-    """The orthophoto (S, S) around a place."""
     half = SIZE_PX * gsd_m / 2
     with Mosaic.open([area.past]).sheet(
         frame,
@@ -108,7 +105,6 @@ def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera
 
 
 def test_errors_have_the_stated_size(area, plane, exact, tmp_path):
-    """The same seed without errors is the same flight with exact telemetry."""
     errors = Errors(yaw_std_deg=4.0, agl_std=0.05, tilt_std_deg=1.5, prior_std_m=30.0)
     exact, truth = exact
     erring, same = unseen(area, tmp_path / "f", random=len(truth), errors=errors, seed=9)

@@ -79,17 +79,3 @@ def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
     assert (np.abs(pictures["dem"] - pictures["dsm"]) > 15).mean() > 0.005
     with pytest.raises(FlightError, match="camera pitch must be 0 to 65"):
         simulate_flight(SimulateRequest([ortho], tmp_path / "no", camera_pitch_deg=70.0, **request))
-
-
-def test_objects_of_the_landscape_stand_where_they_are_drawn(tmp_path):
-    size = {"size_m": (260.0, 260.0), "dates": (AUTUMN,), "seed": 1}
-    dem, dsm = generate_heights(tmp_path, slope=0.0, **size)
-    assert (dem.name, dsm.name) == ("dem.tif", "2021-10_dsm.tif")
-    import rasterio
-
-    with rasterio.open(dem) as ground, rasterio.open(dsm) as surface:
-        bare, over = ground.read(1), surface.read(1)
-    assert np.ptp(bare) == 0
-    objects = over - bare[0, 0]
-    assert 0.02 < (objects > 2).mean() < 0.9 and 5 < objects.max() <= 26
-    assert (objects >= 0).all()

@@ -18,7 +18,6 @@ def solved(text, seed=0):
 
 
 def off(text):
-    """What a fault changes, by the same draws."""
     return solved(text).en_m - solved("good").en_m
 
 
