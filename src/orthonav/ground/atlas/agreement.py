@@ -3,8 +3,7 @@
 A chain is a sequence of places, one per view, that an aircraft can have flown through. A view found
 where a chain expects it supports the chain by its odds against the best other place in the whole
 atlas, and by how unlikely it is that a wrong place lies there by chance. A view counts by the share
-of it that is new ground, because views of the same ground are not independent.
-"""
+of it that is new ground, because views of the same ground are not independent."""
 
 import math
 from collections.abc import Sequence

@@ -2,8 +2,7 @@
 
 A sheet is finished when its item is written, so an interrupted build keeps its finished sheets and
 the same command resumes it. The same imagery, recipe and versions give the same atlas byte for
-byte, with any number of workers, on processors that round alike.
-"""
+byte, with any number of workers, on processors that round alike."""
 
 import contextlib
 import fcntl

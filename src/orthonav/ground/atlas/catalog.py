@@ -2,8 +2,7 @@
 
 A sheet exists if and only if its item does, and the item is written last. Files are named by their
 content and never change. After a kill at any moment the finished sheets are intact; files without
-an item may remain, which `orthonav.ground.atlas.integrity` finds.
-"""
+an item may remain, which `orthonav.ground.atlas.integrity` finds."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields

@@ -1,8 +1,7 @@
 """Runners of tasks: in this process, or by Ray on all cores of one or many machines.
 
 A runner takes a function and items and yields the result of each item when it is finished. An item
-that fails gives a `Failure`, and the others continue.
-"""
+that fails gives a `Failure`, and the others continue."""
 
 import itertools
 import logging

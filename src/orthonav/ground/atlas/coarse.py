@@ -2,8 +2,7 @@
 
 They are wide tiles at low resolution, stored as features before any learning, because whitening is
 learnt for the whole atlas. A tile belongs to the sheet whose box holds its centre, and may reach
-half a tile beyond the box. So every place of the atlas is within half a stride of a tile centre.
-"""
+half a tile beyond the box. So every place of the atlas is within half a stride of a tile centre."""
 
 import json
 from dataclasses import asdict, dataclass

@@ -3,8 +3,7 @@
 Whitening and quantizers are learnt once, from tiles evenly spaced over all sheets, and shared by
 all shards. New sheets become a new shard and the rows of changed or removed sheets are retired;
 after many changes the whole index is rebuilt. The manifest is written last: an atlas without it has
-no index. It may come from an untrusted source, so every value is checked when it is read.
-"""
+no index. It may come from an untrusted source, so every value is checked when it is read."""
 
 import hashlib
 import re

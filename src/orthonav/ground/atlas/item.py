@@ -4,8 +4,7 @@ Items are canonical JSON: the same sheet gives the same bytes. An item is accept
 the sheet read from it gives the same bytes again, so that an untrusted item can hold nothing that
 this program would not write. PySTAC is not used for it: it rewrites items to its own STAC version,
 checks no values, and takes three times as long (184 instead of 64 us per item, of which a country
-has 140,000). Tests validate items and catalogue with it.
-"""
+has 140,000). Tests validate items and catalogue with it."""
 
 import hashlib
 import json

@@ -5,8 +5,7 @@ a sheet around a place, so that evidence is made of that part only: a whole shee
 make ready than a view to register on it. `ViewMatches` weighs the matches: searching a region takes
 ten times as long as judging the place near its middle, so all candidates are judged, those with
 hope are finished, and of these the strongest are searched until one is proven. The others count as
-rivals by what is known of them, as the candidates of one search do within a sheet.
-"""
+rivals by what is known of them, as the candidates of one search do within a sheet."""
 
 import functools
 import logging

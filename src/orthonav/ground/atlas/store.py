@@ -5,8 +5,7 @@ object stores show a file when it is complete, elsewhere (SFTP) it is moved to i
 outside the atlas is ever named, because the catalogue may come from an untrusted source. Remote
 files are copied to a cache and verified; that of fsspec neither verifies nor limits its size. Nor
 does a folder go through fsspec: its local file system neither syncs files to disk before it renames
-them nor refuses links that lead outside.
-"""
+them nor refuses links that lead outside."""
 
 import contextlib
 import errno

@@ -9,8 +9,7 @@ A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `N
 codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
 list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. FAISS maps
 neither lists of 4-bit codes nor checks the files that it reads, so this format is our own: every
-length is checked before FAISS is given the map.
-"""
+length is checked before FAISS is given the map."""
 
 import json
 import os

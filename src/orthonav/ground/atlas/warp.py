@@ -2,8 +2,7 @@
 
 Within a block of a kilometre two planes differ by a shift, a rotation of less than a degree and
 millimetres, so each sheet is resampled by one affine per block. A place is taken from the sheet
-whose box holds it; where that sheet shows nothing, from neighbours that reach over their border.
-"""
+whose box holds it; where that sheet shows nothing, from neighbours that reach over their border."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -5,8 +5,7 @@ The file name suffix selects the format (`orthonav.ground.planning.routes`). Pre
 trajectories A to D of the paper, Di Piazza et al. (IGARSS 2024), Table 1, at any position. The
 paper states altitude, length, search band and overlap; it does not state the ground resolution:
 0.2 m is assumed for A, 1 m for B and D, 2 m for C, so that a tile of 256 px has about the size of a
-view from 40, 2000 and 4000 m. The paper does not draw the trajectories; they are straight here.
-"""
+view from 40, 2000 and 4000 m. The paper does not draw the trajectories; they are straight here."""
 
 import csv
 import logging
@@ -99,7 +98,10 @@ MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 ti
 MAX_LISTED = 20
 _PAIRS_AT_ONCE = 2**18
 _FEW_POINTS = 64
-_BROKEN = (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error)
+_BROKEN = (
+    *(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError),
+    csv.Error,
+)
 
 log = logging.getLogger(__name__)
 

@@ -5,8 +5,7 @@ reach half a tile beyond the area, so a view near the border lies completely on 
 
 The sheets of the Earth (`WorldSheets`) have names. Rows have equal height in latitude; each row is
 divided into the number of equal boxes its longest parallel requires. Rows are counted from the
-South Pole, columns from 180 deg west.
-"""
+South Pole, columns from 180 deg west."""
 
 import itertools
 import math

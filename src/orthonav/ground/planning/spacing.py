@@ -2,8 +2,7 @@
 map of an area will take.
 
 The limits are those of the localizer (`orthonav.core.localize`) and of registration
-(docs/decisions/registration.md).
-"""
+(docs/decisions/registration.md)."""
 
 import math
 from dataclasses import dataclass

@@ -1,8 +1,7 @@
 """Simulated flights over an orthophoto: images, telemetry with errors, and the true positions.
 
 Positions are arbitrary, never on a tile grid. Images are rendered with the true attitude and
-height; the telemetry differs from these by the requested errors.
-"""
+height; the telemetry differs from these by the requested errors."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

@@ -2,8 +2,7 @@
 
 Heights may be those of bare ground or of a surface model, whose houses and trees then stand up.
 Shares no code with the localizer, which it tests: rays by OpenCV and scipy, the ground by marching
-along them.
-"""
+along them."""
 
 from dataclasses import dataclass
 from typing import Any

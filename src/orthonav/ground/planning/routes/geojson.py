@@ -2,8 +2,7 @@
 
 Properties of a feature: `name`; `band_m`, a number or a list with one per leg (null: the default);
 `height_frame`, above what the third coordinate is ("agl", "home", "amsl", "hae"; the RFC's
-ellipsoid is hardly ever meant, so without it that is taken as not said); `home_amsl_m`.
-"""
+ellipsoid is hardly ever meant, so without it that is taken as not said); `home_amsl_m`."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -83,8 +82,6 @@ def _feature(route: Route) -> dict[str, Any]:
 
 
 def _route(coordinates: Any, properties: dict[str, Any]) -> Route:
-    if not isinstance(coordinates, list):
-        raise RouteError(f"GeoJSON position must be in a list as numbers, got {coordinates!r:.80}")
     require_few_waypoints(len(coordinates))
     points = [_position(point) for point in coordinates]
     frames = properties.get("height_frame")
@@ -115,12 +112,8 @@ def _bands_m(band: Any, legs: int) -> tuple[float | None, ...]:
 
 
 def _position(point: Any) -> tuple[float, float, float | None]:
-    numbers = isinstance(point, list) and all(type(value) in (int, float) for value in point[:3])
-    if not numbers or len(point) < 2:
-        raise RouteError(
-            f"GeoJSON position must be [longitude, latitude] as numbers, got {point!r:.80}"
-        )
-    return float(point[1]), float(point[0]), float(point[2]) if len(point) > 2 else None
+    lon, lat, *rest = (number(value, "GeoJSON position") for value in point[:3])
+    return lat, lon, rest[0] if rest else None
 
 
 def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:

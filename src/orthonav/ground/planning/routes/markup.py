@@ -4,8 +4,7 @@ https://developer.dji.com/doc/cloud-api-tutorial/en/api-reference/dji-wpml/wayli
 
 Files are of unknown origin: no DTD is read, hence no entities and no external files. defusedxml and
 gpxpy are not used: neither limits the number and depth of elements, and 20 MB of empty elements
-would take gigabytes.
-"""
+would take gigabytes."""
 
 import re
 import struct
@@ -123,18 +122,11 @@ def _called(kind: str, element: Element, tag: str = "name") -> str:
 def _gpx_route(element: Element, points: str) -> Route:
     waypoints, heights = [], []
     for point in element.iterfind(points):
-        lat, lon = (_degrees(point, name) for name in ("lat", "lon"))
+        lat, lon = (parsed(point.get(name) or "", f"GPX {name}") for name in ("lat", "lon"))
         waypoints.append((lat, lon))
         height = text_of(point, "ele")
         heights.append(None if height is None else Height(parsed(height, "GPX ele"), "amsl"))
     return Route(tuple(waypoints), tuple(heights), name=text_of(element, "name"))
-
-
-def _degrees(point: Element, name: str) -> float:
-    value = point.get(name)
-    if value is None:
-        raise RouteError(f"GPX point has no {name}")
-    return parsed(value, f"GPX {name}")
 
 
 def read_kmz(data: bytes) -> list[Route]:
@@ -148,11 +140,10 @@ def read_kmz(data: bytes) -> list[Route]:
                 raise RouteError(f"KMZ must hold one KML file, got {len(chosen)}")
             with archive.open(chosen[0]) as member:
                 text = member.read(MAX_KML_BYTES + 1)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
-        raise RouteError(f"KMZ is not a complete zip archive ({error})") from error
-    except (NotImplementedError, RuntimeError, ValueError) as error:  # encrypted, odd compression
-        if isinstance(error, RouteError):
-            raise
+    except (
+        *(zipfile.BadZipFile, zlib.error, EOFError, OSError),
+        *(NotImplementedError, RuntimeError),  # encrypted, odd compression
+    ) as error:
         raise RouteError(f"KMZ cannot be unpacked ({error})") from error
     if len(text) > MAX_KML_BYTES:
         raise RouteError(f"KML in the KMZ is larger than {MAX_KML_BYTES // 10**6} MB")
@@ -267,8 +258,6 @@ def _waylines(folder: Element) -> Iterator[Route]:
 
 def _wpml_latlon(mark: Element) -> tuple[float, float]:
     values = (mark.findtext("Point/coordinates") or "").strip().split(",")
-    if not 2 <= len(values) <= 3:
-        raise RouteError(f"WPML position must be longitude,latitude, got {values!r:.60}")
     lon, lat = (parsed(value, "WPML position") for value in values[:2])
     return lat, lon
 

@@ -9,8 +9,7 @@ parameters, latitude, longitude, altitude, autocontinue (mavlink.io, "Mission Pl
 Format"). In version 110 the first item, with number 0, is the planned home position, in the older
 120 of QGroundControl there is none (QGroundControl, `MissionController::_loadTextMissionFile`).
 
-Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml.
-"""
+Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml."""
 
 import io
 import itertools
@@ -163,13 +162,10 @@ def is_plan(plain: dict[str, Any]) -> bool:
 def plan_route(plain: dict[str, Any]) -> Route:
     if not is_plan(plain):
         raise RouteError(f"plan must have fileType 'Plan', got {plain.get('fileType')!r:.40}")
-    mission = plain.get("mission")
-    items = mission.get("items") if isinstance(mission, dict) else None
-    if not isinstance(mission, dict) or not isinstance(items, list):
-        raise RouteError("plan must hold a mission with a list of items")
+    mission = plain["mission"]
     home = _plan_home(mission.get("plannedHomePosition"))
-    flown = [item for index, raw in enumerate(items) for item in _plan_items(raw, index)]
-    return route_of(flown, home)
+    items = enumerate(mission["items"])
+    return route_of([item for index, raw in items for item in _plan_items(raw, index)], home)
 
 
 def _plan_home(raw: Any) -> MissionItem | None:
@@ -182,32 +178,24 @@ def _plan_home(raw: Any) -> MissionItem | None:
     return MissionItem(WAYPOINT, 0, lat, lon, height_m)
 
 
-def _plan_items(raw: Any, index: int) -> list[MissionItem]:
-    where = f"item {index + 1} of the plan"
-    if not isinstance(raw, dict):
-        raise RouteError(f"{where} must be an object, got {raw!r:.60}")
-    kind = raw.get("type")
-    if kind == "SimpleItem":
+def _plan_items(raw: dict[str, Any], index: int) -> list[MissionItem]:
+    where, name = f"item {index + 1} of the plan", raw.get("complexItemType")
+    if raw["type"] == "SimpleItem":
         return [_simple(raw, index + 1, where)]
-    if kind != "ComplexItem":
-        raise RouteError(f"{where} must be a SimpleItem or a ComplexItem, got {kind!r:.40}")
-    name = raw.get("complexItemType")
     if name in _TRANSECTS:
         return _transects(raw, index, f"{where} ({name})")
     if name in _LANDINGS:
         return _landing(raw, f"{where} ({name})")
     raise RouteError(
-        f"{where} is a {name!r:.40}: only surveys, corridor scans and landing patterns are read "
-        "besides waypoints, because in others the camera does not look down; remove it from the "
-        "plan"
+        f"{where} is a {name or raw['type']!r:.40}: only surveys, corridor scans and landing "
+        "patterns are read besides waypoints, because in others the camera does not look down; "
+        "remove it from the plan"
     )
 
 
 def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
-    params = raw.get("params")
-    place = params[4:7] if isinstance(params, list) and len(params) >= 7 else raw.get("coordinate")
-    if not isinstance(place, list) or len(place) < 3:
-        raise RouteError(f"{where} must have 7 params, got {params!r:.80}")
+    params = raw.get("params") or ()
+    place = params[4:7] if len(params) >= 7 else raw["coordinate"]
     command, frame = (int(number(raw.get(key), f"{where}: {key}")) for key in ("command", "frame"))
     lat, lon, height = (number_or_none(value, f"{where}: params") for value in place[:3])
     if raw.get("AltitudeMode") == _ABOVE_TERRAIN_MODE:
@@ -217,15 +205,14 @@ def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
 
 def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]:
     """Flight lines of a survey or corridor scan; the corridor width is the band of its legs."""
-    inner = raw.get("TransectStyleComplexItem")
-    points = inner.get("VisualTransectPoints") if isinstance(inner, dict) else None
-    if not isinstance(inner, dict) or not isinstance(points, list) or not points:
+    inner = raw.get("TransectStyleComplexItem") or {}
+    points = inner.get("VisualTransectPoints")
+    if not points:
         raise RouteError(
             f"{where} has no VisualTransectPoints; open the plan with a later QGroundControl, let "
             "it draw the flight lines, and save it"
         )
-    camera = inner.get("CameraCalc")
-    frame, height_m = _survey_height(camera if isinstance(camera, dict) else {}, inner, where)
+    frame, height_m = _survey_height(inner.get("CameraCalc") or {}, inner, where)
     width_m = number_or_none(raw.get("CorridorWidth"), f"{where}: CorridorWidth") or None
     items = []
     for point in points:
@@ -262,8 +249,6 @@ def _landing(raw: dict[str, Any], where: str) -> list[MissionItem]:
 
 
 def _latlon(point: Any, what: str) -> tuple[float, float]:
-    if not isinstance(point, list) or len(point) < 2:
-        raise RouteError(f"{what} must be [latitude, longitude], got {point!r:.60}")
     return number(point[0], what), number(point[1], what)
 
 
