@@ -158,8 +158,7 @@ def with_paths(record: object, *names: str) -> None:
 
 
 def require_file(path: Path, what: str) -> Path:
-    """`path` if it is a file and no pointer of Git LFS, else raises `MissingFileError` naming
-    `what`."""
+    """`path` if it is a file and no pointer of Git LFS, else `MissingFileError` naming `what`."""
     path = Path(path)
     if not path.is_file():
         kind = "is a folder, not a file" if path.is_dir() else "does not exist"

@@ -21,9 +21,7 @@ PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outs
 DEFAULT_YAW_STD_DEG = 7.0
 """Magnetic compasses of the recorded flights are off by several degrees (docs/tracking.md)."""
 MIN_YAW_STD_DEG = 2.0  # the least that searches allow for
-TILE_YAW_STD_DEG = 5.0
-"""Where views are localized by tiles alone: three headings 6 deg apart
-(docs/decisions/embedding.md)."""
+TILE_YAW_STD_DEG = 5.0  # of tiles alone: three headings 6 deg apart (docs/decisions/embedding.md)
 DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = 3.0
 """Mounts lean by 1 to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""

@@ -227,8 +227,7 @@ def axis_on_ground_en_m(
 
 
 def distort(camera: Camera, xy: Array) -> Array:
-    """Distorted camera-plane coordinates `(..., 2)`; NaN beyond the radius where the model folds
-    back."""
+    """Distorted camera-plane coordinates `(..., 2)`; NaN where the model folds back."""
     if camera.is_pinhole:
         return xy
     if camera.model == "fisheye":
@@ -282,8 +281,7 @@ def ground_en_m(
 
 
 def camera_rays(camera: Camera, px: Array) -> Array:
-    """Rays (N, 3), 1 along the optical axis, through image points (N, 2); NaN beyond the lens
-    model."""
+    """Rays (N, 3), 1 along the optical axis, of image points (N, 2); NaN beyond the lens model."""
     plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
     return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
 

@@ -41,8 +41,7 @@ def ground_over(terrain: TerrainHeights, lat_deg: Array, lon_deg: Array) -> Grou
 def ground_around(
     terrain: TerrainHeights, place_deg: tuple[float, float], std_m: float
 ) -> Ground | None:
-    """Over a disc around `place_deg` (latitude, longitude) with `std_m` per axis; None where
-    unknown."""
+    """Over a disc around `place_deg` (latitude, longitude); None where unknown."""
     if std_m <= 0:
         return ground_over(terrain, np.array([place_deg[0]]), np.array([place_deg[1]]))
     lat, lon = LocalFrame(*place_deg).latlon_from_en(2 * std_m * _DISC)

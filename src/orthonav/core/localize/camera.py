@@ -28,8 +28,7 @@ BLURS_PX = (2.0, 1.0, 0.0, 0.0)
 """Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
 SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
 SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
-"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC, Fischler 1981).
-"""
+"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC)."""
 FINAL_STEPS = 2  # after the blocks' information was compared with the scatter of their slopes
 LONGEST_STEP_PX = 3.0  # of any block, per step
 PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
@@ -97,8 +96,7 @@ def resected(
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Of all levels: correlations (L * N, S, S), pixels (L * N,), moves (L * N, 2, 6);
-    `CORRELATED`."""
+    """Of all levels: correlations (L * N, S, S), pixels (L * N,), moves (L * N, 2, 6)."""
 
     levels: int
     correlated: float
@@ -285,8 +283,7 @@ def moved_by_camera(
 
 
 FIRST_REACH_PX, REACH_PX = 7, 4
-"""Reach of blocks, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide.
-"""
+"""Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
 FITS = 3  # at most,
 SMALL_SHARE = 0.2  # until a correction is below this share of its standard deviations
 
@@ -311,8 +308,7 @@ class CameraFound:
 
 
 def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> CameraFound | None:
-    """Of a view whose window lies at `pose`; None where the tilt is exact or too few blocks are
-    seen."""
+    """Of a view at `pose`; None where the tilt is exact or too few blocks are seen."""
     if tilt_std_deg(seen.view.telemetry) == 0:
         return None
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
@@ -354,8 +350,7 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
 def _fitted(
     seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> Resection | None:
-    """A correction of `orientation`: the first at the final level and a coarser one, then one finer
-    too."""
+    """A correction: the first at the final level and a coarser one, then one finer too."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)

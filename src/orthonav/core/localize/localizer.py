@@ -28,9 +28,7 @@ from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, Vi
 from orthonav.core.register.pose import Pose
 from orthonav.core.tiles.position import PositionRule
 
-ERROR_VARIANCE = 1.5
-"""Errors over their covariance: their tails are heavier than a Gaussian's
-(docs/decisions/camera.md)."""
+ERROR_VARIANCE = 1.5  # their tails are heavier than a Gaussian's (docs/decisions/camera.md)
 WIDEST_M = 2e7  # half the Earth's circumference
 
 

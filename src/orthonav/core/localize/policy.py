@@ -92,8 +92,7 @@ class SearchPolicy:
     last_ms: float = 900.0
     """A second search is left out above: about a second for a view on a large area (README)."""
     last_stage_ms: float = 60.0
-    """The last stage, poses of one view in seven, is left out above where the coarse level has
-    tried them."""
+    """The last stage, one view in seven, is left out above after the coarse level."""
 
     def candidates_from(self, tiles: int) -> int:
         least, most = self.tile_candidates

@@ -66,8 +66,7 @@ HALF_STEP = 0.07  # and half a step of the bank farther
 
 @dataclass(frozen=True, eq=False)
 class ScaleMap:
-    """Log scales (true over reported height) at nodes (H, W), `step_px` of level 0 apart from (0,
-    0)."""
+    """Log scales (true over reported height) at nodes (H, W), `step_px` of level 0 apart."""
 
     values: NDArray[np.float32]
     step_px: float

@@ -206,8 +206,7 @@ class SpreadSums(NamedTuple):
         return float((sums[used] > 0).mean()) if used.any() else 0.0
 
     def blocks_t(self) -> float:
-        """Sum of the gradients' products over blocks, by the root of their squares: many agree, not
-        few."""
+        """Sum of the gradients' products over blocks, by the root of their squares."""
         sums = self.blocks[:, 4]
         return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))
 

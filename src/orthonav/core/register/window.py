@@ -111,8 +111,7 @@ LARGEST_LOG_SCALE = 1.0  # Beyond, the map counts as missing: more than twice wh
 
 @dataclass(frozen=True, eq=False)
 class MapWindow:
-    """Channels (R, C, 4) of the map at a level, from (`row`, `col`), for windows (H, W) near a
-    pose."""
+    """Channels (R, C, 4) of a level, from (`row`, `col`), for windows (H, W) near a pose."""
 
     made: Array
     row: int
@@ -216,8 +215,7 @@ def compared(template: Template, seen: Array, valid: Array, slopes: bool = True)
 
 
 def sampled_planes(template: Template, window: MapWindow, pose: Pose) -> tuple[Array, Array]:
-    """Channels (3, H, W), and validity (H, W), in memory of the thread, overwritten by the next
-    call."""
+    """Channels (3, H, W), validity (H, W), in memory that the thread's next call overwrites."""
     shape = template.mask.shape
     planes = thread_memory("sampled", 10 * template.mask.size).reshape(10, *shape)
     interleaved = planes[:4].reshape(*shape, 4)

@@ -25,8 +25,7 @@ Poses = NDArray[np.float64]
 
 
 class Representation(Protocol):
-    """One channel, or a magnitude and harmonics 1, 2, .. of the doubled direction, real and
-    imaginary."""
+    """One channel, or a magnitude and real and imaginary parts of harmonics 1, 2, .."""
 
     @property
     def channels(self) -> int:

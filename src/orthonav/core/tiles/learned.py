@@ -48,9 +48,7 @@ class LearnedEdges:
     def path(self) -> str:
         return self.weights or os.environ.get(VARIABLE, "")
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:

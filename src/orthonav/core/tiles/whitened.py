@@ -219,8 +219,7 @@ class WhitenedEmbedder:
         return _unit(((features - self._mean) * weights) @ self._basis)
 
     def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """(D,), zero for an empty view. Raises `ValueError` unless a square of a multiple of
-        `MICRO`."""
+        """(D,), zero if empty. Raises `ValueError` unless a square of a multiple of `MICRO`."""
         channels, height, width = maps.shape
         if height != width or height % MICRO:
             raise ValueError(f"view must be square, a multiple of {MICRO} px, got {maps.shape}")

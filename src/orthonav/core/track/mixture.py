@@ -173,8 +173,7 @@ def distance(one: Hypothesis, other: Hypothesis) -> float:
 
 
 MIN_SPLIT = 1e-5
-"""Less likely predictions are not followed. Values without a source: by the flights of
-docs/tracking.md."""
+"""Least share to be followed. Values without a source: by the flights of docs/tracking.md."""
 MINOR_SHARE = 1e-4  # less likely hypotheses are not split for rare events,
 MAJOR_SHARE = 0.05  # nor these without odometry, where hypotheses are not merged between views
 START_SHARE = 0.9  # of a reported start position

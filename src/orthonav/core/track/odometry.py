@@ -20,15 +20,13 @@ from orthonav.core.register.window import Reference
 from orthonav.core.track import CameraDisplacement
 
 VIEW_PX = 160
-"""Across: half the resolution of a fix. Values without a source: by the flights of
-docs/tracking.md."""
+"""Across: half that of a fix. Values without a source: by the flights of docs/tracking.md."""
 LEVELS = 3  # of a view that serves as the map of the next one
 TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
 """Of the search from a coarse level: about that of `policy.SearchPolicy`."""
 MAX_SPEED_MPS = 80.0  # for which a displacement is sought
 MIN_SCORE_RATIO = 2.5
-"""Over the strongest rival: right ones have at least 4 on Arroio and generated land, wrong ones
-1.7."""
+"""Over the strongest rival: at least 4 for right ones, at most 1.7 for wrong ones."""
 MIN_CORRELATION = 0.4
 """Right ones have at least 0.56, wrong ones at most 0.11 (docs/decisions/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
