@@ -8,11 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.confidence import (
-    TILE_FEATURES,
-    USUAL_TILES,
-    LogisticConfidence,
-)
+from orthonav.core.localize.confidence import TILE_FEATURES, USUAL_TILES, LogisticConfidence
 from orthonav.core.localize.tiles import MAX_RATIO, lowe_ratio
 from orthonav.ground.build.fit import fit_few, fit_logistic
 

@@ -9,12 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.confidence import (
-    CHANCES,
-    FEATURES,
-    Chances,
-    RegisteredConfidence,
-)
+from orthonav.core.localize.confidence import CHANCES, FEATURES, Chances, RegisteredConfidence
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.build.fit import fit_registered
 

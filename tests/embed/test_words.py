@@ -10,11 +10,7 @@ import pytest
 
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.represent import Gray
-from orthonav.core.tiles.words import (
-    WordsEmbedder,
-    WordsRecipe,
-    describe,
-)
+from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
 from orthonav.core.variants import Variant, make_variant
 from orthonav.research.words import learn_words
 

@@ -6,14 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import (
-    Ground,
-    apart_px,
-    random_poses,
-    reference_of,
-    templates_of,
-    turned_rad,
-)
+from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.localize.place import Placer
 from orthonav.core.register.pose import Pose, PosePrior

@@ -5,23 +5,11 @@ import math
 import cv2
 import numpy as np
 import pytest
-from scenes import (
-    Ground,
-    apart_px,
-    random_poses,
-    reference_of,
-    templates_of,
-    turned_rad,
-)
+from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.search import (
-    SearchWindow,
-    bank,
-    best_near,
-    search,
-)
+from orthonav.core.register.search import SearchWindow, bank, best_near, search
 from orthonav.core.register.template import Template
 
 SHAPE = (384, 448)

@@ -34,12 +34,7 @@ def test_peak_lies_where_the_scores_say(east_m, north_m):
     np.testing.assert_allclose(centres[best] + offset, [east_m, north_m], atol=0.5)
 
 
-@given(
-    st.integers(0, 10**6),
-    st.integers(0, 12),
-    st.sampled_from([0.0, 0.3, 0.7]),
-    st.booleans(),
-)
+@given(st.integers(0, 10**6), st.integers(0, 12), st.sampled_from([0.0, 0.3, 0.7]), st.booleans())
 def test_maxima_are_the_tiles_that_no_neighbour_exceeds(seed, count, missing, gated):
     rng = np.random.default_rng(seed)
     some = tiles(lambda row, col: rng.random() >= missing)

@@ -1,8 +1,7 @@
 """Camera files of other programs.
 
 OpenCV, ROS and Kalibr measure the principal point from the centre of the first pixel, orthonav
-from its outer corner, which adds half a pixel.
-"""
+from its outer corner, which adds half a pixel."""
 
 import json
 import re
@@ -45,8 +44,7 @@ def read_camera_file(path: Path) -> Camera:
     """The camera of a `flight.json`, or of a file of OpenCV (YAML, JSON), ROS or Kalibr (YAML).
 
     `FILE#cam1` selects one camera of a Kalibr chain. Raises `MissingFileError`, `CameraError` or
-    `MissingExtraError`.
-    """
+    `MissingExtraError`."""
     path, name = _name_apart(Path(path))
     path = require_file(path, "camera file")
     if path.stat().st_size > MAX_BYTES:

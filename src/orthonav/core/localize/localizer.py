@@ -88,8 +88,7 @@ class Localizer:
 
         `prior` limits the search to three standard deviations around it. With `heading_known`
         false all headings are tried and the reported heading may be NaN. Any fault of a view makes
-        a `NoFix`.
-        """
+        a `NoFix`."""
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused
@@ -116,8 +115,7 @@ class Localizer:
 
         `heading_deg` None: all headings are tried. `prior`: searched within three of its standard
         deviations; None: on the whole map. Raises `FlightError` for what is no image and
-        `CameraError` where image and camera have different aspect ratios.
-        """
+        `CameraError` where image and camera have different aspect ratios."""
         view = View.of(
             image,
             camera,

@@ -116,11 +116,7 @@ def _likely_directions(
 ) -> list[tuple[float, float, float]]:
     """Cached: the standard deviations are mostly those of the view before."""
     made = bank(
-        turn_std_rad,
-        log_scale_std,
-        turn_step_rad=steps[0],
-        scale_step=steps[1],
-        sigmas=sigmas,
+        turn_std_rad, log_scale_std, turn_step_rad=steps[0], scale_step=steps[1], sigmas=sigmas
     )
     known = turn_std_rad is not None
     prior = PosePrior(0.0 if known else None, turn_std_rad or 0.0, log_scale_std)

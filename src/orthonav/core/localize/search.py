@@ -1,8 +1,7 @@
 """The search for the place of one view: steps that find candidates, and when they are enough.
 
 `policy` says what is tried and what it costs; each step finds candidates in its way, `place` judges
-them. A search ends as soon as the best place stands out or is proven by its confidence.
-"""
+them. A search ends as soon as the best place stands out or is proven by its confidence."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,13 +21,7 @@ from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.search import (
-    PLACES_AT_ONCE,
-    Peak,
-    best_near,
-    largest_half_px,
-    search,
-)
+from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
 from orthonav.core.tiles.position import rows_within
 
 SAME_PLACE_SHARE = 1 / 8  # closer candidates from tiles are one place

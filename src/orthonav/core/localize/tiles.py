@@ -50,10 +50,7 @@ def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
 
 
 def rival_score(
-    scores: NDArray[np.float32],
-    centres_en_m: NDArray[np.float32],
-    best: int,
-    exclusion_m: float,
+    scores: NDArray[np.float32], centres_en_m: NDArray[np.float32], best: int, exclusion_m: float
 ) -> float:
     """Best score farther than `exclusion_m` from the best tile.
 

@@ -102,9 +102,7 @@ def new_key(folder: Path) -> str:
         raise OutputError(f"folder holds a key already; name another folder: {folder}")
     private = ed25519.Ed25519PrivateKey.generate()
     pem = private.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     public = private.public_key()
     public_pem = public.public_bytes(

@@ -25,8 +25,6 @@ from orthonav.core.register.window import Reference, cut, thread_memory
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3  # of the typical energy, so that blank ground is not amplified
-
-
 POSES_AT_ONCE = 6
 PLACES_AT_ONCE = 50
 MAX_KEPT_WINDOWS = 4  # of whole sheets in the cache

@@ -362,10 +362,7 @@ def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> Wh
 
 
 def _whitening(
-    recipe: WhitenedRecipe,
-    mean: NDArray[np.float16],
-    scatter: NDArray[np.float64],
-    count: int,
+    recipe: WhitenedRecipe, mean: NDArray[np.float16], scatter: NDArray[np.float64], count: int
 ) -> WhitenedEmbedder:
     """Of `count` features with mean (F,) and scatter matrix (F, F)."""
     variances, vectors = np.linalg.eigh(scatter / count)

@@ -248,10 +248,7 @@ class Mixture:
         self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
 
     def move(
-        self,
-        plane: LocalFrame,
-        other: LocalFrame,
-        extent_en_m: tuple[float, float, float, float],
+        self, plane: LocalFrame, other: LocalFrame, extent_en_m: tuple[float, float, float, float]
     ) -> None:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]

@@ -133,12 +133,7 @@ class OdometryView:
         return np.asarray(self.en_from_px @ -self.camera_px)
 
     @classmethod
-    def of(
-        cls,
-        view: View,
-        pixel_m: float | None,
-        bias: Array = NO_BIAS,
-    ) -> "OdometryView | None":
+    def of(cls, view: View, pixel_m: float | None, bias: Array = NO_BIAS) -> "OdometryView | None":
         """None where it shows too little."""
         camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)

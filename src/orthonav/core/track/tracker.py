@@ -147,8 +147,7 @@ class Tracker:
     def continue_on(self, localizer: Localizer) -> None:
         """Continue the track between two views on another map, which shows the aircraft too.
 
-        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor.
-        """
+        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor."""
         frame = self._localizer.sheet.frame
         self.mixture.move(frame, localizer.sheet.frame, self._use(localizer))
 
@@ -156,8 +155,7 @@ class Tracker:
         """The position of the aircraft, by this view and all before it.
 
         A view that shows nothing is bridged by dead reckoning. Raises `CameraError` if the camera
-        has another size than the picture.
-        """
+        has another size than the picture."""
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
         if self._usual_scale:
             self._usual_scale = False
@@ -188,8 +186,7 @@ class Tracker:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
         `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
-        reported velocity over ground. Raises as `View.of`.
-        """
+        reported velocity over ground. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
@@ -420,7 +417,7 @@ class Tracker:
         return over_terrain(made, heights_m, terrain, ahead_en_m)
 
     def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
-        """None where unknown. `ahead_en_m` (2,): by reported heading and height, on level ground."""
+        """None where unknown. `ahead_en_m` (2,): as reported, on level ground."""
         best = self.mixture.likeliest
         if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
             return None
