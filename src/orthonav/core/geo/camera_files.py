@@ -1,7 +1,4 @@
-"""Camera files of other programs.
-
-OpenCV, ROS and Kalibr measure the principal point from the centre of the first pixel, orthonav
-from its outer corner, which adds half a pixel."""
+"""Camera files of other programs: OpenCV, ROS and Kalibr count from the first pixel's centre."""
 
 import json
 import re
@@ -105,10 +102,7 @@ def _yaml(text: str) -> Any:
 
 
 def _check_events(yaml: Any, text: str) -> None:
-    """Refuses YAML that could exhaust memory or time, before it is built.
-
-    Aliases expand exponentially, nesting fills the stack, numbers with colons take quadratic time.
-    """
+    """Refuses YAML whose aliases, nesting or numbers with colons could exhaust memory or time."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
         if getattr(event, "anchor", None) is not None:

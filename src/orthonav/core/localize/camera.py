@@ -1,9 +1,8 @@
 """The camera of a placed view: position, height, heading, pitch and roll from the picture.
 
-Reported pitch and roll are only a prior: mounts and horizons lean by degrees. Each block of the
-view says how well it fits the map a little aside (`orthonav.core.register.blocks`). The camera is
-the maximum of the posterior of blocks and telemetry, by Newton's method; changed ground is an
-outlier of a mixture. The view is orthorectified with it one level finer, and fitted again."""
+Blocks of the view say how well they fit the map a little aside (`orthonav.core.register.blocks`).
+The camera is the maximum of their posterior with the telemetry, by Newton's method; changed ground
+is an outlier of a mixture. Then the view is orthorectified one level finer, and fitted again."""
 
 import math
 from collections.abc import Sequence
@@ -63,9 +62,9 @@ def resected(
 ) -> Resection | None:
     """The camera under which the blocks of a view fit the map best; None where too few are seen.
 
-    `seen`: per level, of one reach, the blocks and how far (N, 2, 6) each moves, pixels of the
-    level right and down, by metres and degrees of the camera. `prior`: correction (6,) and
-    information (6, 6). `block_px`: at level 0. `close`: the camera is known to a pixel or two."""
+    `seen`: per level the blocks and how far (N, 2, 6) each moves, pixels right and down, by the
+    camera. `prior`: correction (6,) and information (6, 6). `close`: the camera is known to a pixel
+    or two."""
     correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
     blocks = _Blocks.of(seen, correlated)
     if blocks is None:
@@ -255,10 +254,8 @@ def _positive(matrices: Array) -> Array:
 def moved_by_camera(
     camera: Camera, orientation: Orientation, ground_m: Array, slopes: Array
 ) -> Array:
-    """Metres (N, 2, 6) by which an image point moves over the ground per unit of the camera.
-
-    `ground_m` (N, 3): east, north, above sea; `slopes` (N, 2): rise per metre. NaN where not seen.
-    """
+    """Metres (N, 2, 6) by which an image point moves over the ground per unit of the camera; NaN
+    where not seen. `ground_m` (N, 3): east, north, above sea; `slopes` (N, 2): its rise."""
     by_ground = []
     for axis in range(2):
         step = np.zeros((len(ground_m), 3))
@@ -290,11 +287,9 @@ SMALL_SHARE = 0.2  # until a correction is below this share of its standard devi
 
 @dataclass(frozen=True, eq=False)
 class CameraFound:
-    """The camera of a view.
+    """The camera of a view; `agl_m`: above the ground below it; `alone`: without telemetry.
 
-    - `agl_m`: above the ground below it. `covariance` (6, 6): m east, north, up, deg heading,
-      pitch, roll.
-    - `alone`, `alone_covariance`: by the view without telemetry; `WEAK` where it does not show it.
+    - covariances (6, 6): m east, north, up, deg heading, pitch, roll; `WEAK` where not shown.
     - `middle_en_m`, `middle_covariance` (2, 2): ground in the middle of the picture, None: unknown.
     """
 

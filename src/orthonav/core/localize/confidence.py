@@ -247,10 +247,8 @@ def within(
     radius_m: float,
     middle: NDArray[np.float64] | None = None,
 ) -> float:
-    """Probability that a state lies within a radius of `middle` (2,), None: its mean.
-
-    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
-    """
+    """Probability of being within a radius of `middle` (2,), None: the mean; exact for a round
+    Gaussian, else a distance from it counts as variance."""
     variance = float(covariance[0, 0] + covariance[1, 1]) / 2
     away = 0.0 if middle is None else math.dist(mean[:2], middle)
     if away > radius_m + 3 * math.sqrt(variance):

@@ -210,10 +210,9 @@ class Placer:
     # On the terrain
 
     def on_terrain(self, places: Sequence[Place], at_most: int) -> list[Place]:
-        """The best judged places that lie apart, on the terrain where they are better there.
-
-        The surroundings of the first `AROUND` are searched: where relief displaces much, the right
-        one may be far down the list, and off by more than refinement follows."""
+        """The best judged places that lie apart, on the terrain where they are better there; the
+        first `AROUND` with their surroundings, for relief displaces more than refinement follows.
+        """
         if self.is_level:
             return list(places)
         chosen = self._best_apart(places, at_most)
@@ -285,10 +284,9 @@ class Placer:
         kept: int = KEPT_TO_FINISH,
         finer: bool = False,
     ) -> Place:
-        """The best of judged places, found by searches of `candidates` in all.
-
-        The best `kept` of them and all `direct` ones are refined at the final level; with `finer`
-        the best `KEPT_TO_FINEST` are compared one level finer."""
+        """The best of judged places, found by searches of `candidates` in all: the best `kept` and
+        all `direct` ones at the final level, with `finer` the best `KEPT_TO_FINEST` one level
+        finer."""
         ranked = sorted(places, key=lambda each: -self._value(each.judged))
         chosen = self._apart([each.judged for each in ranked], self._exclusion_px, kept)
         apart = [ranked[number] for number in chosen]
@@ -314,10 +312,8 @@ class Placer:
         )
 
     def _finish(self, place: Place) -> None:
-        """At the final level, once: on the terrain, unless level ground is as good or too little is
-        known.
-
-        Only a place not far below the best one before it is worth its terrain."""
+        """At the final level, once: on the terrain, unless level ground is as good, too little is
+        known, or it is far below the best one before."""
         if place.final is not None:
             return
         first = None

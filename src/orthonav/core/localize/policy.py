@@ -152,10 +152,8 @@ class CostModel:
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """A policy with its costs, and what the user allows.
-
-    `budget_ms`: no search after the first is begun that would end later than this after the first
-    began. `threads` share poses and candidates."""
+    """A policy with its costs, and what the user allows: none but the first search is begun that
+    would end later than `budget_ms`; `threads` share poses and candidates."""
 
     budget_ms: float = math.inf
     threads: int = 1

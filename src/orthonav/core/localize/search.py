@@ -375,11 +375,10 @@ class Search:
     def _proven_before(self, step: Step) -> Place | None:
         """The best place so far, if a trial before the next step proves it.
 
-        The best few are placed on the terrain and finished; where that proves none, they are
-        compared one level finer. Where only a part of all places was compared, the best must stand
-        out too. No trial before a step that costs less, except the final level, which only runs
-        after all directions of the judged one: the best need only be as certain as at the end of
-        all steps."""
+        The best few are finished on the terrain; where that proves none, they are compared one
+        level finer. Where only a part of all places was compared, the best must stand out too. No
+        trial before a step that costs less, except the final level, before which all directions
+        were tried."""
         policy, last, levels = self.policy, self.last, self.levels
         if last is None or self.sheet.confidence is None or levels.final == levels.judged:
             return None

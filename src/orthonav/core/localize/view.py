@@ -146,11 +146,8 @@ NEAR_SHARE = 0.6
 
 @dataclass(frozen=True, eq=False)
 class PreparedView:
-    """A view made ready for registration.
-
-    `gsd_m`: of level 0 of the map. `templates`: at the final level. `side_px`: root of the area
-    seen, `camera_px` (2,): of the camera from the middle of the view, right and down; pixels of
-    level 0."""
+    """A view made ready for registration. `side_px`: root of the area seen, `camera_px` (2,): of
+    the camera from the middle of the view, right and down; both in pixels of level 0."""
 
     view: View
     gsd_m: float

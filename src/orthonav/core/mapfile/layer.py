@@ -1,8 +1,7 @@
-"""The registration layer of a map: a grey pyramid of a sheet, read by windows.
+"""The registration layer of a map (`docs/map-format.md`): a grey pyramid, read by windows.
 
-Each level is divided into square chunks, each a grey JPEG with its own mask, see
-`docs/map-format.md`. Only the chunks that a window touches are decoded. Maps are untrusted files,
-so every length, size and offset is checked before it is used."""
+Only the chunks (JPEG and mask) that a window touches are decoded. Maps are untrusted files, so
+every length, size and offset is checked before it is used."""
 
 import zlib
 from itertools import pairwise

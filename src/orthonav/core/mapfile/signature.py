@@ -129,10 +129,8 @@ def key_id(public: "Ed25519PublicKey") -> str:
 
 
 def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
-    """Sign a map, fully checked first, with a private key (PEM); returns the signature's path.
-
-    `serial`: 0 to `MAX_SERIAL`, by default seconds since 1970. Raises `MissingFileError`,
-    `MapFileError`, `OutputError`, `VariantError` or `MissingExtraError`."""
+    """Sign a map, fully checked first, with a private key (PEM); `serial`: 0 to `MAX_SERIAL`, by
+    default seconds since 1970. Raises `OrthonavError` of the kind that fits."""
     now = datetime.now(UTC)
     serial = int(now.timestamp()) if serial is None else serial
     if not 0 <= serial <= MAX_SERIAL:

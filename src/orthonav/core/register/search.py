@@ -62,10 +62,9 @@ class Peak(NamedTuple):
 
 
 class SearchWindow:
-    """Channels (H, W, 4) of the map at a level, first pixel (`row`, `col`), ready to be searched.
-
-    `view_px`: about the side of views; no middle is sought within `margin_px` of the border.
-    `half_px`: the largest `posed_half_px`; None: not known yet."""
+    """Channels (H, W, 4) of the map at a level, first pixel (`row`, `col`), ready to be searched
+    for views of about `view_px`, none within `margin_px` of the border; `half_px`: largest
+    `posed_half_px`."""
 
     def __init__(
         self,

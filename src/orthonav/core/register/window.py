@@ -169,13 +169,8 @@ FULLY_VALID = 0.99  # A pixel counts where the sampled map is valid by more
 
 
 class Sums(NamedTuple):
-    """Over the pixels of a view that count and see valid map, by kind of channel.
-
-    - `products`, `energies` (2,): view times map, map squared; `slopes` (2, 4): derivatives times
-      map.
-    - `left_energies`, `left_slopes`: view squared, derivatives times view where it sees no valid
-      map.
-    - `left_pixels` (B * B,): number of these by block."""
+    """Over the pixels of a view that count and see valid map, by kind of channel: view times map,
+    map squared, derivatives times map; `left`: over its pixels that see no valid map, by block."""
 
     products: NDArray[np.float64]
     energies: NDArray[np.float64]

@@ -101,10 +101,8 @@ class Gray:
 
 @dataclass(frozen=True)
 class Canny:
-    """Binary edges, by default as in Di Piazza et al. 2024, section 4.
-
-    `low`, `high`: hysteresis on the Sobel gradient (L1 norm, 8-bit grey), `kernel`: aperture (3, 5,
-    7)."""
+    """Binary edges, by default as in Di Piazza et al. 2024, section 4; thresholds on the Sobel
+    gradient (L1 norm, 8-bit grey), aperture 3, 5 or 7."""
 
     low: float = 100.0
     high: float = 200.0

@@ -246,9 +246,7 @@ class WhitenedEmbedder:
         return np.asarray(np.linalg.solve(normal, seen @ centred))
 
     def cells(self, cells: NDArray[np.float32], valid: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(Q, D) of many views, as `view`.
-
-        `cells` (Q, cells, cells, C): micro-cells weighted by `recipe.pooling`, `valid`: their
+        """(Q, D) of many views, as `view`; sums of micro-cells by `recipe.pooling`, and of their
         shares."""
         out = np.empty((len(cells), self.dims), dtype=np.float32)
         along = self.recipe.pooling.sum(axis=1)
@@ -266,10 +264,8 @@ class WhitenedEmbedder:
     def _from_parts(
         self, centred: NDArray[np.float32], weights: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """`_from_part` of many views (Q, D).
-
-        By conjugate gradients, preconditioned as if every cell had the mean weight: a twentieth of
-        the time."""
+        """`_from_part` of many views (Q, D), by conjugate gradients, preconditioned as if every
+        cell had the mean weight: a twentieth of the time."""
         loadings = self._loadings
         noisy = weights / np.float32(PART_NOISE)
         power = np.square(loadings).sum(axis=0)

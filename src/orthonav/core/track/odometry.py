@@ -154,9 +154,7 @@ class OdometryView:
         )
 
     def corrected(self, bias: Array) -> "OdometryView | None":
-        """With the present estimate of the biases.
-
-        Both views need the same: what was learnt between them would appear as motion
+        """With the present biases: what was learnt between two views would else appear as motion
         (docs/decisions/tracking.md)."""
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
             return OdometryView.of(self.view, self.pixel_m, bias)
@@ -217,9 +215,7 @@ def displacement(
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Ground that is not level.
-
-    `below`, `seen` (2,): rise per metre east and north below the camera, and where both views look.
+    """Ground that is not level: rise (2,) per metre below the camera and where both views look;
     `rise`: of the ground there over that below, as a share of the height."""
 
     below: Array
