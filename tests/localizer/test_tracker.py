@@ -18,7 +18,7 @@ from orthonav.core.track import Estimate, ReportedAttitude, Sighting, State
 from orthonav.core.track.model import STATE
 from orthonav.core.track.odometry import OdometryView, displacement
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.run import localize_flight, smoothed_track
+from orthonav.ground.recordings.localize import localize_flight, smoothed_track
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0

@@ -100,7 +100,8 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
         calibrate_mount_by_views,
         confident_views,
     )
-    from orthonav.onboard.run import Locator, localize_flight, smoothed_track
+    from orthonav.ground.recordings.localize import localize_flight, smoothed_track
+    from orthonav.onboard.run import Locator
 
     dem, opened = dem_of(options), open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None

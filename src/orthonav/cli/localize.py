@@ -218,13 +218,8 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.run import (
-        Locator,
-        MountCorrected,
-        SingleViews,
-        model_of,
-        smoothed_track,
-    )
+    from orthonav.ground.recordings.localize import smoothed_track
+    from orthonav.onboard.run import Locator, MountCorrected, SingleViews, model_of
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
@@ -349,7 +344,7 @@ def _located(
     take: "Callable[[ViewResult], None]" = lambda result: None,
 ) -> "list[ViewResult]":
     """Results of the views; `take` gets each."""
-    from orthonav.onboard.run import localize_flight
+    from orthonav.ground.recordings.localize import localize_flight
 
     results = []
     for result in localize_flight(
