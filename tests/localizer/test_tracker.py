@@ -16,7 +16,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track.odometry import OdometryView, displacement
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.run import localize_flight, smoothed_track
+from orthonav.ground.recordings.localize import localize_flight, smoothed_track
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0

@@ -44,9 +44,10 @@ from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
+from orthonav.onboard import fly as loop
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
-from orthonav.onboard.console import Inputs, Narrator
+from orthonav.onboard.console import Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
@@ -111,13 +112,17 @@ class Flight:
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
         messages = MessageOptions(kinds)
         self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
-        inputs = Inputs(self.newest, "images from 0", True, self.link, "udpin:1", True)
+        narrator = Narrator(
+            *(self.said, clocks, self.newest, "images from 0", self.link, "udpin:1"),
+            is_live=True,
+            sends=True,
+        )
         publisher = Publisher(
             self.gate,
             clocks,
             messenger=Messenger(messages, self.gate, self.link.send, clocks),
             link=self.link,
-            lines=[JsonOut(self.lines), Narrator(self.said, clocks, inputs)],
+            lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
         rest = {
@@ -890,8 +895,9 @@ def paced(monkeypatch):
     return lambda lines: monkeypatch.setattr(cameras, "own_pace", pace_by(lines))
 
 
-def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
+def test_a_flight_from_end_to_end(flown, autopilot, paced, monkeypatch, tmp_path):
     """Every image is located, however slow the machine is; only "stale" depends on its speed."""
+    monkeypatch.setattr(loop, "TELEMETRY_WAIT_S", 10.0)
     path, folder, frame, truth = flown
     lines, state = tmp_path / "lines.jsonl", tmp_path / "state.json"
     cv2.setNumThreads(1)
@@ -899,7 +905,7 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
     code = main(
         [
             *("fly", str(path), str(folder), "--autopilot", f"udpin:{autopilot.port}"),
-            *("--deadline-ms", "60000", "--telemetry-wait-ms", "10000"),
+            *("--deadline-ms", "60000"),
             *("--send", "global-position", "--send", "gps-input"),
             *("--jsonl", str(lines), "--state", str(state)),
         ]
@@ -976,7 +982,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     def start(lines):
         arguments = [
             *(lines, tmp_path / "release", "fly", path, folder),
-            *("--state", state, "--jsonl", lines, "--telemetry-wait-ms", "10000"),
+            *("--state", state, "--jsonl", lines),
             *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
         ]
         return subprocess.Popen([sys.executable, PACED, *map(str, arguments)])
@@ -1015,7 +1021,6 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
     release = tmp_path / "release"
     arguments = [
         *(lines, release, "fly", area, folder, "--state", state, "--jsonl", lines),
-        *("--telemetry-wait-ms", "10000"),
         *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
     ]
     process = subprocess.Popen(

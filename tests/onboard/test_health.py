@@ -109,7 +109,7 @@ def test_changes_are_reported_at_most_every_five_seconds():
 
 
 def test_counts_are_those_of_the_window():
-    counter = EventCounter(10.0)
+    counter = EventCounter()
     for second in range(20):
         counter.add(second * S, "late")
         counter.add_latency(second * S, second / 10)

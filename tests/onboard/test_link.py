@@ -232,7 +232,7 @@ def test_a_missing_port_is_retried_at_growing_intervals():
     for _ in range(600):
         flying.link.poll()
         flying.time.go(0.1)
-    assert 12 <= flying.link.status().errors <= 18 and not flying.link.status().is_open
+    assert 12 <= flying.link.counts["error"] <= 18 and not flying.link.status().is_open
     assert flying.link.status().heard_age_s == math.inf
     flying.port.refuse = False
     flying.time.go(RETRY_S[-1])
@@ -277,7 +277,7 @@ def test_the_origin_of_the_autopilot_is_stored_until_it_restarts(flying):
     for number in range(40):
         flying.time.go(0.05)
         flying.hear(flying.autopilot.attitude((number + 1) * 50 * MS))
-    assert flying.link.status().jumps == 1 and flying.link.origin is None
+    assert flying.link.sync.jumps == 1 and flying.link.origin is None
 
 
 def test_whether_the_autopilot_is_armed():

@@ -251,9 +251,10 @@ def test_nmea_over_udp():
 
 def test_nmea_over_tcp_to_all_clients_that_read():
     sink = open_sink("tcp-listen:0")
-    assert isinstance(sink, TcpSink) and sink._listening.getsockname()[0] == "127.0.0.1"
+    address = sink._listening.getsockname()
+    assert isinstance(sink, TcpSink) and address[0] == "127.0.0.1"
     out = NmeaOut(sink, quality=Quality.AUTONOMOUS)
-    clients = [socket.create_connection(("127.0.0.1", sink.port)) for _ in range(2)]
+    clients = [socket.create_connection(address) for _ in range(2)]
     out.write(ESTIMATE, UTC_NS, 0.9)
     for client in clients:
         client.settimeout(2)

@@ -130,7 +130,7 @@ def circling(time_ns):
 
 
 def test_the_displacement_follows_turns_for_longer_than_samples_are_kept(monkeypatch):
-    monkeypatch.setattr(telemetry, "KEEP_S", 2.0)
+    monkeypatch.setattr(telemetry, "KEEP_NS", 2 * S)
     buffer = TelemetryBuffer()
     buffer.add_local(0, circling(0), 0.0)
     first = buffer.at(0).travelled
@@ -181,12 +181,12 @@ def test_an_invalid_attitude_is_dropped(wxyz):
 
 
 def test_samples_out_of_order_and_old_ones_are_dropped(monkeypatch):
-    monkeypatch.setattr(telemetry, "KEEP_S", 1.0)
+    monkeypatch.setattr(telemetry, "KEEP_NS", S)
     buffer = TelemetryBuffer()
     for number in range(1000):
         attitude(buffer, number * 10 * MS, yaw_deg=10.0)
     attitude(buffer, 5 * S, yaw_deg=90.0)
-    assert buffer.covered_ns == 9990 * MS + round(telemetry.ATTITUDE_AHEAD_S * S)
+    assert buffer.covered_ns == 9990 * MS + telemetry.ATTITUDE_AHEAD_NS
     assert buffer.at(5 * S).ned_from_body is None
     assert buffer.at(9500 * MS).telemetry(0).yaw_deg == pytest.approx(10.0)
     assert len(buffer._attitude.times) <= 201

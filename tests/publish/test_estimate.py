@@ -106,15 +106,14 @@ def test_the_95_percent_ellipse_is_wider_and_unknown_where_there_is_none() -> No
 def test_an_invalid_covariance_has_no_standard_deviation(cov: list[list[float]]) -> None:
     estimate = replace(PLAIN, cov_en_m2=np.array(cov))
     assert all(map(math.isnan, error_ellipse(estimate.cov_en_m2)))
-    assert math.isnan(estimate.horizontal_std_m(3.0))
+    assert math.isnan(estimate.horizontal_std_m())
     assert not estimate.is_confident()
 
 
-def test_the_standard_deviation_is_that_of_the_worst_direction_and_at_least_the_minimum() -> None:
+def test_the_standard_deviation_is_that_of_the_worst_direction() -> None:
     values = np.linalg.eigvalsh(COV)
     assert PLAIN.horizontal_std_m() == pytest.approx(math.sqrt(values[1]))
     assert PLAIN.horizontal_std_m() >= math.sqrt(COV.diagonal().max())
-    assert PLAIN.horizontal_std_m(10.0) == 10.0
 
 
 @pytest.mark.parametrize(

@@ -214,10 +214,8 @@ def test_the_rate_limit_works_after_a_clock_was_set_back() -> None:
     "rules",
     [
         {"max_std_m": 0.0},
-        {"max_age_s": math.nan},
         {"min_interval_s": {"A": 0.0}},
         {"min_confidence": 1.1},
-        {"jump_sigmas": -1.0},
     ],
 )
 def test_invalid_rules_are_refused(rules: dict) -> None:

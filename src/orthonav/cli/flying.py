@@ -34,11 +34,10 @@ from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
-from orthonav.onboard.cameras import CameraThread, NewestImage
-from orthonav.onboard.console import Console, Inputs, Narrator
+from orthonav.onboard.cameras import NewestImage, read_in_thread
+from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.gnss.biases import Biases
-from orthonav.onboard.gnss.learner import Resumed
+from orthonav.onboard.gnss.biases import Biases, Resumed
 from orthonav.onboard.gnss.watch import (
     GnssSource,
     GnssWatch,
@@ -61,9 +60,7 @@ from orthonav.onboard.outputs import (
     MessageOptions,
     Messenger,
     NmeaOut,
-    PositionOutput,
     Publisher,
-    ViewOutput,
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
@@ -80,6 +77,7 @@ from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0
@@ -91,7 +89,6 @@ flight that comes from there gives the place where it reaches the map, or a larg
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
-    """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
     console = opened_console(options, clocks, stack)
     opened = _opened(options)
@@ -125,8 +122,16 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     newest = NewestImage()
     sends = not options.dry_run and (link is not None or graph is not None)
     is_live = options.ros2 or cameras.is_live(options.source)
-    inputs = Inputs(newest, awaited(options), is_live, link, options.autopilot, sends)
-    narrator = Narrator(console, clocks, inputs)
+    narrator = Narrator(
+        console,
+        clocks,
+        newest,
+        awaited(options),
+        link,
+        options.autopilot,
+        is_live=is_live,
+        sends=sends,
+    )
     publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
@@ -135,8 +140,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         source.log_gnss = sink.gnss
     if gnss is not None and sink is not None and not options.ros2:
         gnss.log = sink.gnss  # with ROS 2 messages are logged as received
-    thread = CameraThread(source, stopping, newest)
-    stack.callback(thread.stop)
+    stack.callback(read_in_thread(newest, source, stopping))
     fly = FlyOptions(
         mount_deg=tuple(options.mount_deg),
         mount=mount,
@@ -144,7 +148,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
         min_agl_m=_min_agl_m(options, camera, localizer),
-        telemetry_wait_s=options.telemetry_wait_ms / 1e3,
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
@@ -174,7 +177,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
 
 
 def _min_agl_m(options: argparse.Namespace, camera: Camera, localizer: Localizer) -> float:
-    """Height from which views are located: as given, else where they cover enough of the map."""
     if options.min_agl_m is not None:
         return float(options.min_agl_m)
     across, along = camera.extent
@@ -182,7 +184,6 @@ def _min_agl_m(options: argparse.Namespace, camera: Camera, localizer: Localizer
 
 
 def _opened(options: argparse.Namespace) -> MapFile:
-    """The map, its signature checked first where that is asked for."""
     signature = checked_signature(options)
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
     if signature is not None and options.state is not None:
@@ -204,7 +205,6 @@ def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMoni
 
 
 def _stated(text: str | None) -> CameraLatency | None:
-    """Latency of `--camera-latency-ms`: a number or a file."""
     if text is None:
         return None
     try:
@@ -225,8 +225,7 @@ def _inputs(
     stack: ExitStack,
     localizer: Localizer,
     least: float,
-) -> tuple[Any, PositionOutput | None]:
-    """Source of images, and the output that belongs to it, if any."""
+) -> tuple[Any, "Ros2Publisher | None"]:
     if camera is not None and not options.ros2:
         return _source(options, clocks, link, camera, stopping), None
     ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
@@ -236,7 +235,6 @@ def _inputs(
 
 
 def _camera(options: argparse.Namespace) -> Camera | None:
-    """Camera of a file; None for that of a ROS 2 topic."""
     if options.camera is not None:
         return read_camera_file(options.camera)
     if options.ros2:
@@ -308,7 +306,7 @@ def _publisher(
     clocks: Clocks,
     link: AutopilotLink | None,
     least: float,
-    graph: PositionOutput | None,
+    graph: "Ros2Publisher | None",
     narrator: Narrator,
     digest: str,
 ) -> Publisher:
@@ -339,7 +337,7 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        lines: list[ViewOutput] = [
+        lines: list[Any] = [
             JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl
         ]
@@ -360,7 +358,6 @@ def _publisher(
 
 
 def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
-    """Warn of local messages at a rate at which PX4 does not fuse them."""
     local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
     if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
         log.warning(
@@ -383,10 +380,7 @@ def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLo
 
 
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
-    """Options for a replay of the log, and the whole command line.
-
-    Files are logged by name: the contents of a key file are written nowhere.
-    """
+    """Options for a replay, and the command line; the contents of a key file are never logged."""
     line = {
         name: [str(each) for each in value] if isinstance(value, list | tuple) else str(value)
         for name, value in vars(options).items()
@@ -420,7 +414,6 @@ def awaited(options: argparse.Namespace) -> str | None:
 
 
 def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> list[str]:
-    """What the flight uses and sends, one line each. `least`: confidence from which it sends."""
     lines = [
         f"map: {_map_text(options.map, opened)}",
         f"autopilot: {_telemetry_text(options)}",
@@ -534,11 +527,8 @@ def gnss_watch(
 def _learnt_before(
     options: argparse.Namespace, digest: str, clocks: Clocks
 ) -> tuple[Mapping[str, Biases], Resumed | None]:
-    """What was learnt before this flight, and by it, where it was interrupted.
-
-    A state is that of this flight if the program that saved it stopped no longer than
-    `--state-max-age-s` ago, or at an unknown time because a clock was set back.
-    """
+    """What was learnt before this flight, and by it, where it was interrupted: the saving program
+    stopped at most `--state-max-age-s` ago, or at an unknown time."""
     if options.state is None:
         return {}, None
     saved = load(options.state)
@@ -552,10 +542,7 @@ def _learnt_before(
 def start_of(
     options: argparse.Namespace, clocks: Clocks, localizer: Localizer
 ) -> Callable[[], Prior | None]:
-    """Function that gives the prior of the first view.
-
-    It is the saved position if that is recent, but once only, else `--start`, else None.
-    """
+    """Gives the first prior: a recent saved position, but once only, else `--start`, else None."""
     given = given_start(options, localizer)
     saved = [load(options.state)] if options.state else []
 

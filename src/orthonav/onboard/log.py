@@ -91,10 +91,7 @@ class _WaitingMessage:
 
 
 class FlightLog:
-    """A flight log being written. Every method returns at once, and none raises.
-
-    `lost`: number of images (`views`) and other messages (`messages`) dropped so far.
-    """
+    """A flight log being written. No method waits or raises. `lost` counts dropped messages."""
 
     def __init__(
         self,
@@ -211,12 +208,10 @@ class FlightLog:
             self._add(lambda: _with_thumbnail(seen, small), small.nbytes)
 
     def result(self, result: ViewResult) -> None:
-        """Log the result of a view."""
         index = self._indices.get(result.frame, 0)
         self._add(lambda: _result(result, index), 1000)
 
     def health(self, health: Mapping[str, Any]) -> None:
-        """Log the health (JSON values); the counts of dropped messages are added as `log_lost`."""
         try:
             data = to_json({**health, "log_lost": dict(self.lost)})
         except Exception as error:
@@ -350,7 +345,6 @@ class FlightLog:
                 log.debug("flight log ends without an index: %s", error)
 
     def _head(self) -> list[Message]:
-        """First messages of every file."""
         camera = _message(CAMERA, self._time_ns, calibration_message(self._camera, self._time_ns))
         return [self._session_message(self._session), camera]
 

@@ -63,7 +63,6 @@ class ImageMotion:
 
     @property
     def seconds(self) -> float:
-        """Time between the images."""
         return (self.end_ns - self.start_ns) / 1e9
 
 
@@ -74,20 +73,15 @@ class PictureOdometry:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the image before."""
         self._before: Grey | None = None
         self._arrived_ns = 0
         self._corners: Corners | None = None
 
     def wants(self, arrived_ns: int) -> bool:
-        """Whether an image that arrived then would be used."""
         return self._before is None or not 0 <= arrived_ns - self._arrived_ns < SHORTEST_S * 1e9
 
     def motion(self, grey: Grey, camera: Camera, arrived_ns: int) -> ImageMotion | None:
-        """Motion since the image before; None where they are too close, too far apart, or differ.
-
-        `grey` (H, W); `camera` of its size; `arrived_ns`: time of arrival.
-        """
+        """Motion since the image before; None where it is too close, too far away, or differs."""
         if not self.wants(arrived_ns):
             return None
         share = min(1.0, SIDE_PX / max(grey.shape))
@@ -212,17 +206,13 @@ def reported_motion(
 
 
 class StateHistory:
-    """Attitude, velocity and height of the camera over time. Mutable."""
-
     def __init__(self, gap_s: float = GAP_S) -> None:
-        """`gap_s`: longest interval between states that is interpolated."""
         self._gap_ns = round(gap_s * 1e9)
         self._times: Times = np.zeros(0, np.int64)
         self._rows: Array = np.zeros((0, 13))
 
     @property
     def newest_ns(self) -> int:
-        """Time of the newest state; a time before all where there is none."""
         return int(self._times[-1]) if len(self._times) else -(2**62)
 
     def add(
@@ -247,7 +237,6 @@ class StateHistory:
         self._rows = np.concatenate([self._rows[first:], row[None]])
 
     def motion(self, start_ns: Times, end_ns: Times) -> ReportedMotion:
-        """Motion of the picture between N pairs of times (N,), all of one duration."""
         start, end = self._at(start_ns), self._at(end_ns)
         seconds = float(end_ns[0] - start_ns[0]) / 1e9
         velocity, height = (start[:, 9:12] + end[:, 9:12]) / 2, start[:, 12]
@@ -255,7 +244,6 @@ class StateHistory:
         return reported_motion(before, after, velocity, height, seconds)
 
     def velocity(self, times_ns: Times) -> Array:
-        """Velocities (N, 2) east and north at N times; NaN where not known."""
         return self._at(times_ns)[:, 9:11]
 
     def _at(self, times_ns: Times) -> Array:

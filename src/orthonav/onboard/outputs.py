@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
@@ -45,6 +45,10 @@ from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
 from orthonav.onboard.ports import Descriptor, Udp, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
+if TYPE_CHECKING:
+    from orthonav.onboard.console import Narrator
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
+
 log = logging.getLogger(__name__)
 KINDS = {
     "global-position": "GLOBAL_POSITION_SENSOR",
@@ -70,17 +74,10 @@ _MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
 
 @dataclass(frozen=True)
 class MessageOptions:
-    """Messages to send and their fields; docs/autopilots.md describes each message.
+    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md).
 
-    `kinds`: names of messages, keys of `KINDS`.
-    `clock`: clock of the timestamps.
-    `sensor_id`: id of GLOBAL_POSITION_SENSOR, 1 to 255; PX4's `EKF2_AGP0_ID`.
-    `gps_id`, `satellites`: fields of GPS_INPUT.
-    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored.
-    `min_std_m`: lower bound of the reported standard deviation, metres.
-    `min_confidence`: confidence (0 to 1) from which a position is reported as valid.
-    `autopilot`: whose conventions local messages follow; None: those of the autopilot heard.
-    `origin`: origin of the local frame to set, on the ground, where the autopilot has none.
+    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored. `origin`: of the
+    local frame, set on the ground where the autopilot has none.
     """
 
     kinds: tuple[str, ...] = ("global-position",)
@@ -91,7 +88,6 @@ class MessageOptions:
     hdop_m: float | None = None
     min_std_m: float = 0.0
     min_confidence: float = CONFIDENT
-    autopilot: Autopilot | None = None
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
@@ -101,16 +97,14 @@ class MessageOptions:
 
 
 class Messenger:
-    """Builds the messages of a view and sends those that are due. Mutable.
+    """Builds and sends the messages of a view that are due. Mutable.
 
-    `incomplete`: number of messages that could not be built. `too_slow`: number of local messages
-    that followed the one before too late for PX4.
+    `incomplete`: messages that could not be built; `too_slow`: those too late for PX4.
     """
 
     def __init__(
         self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
     ) -> None:
-        """`gate` limits the rates; `send` returns whether the port was open."""
         self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
         self._covariance = FilterCovariance(options.min_std_m)
         self.incomplete = self.too_slow = 0
@@ -128,11 +122,7 @@ class Messenger:
         kind: Autopilot | None,
         origin: Origin | None,
     ) -> tuple[str, ...]:
-        """Names of the messages that were sent.
-
-        `exposed_ns` is the time of exposure by our clock, `boot_ns` by the autopilot's. `vehicle`,
-        `target`, `kind` and `origin` are what the autopilot reported.
-        """
+        """Names of the messages sent. `exposed_ns`: by our clock; `boot_ns`: the autopilot's."""
         sent = []
         for name in self.options.kinds:
             if estimate.dead_reckoned and name != "global-position":
@@ -154,12 +144,8 @@ class Messenger:
         """Note that a message was sent, and whether it was too late for PX4."""
         interval_s = self._covariance.interval_s(name, exposed_ns)
         self._covariance.sent(name, exposed_ns)
-        if name in LOCAL and self._convention(kind) is Autopilot.PX4:
+        if name in LOCAL and kind is not Autopilot.ARDUPILOT:
             self.too_slow += PX4_VISION_S <= interval_s < math.inf
-
-    def _convention(self, kind: Autopilot | None) -> Autopilot:
-        """Whose conventions local messages follow; `kind` is the autopilot heard."""
-        return self.options.autopilot or kind or Autopilot.PX4
 
     def _not_made(self, name: str, error: EstimateError) -> None:
         """Count a message that could not be built, and log why, once for each reason."""
@@ -172,17 +158,13 @@ class Messenger:
 
     @property
     def needs_origin(self) -> bool:
-        """Whether messages are in the autopilot's local frame."""
         return any(kind in LOCAL for kind in self.options.kinds)
 
     def find_origin(
         self, known: Origin | None, target: Target | None, *, armed: bool | None
     ) -> None:
-        """Ask the autopilot for the origin of its local frame until it reports one (`known`).
-
-        One that has none gets that of the options, unless it is `armed`: an origin that moves in
-        flight moves the aircraft.
-        """
+        """Ask for the origin of the local frame until it is `known`. Where there is none, set that
+        of the options, unless `armed`: an origin that moves in flight moves the aircraft."""
         now_ns, origin = self._clocks.mono_ns(), self.options.origin
         if known is not None:
             self._requests = 0
@@ -230,7 +212,7 @@ class Messenger:
             )
         make = odometry if name == "odometry" else vision_position_estimate
         pose = _pose(vehicle, origin)
-        return make(estimate, pose, self._convention(kind), clock=clock, min_confidence=least)
+        return make(estimate, pose, kind or Autopilot.PX4, clock=clock, min_confidence=least)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -247,16 +229,6 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
     )
 
 
-class Sink(Protocol):
-    """Output for bytes that never blocks. `write` raises `OSError` where it fails."""
-
-    def write(self, data: bytes) -> None:
-        """Send `data`."""
-
-    def close(self) -> None:
-        """Close the output."""
-
-
 class TcpSink:
     """TCP server that sends the same data to all clients; one that does not read is dropped."""
 
@@ -265,13 +237,7 @@ class TcpSink:
         self._listening.setblocking(False)
         self._clients: list[socket.socket] = []
 
-    @property
-    def port(self) -> int:
-        """Port of the server."""
-        return int(self._listening.getsockname()[1])
-
     def write(self, data: bytes) -> None:
-        """Send to each client, all of `data` or nothing."""
         try:
             while len(self._clients) < _MOST_CLIENTS:
                 client, _ = self._listening.accept()
@@ -290,7 +256,6 @@ class TcpSink:
                 self._clients.remove(client)
 
     def close(self) -> None:
-        """See `Sink.close`."""
         for each in (*self._clients, self._listening):
             each.close()
 
@@ -303,7 +268,6 @@ class SerialSink:
         self._port: Descriptor | None = open_serial(device, baud)
 
     def write(self, data: bytes) -> None:
-        """See `Sink.write`."""
         if self._port is None:
             self._port = open_serial(self._device, self._baud)
         try:
@@ -313,10 +277,12 @@ class SerialSink:
             raise
 
     def close(self) -> None:
-        """See `Sink.close`."""
         if self._port is not None:
             self._port.close()
             self._port = None
+
+
+Sink = Udp | TcpSink | SerialSink
 
 
 def open_sink(url: str) -> Sink:
@@ -343,13 +309,11 @@ class NmeaOut:
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
-        """Write one view; `utc_ns` is its time where there is no estimate. Raises `OSError`."""
         options: dict[str, Any] = {"utc_ns": utc_ns, "min_confidence": min_confidence}
         sentences = [make(estimate, quality=self._quality, **options) for make in (gga, rmc)]
         self._sink.write(b"".join([*sentences, gst(estimate, **options)]))
 
     def close(self) -> None:
-        """Close the sink."""
         self._sink.close()
 
 
@@ -370,18 +334,15 @@ class JsonOut:
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
     ) -> None:
-        """Write one view. Raises `OSError`."""
         more = {"age_ms": round(age_ms, 3), "sent": list(sent), "withheld": withheld}
         line = result_to_json(result)[:-1] + ", " + json.dumps(more)[1:]
         self._write(self._identity.added_to(line))
         self._identity = UNKNOWN
 
     def health(self, plain: dict[str, object]) -> None:
-        """Write one line of health. Raises `OSError`."""
         self._write(json.dumps(plain, allow_nan=False))
 
     def close(self) -> None:
-        """Close the file."""
         if self._path is not None and self._stream is not None:
             self._stream.close()
 
@@ -402,41 +363,6 @@ class JsonOut:
             raise
 
 
-class ViewOutput(Protocol):
-    """Takes every view, and the health: lines of JSON, the console. Raises `OSError`."""
-
-    def view(
-        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
-    ) -> None:
-        """Take one view: its age at the end, the messages sent, why none was."""
-
-    def health(self, plain: dict[str, Any]) -> None:
-        """Take the health."""
-
-    def close(self) -> None:
-        """Close the output."""
-
-
-class PositionOutput(Protocol):
-    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`.
-
-    `for_filter`: whether it gets covariances for a filter instead of those of the fixes.
-    """
-
-    for_filter: bool
-
-    def position(
-        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
-    ) -> tuple[str, ...]:
-        """Send one position; returns the names of messages. `stamp_ns`: time of the image."""
-
-    def health(self, plain: dict[str, Any]) -> None:
-        """Send the health."""
-
-    def close(self) -> None:
-        """Close the output."""
-
-
 class Publisher:
     """Publishes results to all outputs. Mutable."""
 
@@ -448,8 +374,8 @@ class Publisher:
         messenger: Messenger | None = None,
         link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
-        lines: Sequence[ViewOutput] = (),
-        graph: PositionOutput | None = None,
+        lines: "Sequence[JsonOut | Narrator]" = (),
+        graph: "Ros2Publisher | None" = None,
         min_confidence: float = CONFIDENT,
         min_std_m: float = 0.0,
     ) -> None:
@@ -457,7 +383,7 @@ class Publisher:
         self.gate, self._clocks = gate, clocks
         self.messenger, self._link = messenger, link
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
-        self._graph = [graph] if graph is not None else []
+        self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
         self.failed = 0
 
@@ -470,12 +396,8 @@ class Publisher:
         judged: bool,
         withheld: str | None = None,
     ) -> tuple[str, ...]:
-        """Send the position of a view where the gate admits it; the names of the messages.
-
-        Only views that the locator processed (`judged`) can give a position: the prediction of a
-        track is not a measurement. `withheld`: reason why a view was not located, which the gate
-        counts.
-        """
+        """Send a position that the gate admits; the names of the messages. Only a view that was
+        processed (`judged`) gives one: the prediction of a track is not a measurement."""
         estimate: NavigationEstimate | None = None
         sent: tuple[str, ...] = ()
         if withheld is not None:
@@ -498,11 +420,9 @@ class Publisher:
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
-        """Send the health to the outputs that carry it."""
         self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
-        """Close all outputs."""
         self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
 
     def _send(

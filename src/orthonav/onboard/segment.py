@@ -38,8 +38,7 @@ class _Tail:
     def tell(self) -> int:
         return self._count
 
-    def flush(self) -> None:
-        """Do nothing: `Segment` writes to disk."""
+    def flush(self) -> None: ...
 
     def taken(self) -> bytes:
         parts, self._parts = self._parts, []
@@ -140,11 +139,8 @@ def _write_ending(handle: int, size_bytes: int) -> None:
 
 
 def next_segment(folder: Path, name: str, needed_bytes: int, max_bytes: int | None) -> Segment:
-    """Next file `NAME_0001.mcap` of a log.
-
-    The oldest files are deleted until the others and `needed_bytes` fit into `max_bytes`. Raises
-    `OSError`.
-    """
+    """Next file `NAME_0001.mcap` of a log; the oldest are deleted until the rest and `needed_bytes`
+    fit into `max_bytes`. Raises `OSError`."""
     pattern = re.compile(re.escape(name) + r"_(\d{4,9})\.mcap")
     found = ((pattern.fullmatch(path.name), path) for path in folder.iterdir())
     files = {int(match[1]): path for match, path in found if match}

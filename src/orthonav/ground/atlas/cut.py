@@ -55,8 +55,7 @@ from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.warp import SheetSource, Warp, joined_cells, joined_grey, outline
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
-from orthonav.ground.build.cellparts import StoredCells
-from orthonav.ground.build.layer import GreyLayerWriter, Parts
+from orthonav.ground.build.layer import GreyLayerWriter, Parts, StoredCells
 from orthonav.ground.build.sheet import (
     MIN_TILE_VALID_SHARE,
     PREVIEW_PX,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate, floored
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.onboard.messages.mavlink import (
     Message,
     clamped,
@@ -91,7 +91,6 @@ def odometry(
     autopilot: Autopilot,
     *,
     clock: Clock = Clock.UTC,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
@@ -103,7 +102,7 @@ def odometry(
     known, or the estimate is of low confidence.
     """
     require_confident(estimate, min_confidence, "ODOMETRY")
-    position, variance = _position(estimate, pose, autopilot, min_std_m, "ODOMETRY")
+    position, variance = _position(estimate, pose, autopilot, "ODOMETRY")
     velocity_ned = _velocity_ned(estimate, pose)
     frames = (_LOCAL_NED, _LOCAL_NED)
     velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
@@ -146,7 +145,6 @@ def vision_position_estimate(
     autopilot: Autopilot,
     *,
     clock: Clock = Clock.UTC,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
@@ -155,7 +153,7 @@ def vision_position_estimate(
     the estimate is of low confidence.
     """
     require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
-    (x, y, z), variance = _position(estimate, pose, autopilot, min_std_m, "this message")
+    (x, y, z), variance = _position(estimate, pose, autopilot, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
     roll, pitch, yaw = pose.attitude_rad
@@ -193,14 +191,10 @@ def _position(
     estimate: NavigationEstimate,
     pose: LocalPose,
     autopilot: Autopilot,
-    min_std_m: float,
     message: str,
 ) -> tuple[Triple, Array]:
-    """North, east, down in metres and their (3, 3) covariance, all of them known.
-
-    ArduPilot makes one standard deviation of the covariance; it gets the one that comes out as the
-    horizontal standard deviation.
-    """
+    """North, east, down in metres and their covariance (3, 3), all known. ArduPilot makes one
+    standard deviation of it: it gets the one that comes out as the horizontal one."""
     north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
     down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
     if not math.isfinite(down):
@@ -211,10 +205,10 @@ def _position(
             "receivers drop the position or its accuracy"
         )
     if autopilot is Autopilot.ARDUPILOT:
-        std_m = estimate.horizontal_std_m(min_std_m)
+        std_m = estimate.horizontal_std_m()
         return (north, east, down), np.eye(3) * ardupilot_variance(std_m)
     variance = np.zeros((3, 3))
-    variance[:2, :2] = floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
+    variance[:2, :2] = estimate.cov_en_m2[::-1, ::-1]
     variance[2, 2] = down_std**2
     return (north, east, down), variance
 

@@ -25,8 +25,6 @@ _UNIX = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Quality(Enum):
-    """GGA quality, RMC status and RMC mode of a confident position."""
-
     ESTIMATED = ("6", "V", "E")
     """Estimated, which is true. The RMC status is then V, as NMEA requires for all modes but A and
     D, so that receivers that need satellites (such as ArduPilot) do not take it for GPS."""
@@ -136,7 +134,6 @@ def _minutes(degrees: float, width: int) -> str:
 
 
 def _moment(utc_ns: int | None) -> datetime | None:
-    """Date and time; None where it is unknown or out of range."""
     if utc_ns is None:
         return None
     try:
