@@ -120,8 +120,7 @@ class Flight:
         publisher = Publisher(
             self.gate,
             clocks,
-            messenger=Messenger(messages, self.gate, self.link.send, clocks),
-            link=self.link,
+            messenger=Messenger(messages, self.gate, self.link, clocks),
             lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
@@ -442,7 +441,7 @@ def test_without_telemetry_there_is_no_fix(flight):
 def test_a_link_that_failed_is_opened_again(flight):
     flight.port.broken = OSError("unplugged")
     flight.views(60)
-    assert "link_down" in flight.reasons() and not flight.link.status().is_open
+    assert "link_down" in flight.reasons() and not flight.link.is_open
     assert flight.runner.counter.total["no_telemetry"] > 0
     flight.port.broken = None
     flight.views(70)

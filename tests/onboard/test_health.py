@@ -18,11 +18,11 @@ from orthonav.onboard.health import (
     Health,
     HealthReporter,
     Level,
-    Notifier,
     Snapshot,
     TelemetryDiagnosis,
     judge,
     mismatch,
+    notify,
 )
 
 GOOD = Snapshot(60.0, {"taken": 50, "processed": 50, "confident": 50}, latency_s=0.1)
@@ -125,11 +125,11 @@ def test_systemd_is_notified(tmp_path, abstract, monkeypatch):
         receiver.settimeout(2)
         receiver.bind(name.replace("@", "\0"))
         monkeypatch.setenv("NOTIFY_SOCKET", name)
-        assert Notifier().notify("READY=1", "STATUS=flying")
+        assert notify("READY=1", "STATUS=flying")
         assert receiver.recv(100) == b"READY=1\nSTATUS=flying"
-    assert not Notifier().notify("WATCHDOG=1")  # the socket is closed
+    assert not notify("WATCHDOG=1")  # the socket is closed
     monkeypatch.delenv("NOTIFY_SOCKET")
-    assert not Notifier().notify("WATCHDOG=1")
+    assert not notify("WATCHDOG=1")
 
 
 def test_heading_mismatch_is_between_minus_180_and_180():

@@ -194,7 +194,7 @@ def test_clocks_are_compared(flying):
         there = flying.boot_ns()
         flying.time.go(0.004)
         flying.hear(flying.autopilot.say("timesync", there, asked["ts1"]))
-    assert flying.link.status().synced
+    assert flying.link.sync.is_exact
     assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
     other = flying.autopilot.say("timesync", 1, 12345)  # an answer without a request
     flying.hear(other)
@@ -232,8 +232,8 @@ def test_a_missing_port_is_retried_at_growing_intervals():
     for _ in range(600):
         flying.link.poll()
         flying.time.go(0.1)
-    assert 12 <= flying.link.counts["error"] <= 18 and not flying.link.status().is_open
-    assert flying.link.status().heard_age_s == math.inf
+    assert 12 <= flying.link.counts["error"] <= 18 and not flying.link.is_open
+    assert flying.link.heard_age_s == math.inf
     flying.port.refuse = False
     flying.time.go(RETRY_S[-1])
     assert flying.hear(flying.autopilot.heartbeat()) == 1

@@ -49,22 +49,25 @@ class Sending:
     """A messenger whose link is a list."""
 
     def __init__(self, *kinds, rules=None, **options):
-        self.time, self.frames, self.open = Time(), [], True
+        self.time, self.frames, self.is_open = Time(), [], True
+        self.kind, self.target, self.armed = Autopilot.PX4, Target(1, 1), False
+        self.origin, self.boot_time_ns = ORIGIN, 61 * S
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
         options = MessageOptions(kinds=kinds or ("global-position",), **options)
-        self.messenger = Messenger(options, self.gate, self.send, self.time.clocks)
+        self.messenger = Messenger(options, self.gate, self, self.time.clocks)
         self.packer = Packer()
+
+    def boot_ns(self, mono_ns):
+        return self.boot_time_ns
 
     def send(self, message):
         self.frames.append(decode(self.packer.pack(message)))
-        return self.open
+        return self.is_open
 
-    def publish(self, estimate=ESTIMATE, telemetry=VEHICLE, origin=ORIGIN, age_s=0.25, **more):
-        known = {"target": Target(1, 1), "kind": Autopilot.PX4, "boot_ns": 61 * S, **more}
-        exposed = self.time.now_ns - round(age_s * S)
-        return self.messenger.publish(
-            estimate, telemetry, exposed_ns=exposed, origin=origin, **known
-        )
+    def publish(self, estimate=ESTIMATE, telemetry=VEHICLE, age_s=0.25, **link):
+        vars(self).update(link)
+        exposed_ns = self.time.now_ns - round(age_s * S)
+        return self.messenger.publish(estimate, telemetry, exposed_ns)
 
 
 def test_every_message_has_the_position():
@@ -105,7 +108,7 @@ def test_times_are_those_of_exposure_and_sending():
 def test_no_stamp_by_an_unknown_clock_of_the_autopilot(caplog):
     boot = Sending(clock=Clock.BOOT)
     for _ in range(2):
-        assert boot.publish(boot_ns=None) == () and boot.frames == []
+        assert boot.publish(boot_time_ns=None) == () and boot.frames == []
     assert boot.messenger.incomplete == 2 and len(caplog.messages) == 1
     assert "boot" in caplog.text
 
@@ -113,7 +116,9 @@ def test_no_stamp_by_an_unknown_clock_of_the_autopilot(caplog):
 def test_local_messages_wait_for_the_origin_and_the_height():
     sending = Sending("odometry", "global-position")
     assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
-    assert sending.publish(telemetry=VehicleState(None)) == ("GLOBAL_POSITION_SENSOR",)
+    assert sending.publish(telemetry=VehicleState(None), origin=ORIGIN) == (
+        "GLOBAL_POSITION_SENSOR",
+    )
     assert sending.messenger.incomplete == 2
     assert sending.gate.withheld == {"not_made:ODOMETRY": 2}
     assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
@@ -125,8 +130,9 @@ def test_local_messages_wait_for_the_origin_and_the_height():
 def find_origin(sending, seconds, known=None, *, armed=False):
     """What is sent while an autopilot is asked; `known`: the origin that it reports."""
     sending.frames.clear()
+    sending.origin, sending.target, sending.armed = known, Target(3, 1), armed
     for _ in range(10 * seconds):
-        sending.messenger.find_origin(known, Target(3, 1), armed=armed)
+        sending.messenger.find_origin()
         sending.time.go(0.1)
     return [each["name"] for each in sending.frames]
 
@@ -160,7 +166,7 @@ def test_an_origin_is_never_set_in_flight(armed):
 
 def test_an_origin_is_not_set_by_a_link_that_does_not_send():
     sending = Sending("odometry", origin=ORIGIN)
-    sending.open = False
+    sending.is_open = False
     assert set(find_origin(sending, 60)) == {"COMMAND_LONG"}  # none of them was heard
 
 
@@ -254,9 +260,7 @@ def test_nmea_over_tcp_to_all_clients_that_read():
     address = sink._listening.getsockname()
     assert isinstance(sink, TcpSink) and address[0] == "127.0.0.1"
     out = NmeaOut(sink, quality=Quality.AUTONOMOUS)
-    clients = [
-        socket.create_connection(address) for _ in range(2)
-    ]
+    clients = [socket.create_connection(address) for _ in range(2)]
     out.write(ESTIMATE, UTC_NS, 0.9)
     for client in clients:
         client.settimeout(2)

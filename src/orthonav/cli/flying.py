@@ -45,7 +45,7 @@ from orthonav.onboard.gnss.watch import (
     LiveSolutions,
     RecordedSolutions,
 )
-from orthonav.onboard.health import Notifier, TelemetryDiagnosis
+from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
@@ -171,7 +171,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         ),
         start=start,
         fresh=locator,
-        notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
     )
@@ -344,12 +343,11 @@ def _publisher(
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None if link is None else Messenger(chosen, gate, link.send, clocks)
+    messenger = None if link is None else Messenger(chosen, gate, link, clocks)
     return Publisher(
         gate,
         clocks,
         messenger=messenger,
-        link=link,
         nmea=nmea,
         lines=[*lines, narrator],
         graph=graph,

@@ -32,12 +32,12 @@ from orthonav.onboard.health import (
     EventCounter,
     Health,
     HealthReporter,
-    Notifier,
     Snapshot,
     StartCheck,
     TelemetryDiagnosis,
     judge,
     mismatch,
+    notify,
 )
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
@@ -108,7 +108,6 @@ class Runner:
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
-        notifier: Notifier | None = None,
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
@@ -122,7 +121,6 @@ class Runner:
         self._start_check: StartCheck | None = None
         self._begin, self._fresh = start, fresh
         self._time_ns = 0
-        self._notifier = notifier or Notifier("")
         self._gnss = gnss
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
         self.health: Health | None = None
@@ -145,7 +143,7 @@ class Runner:
 
     def run(self, stopping: threading.Event) -> None:
         self._log(lambda sink: sink.options(dict(self.options.logged_options)))
-        self._notifier.notify("READY=1", "STATUS=waiting for images")
+        notify("READY=1", "STATUS=waiting for images")
         try:
             is_over = False
             while not stopping.is_set() and not is_over:
@@ -156,7 +154,7 @@ class Runner:
                     log.exception("unexpected error in the flight loop")
                     self._count("internal_error")
         finally:
-            self._notifier.notify("STOPPING=1")
+            notify("STOPPING=1")
             self._save_state()
             self._publisher.close()
             self._log(lambda sink: sink.close())
@@ -481,7 +479,7 @@ class Runner:
         plain = self._plain(health, seen.start_off_m)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
-        self._notifier.notify("WATCHDOG=1", f"STATUS={health.text()}")
+        notify("WATCHDOG=1", f"STATUS={health.text()}")
         if self._link is None:
             return
         self._link.system_status = health.level.value
@@ -493,8 +491,7 @@ class Runner:
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
-            link = self._link
-            self._publisher.messenger.find_origin(link.origin, link.target, armed=link.armed)
+            self._publisher.messenger.find_origin()
 
     def _send_text(self, severity: int, text: str) -> None:
         self._texts += 1
@@ -525,7 +522,7 @@ class Runner:
         counts = self.counter.counts(now_ns)
         link, has_origin = None, True
         if self._link is not None:
-            link, messenger = self._link.status(), self._publisher.messenger
+            link, messenger = self._link, self._publisher.messenger
             needed = messenger is not None and messenger.needs_origin
             has_origin = not needed or self._link.origin is not None
         uses_link = link is not None and not self.options.recorded
@@ -545,7 +542,7 @@ class Runner:
             low_confidence_s=(now_ns - self._confident_ns) / 1e9,
             latency_s=self.counter.latency_s(0.95),
             state=state,
-            synced=link.synced if link else True,
+            synced=link is None or link.sync.is_exact,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,

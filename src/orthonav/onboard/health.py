@@ -193,24 +193,19 @@ class HealthReporter:
         return True
 
 
-class Notifier:
-    """Notifies systemd: datagrams to the socket that it names, as `sd_notify(3)` sends them."""
-
-    def __init__(self, address: str | None = None) -> None:
-        address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
-        self._address = "\0" + address[1:] if address.startswith("@") else address
-
-    def notify(self, *lines: str) -> bool:
-        """Send lines such as `READY=1`, `WATCHDOG=1`, `STATUS=..`; whether they were sent."""
-        if not self._address:
-            return False
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
-                out.setblocking(False)
-                out.sendto("\n".join(lines).encode(), self._address)
-        except OSError:
-            return False
-        return True
+def notify(*lines: str) -> bool:
+    """Send `READY=1`, `WATCHDOG=1`, `STATUS=..` to systemd as `sd_notify(3)` does."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    address = "\0" + address[1:] if address.startswith("@") else address
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+            out.setblocking(False)
+            out.sendto("\n".join(lines).encode(), address)
+    except OSError:
+        return False
+    return True
 
 
 def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:

@@ -7,7 +7,7 @@ a pyramid, Bouguet 2001) in a small picture, independently of the odometry of th
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -170,13 +170,11 @@ def centre_motion(homographies: Array) -> tuple[Array, Array]:
     return np.asarray(turn), np.asarray(shift)
 
 
-@dataclass(frozen=True, eq=False)
-class ReportedMotion:
-    """Motion of the picture that follows from the reported state, for N pairs of times.
+class ReportedMotion(NamedTuple):
+    """Motion of the picture by the reported state for N pairs of times; NaN where not known.
 
-    `turn_rad` (N,): by the attitudes, and by the velocity where that is known. `tilt_shift`
-    (N, 2): by the attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground. NaN
-    where the state is not known.
+    `turn_rad` (N,): by the attitudes, and the velocity where known. `tilt_shift` (N, 2): by the
+    attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground.
     """
 
     turn_rad: Array
