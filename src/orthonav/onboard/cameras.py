@@ -1,7 +1,6 @@
 """Images of live cameras (devices and streams) and of recordings played in real time.
 
-A thread reads; the consumer gets the newest image, and replaced images are counted. Every image
-carries its time of exposure by our monotonic clock.
+A thread reads; the consumer gets the newest image, and replaced images are counted.
 """
 
 import logging

@@ -1,8 +1,5 @@
-"""What `orthonav fly` says while it flies: inputs that come and go, states of the track with their
-reason, faults, a status line every few seconds, and a summary at the end.
-
-An output of `Publisher` like the lines of JSON: it takes every view, and the health once a second.
-"""
+"""What `orthonav fly` says while it flies: inputs, states of the track, faults, a status line every
+few seconds, a summary. It is an output of `Publisher`, like the lines of JSON."""
 
 import contextlib
 import logging

@@ -1,8 +1,6 @@
 """Telemetry of the last seconds, interpolated to the exposure of a view.
 
-There are two clocks: ours (monotonic) and the autopilot's (since boot). Samples carry times of the
-autopilot's clock; `ClockSync` converts the time of exposure to it. Nothing here reads a clock or a
-port.
+Samples carry times of the autopilot's clock (since boot); `ClockSync` converts ours to it.
 """
 
 import math
@@ -24,9 +22,8 @@ from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Telemetry
 
 HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
-"""Sources of the height above ground, best first: a rangefinder that looks down, the autopilot's
-terrain model, the height above sea level (with the terrain of the map only), and the height above
-home (without that terrain correct over flat ground only) of two messages."""
+"""Sources of the height above ground, best first: a rangefinder, the autopilot's terrain model, the
+height above sea level (with the terrain of the map only), that above home of two messages."""
 _ABOVE_HOME = ("home", "relative")
 _SECOND_AMSL = "altitude"
 """Height above sea level of a second message, where the first gives none."""
@@ -47,14 +44,12 @@ FASTEST_MPS = 300.0
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 UNAIDED_VEL_STD_MPS = 5.0
-"""Of the velocity without GNSS: that of PX4 was 2 to 5 m/s off in simulated flights, and changed
-within 10 s."""
+"""Of the velocity without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
 UNAIDED_TILT_STD_DEG, AIDED_TILT_STD_DEG = 3.0, 1.5
 """Of the horizon: PX4's was 2 to 4 deg off without GNSS. With GNSS, errors of the accelerometers
 and of the mount remain; ArduPilot's was 0.4 deg off without it (docs/closed-loop.md)."""
 LARGEST_AIDED_MPS = 1.0
-"""A filter that claims a larger standard deviation of its velocity does not fuse GNSS, whatever the
-receiver has."""
+"""A filter that claims more for its velocity does not fuse GNSS, whatever the receiver has."""
 STATUS_NS, FIX_NS = 5 * 10**9, 3 * 10**9
 """A status and a fix hold for so long; the autopilots send both at 1 Hz or more."""
 ABSOLUTE = 16

@@ -47,11 +47,7 @@ class Autopilot(Enum):
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of an autopilot's local frame.
-
-    `lat_deg`, `lon_deg`: WGS84. `alt_amsl_m`: metres above mean sea level; needed, because the
-    message that sets the origin cannot omit it. Raises `EstimateError` for invalid values.
-    """
+    """Origin of an autopilot's local frame (WGS84, m above mean sea level)."""
 
     lat_deg: float
     lon_deg: float
@@ -70,10 +66,8 @@ class Origin:
 class LocalPose:
     """State that the autopilot reported for the exposure, in its local frame. NaN: not known.
 
-    `origin`: origin of the local frame.
-    `down_m`, `down_std_m`: distance below the origin; needed where the estimate has no altitude.
+    `down_m`, `down_std_m`: below the origin; needed where the estimate has no altitude.
     `attitude_rad`, `attitude_std_rad`: roll, pitch, yaw of the body from NED (rotations ZYX).
-    `vel_down_mps`, `vel_down_std_mps`: velocity downwards.
     """
 
     origin: Origin
@@ -170,20 +164,14 @@ def vision_position_estimate(
     )
 
 
-def set_gps_global_origin(
-    origin: Origin, *, target_system: int = 1, time_ns: int | None = None
-) -> Message:
-    """SET_GPS_GLOBAL_ORIGIN (message 48): origin of the local frame.
-
-    Autopilots accept it once. `target_system` must be theirs: PX4 refuses 0. `time_ns`: time of
-    sending by the clock of the link.
-    """
+def set_gps_global_origin(origin: Origin, *, target_system: int = 1) -> Message:
+    """SET_GPS_GLOBAL_ORIGIN (message 48), which autopilots accept once. PX4 refuses system 0."""
     return dialect().MAVLink_set_gps_global_origin_message(
         target_system=target_system,
         latitude=deg_e7(origin.lat_deg),
         longitude=deg_e7(origin.lon_deg),
         altitude=clamped(origin.alt_amsl_m * 1000, _INT32_MIN, _INT32_MAX),
-        time_usec=0 if time_ns is None else microseconds(time_ns),
+        time_usec=0,
     )
 
 
@@ -243,10 +231,9 @@ def north_east_m(
 ) -> tuple[float, float]:
     """Metres north and east of `origin` that `autopilot` converts to this position.
 
-    PX4 converts metres on an azimuthal-equidistant plane of a sphere of 6371 km, ArduPilot by a
-    constant per degree; neither uses the ellipsoid. True metres, 10 km from the origin, would
-    become positions up to 67 m away. Sources: PX4-Autopilot `src/lib/geo/geo.cpp`
-    (`MapProjection::project`); ArduPilot `libraries/AP_Common/Location.cpp`.
+    PX4 converts metres on an azimuthal-equidistant plane of a sphere of 6371 km
+    (`src/lib/geo/geo.cpp`), ArduPilot by a constant per degree (`AP_Common/Location.cpp`): 10 km
+    from the origin, true metres would become positions up to 67 m away.
     """
     if autopilot is Autopilot.PX4:
         return _px4(origin, lat_deg, lon_deg)
@@ -260,8 +247,7 @@ def ardupilot_variance(std_m: float) -> float:
     """Variance of each of three axes that ArduPilot reads as the standard deviation `std_m`.
 
     It takes the root of the sum of the variances of all three axes; older versions the cube root of
-    the sum of their squares, which gives `std_m` at 3 m and more than it above
-    (`libraries/GCS_MAVLink/GCS_Common.cpp`).
+    the sum of their squares, which is not smaller (`GCS_MAVLink/GCS_Common.cpp`).
     """
     return std_m**2 / 3
 
