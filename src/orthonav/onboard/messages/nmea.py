@@ -1,9 +1,8 @@
 """NMEA 0183 sentences of a position: GGA, RMC and GST, for displays, loggers and old receivers.
 
 Fields are as in version 2.3 to 4.0; unknown values, and altitudes that do not fit, are empty.
-Without a confident position: quality 0 (GGA), status V and mode N (RMC), empty fields (GST). The writer of
-pynmeagps writes hundredths of seconds, 60.00000 minutes, zeros for unknown numbers, and the current
-time for an unknown one.
+Without a confident position: quality 0 (GGA), status V and mode N (RMC), empty fields (GST). The
+writer of pynmeagps writes 60.00000 minutes, zeros for unknown numbers and the time of now.
 """
 
 import math
