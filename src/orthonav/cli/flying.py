@@ -82,11 +82,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0
-"""Narrower views (pixels of the map across) are seldom confident and take the longest, which makes
-the next ones late. An aircraft climbs through them."""
+"""Narrower views (pixels of the map across) are seldom confident, and slow."""
 START_OFF_M, START_SIGMAS = 3000.0, 3.0
-"""A start farther off the map than this distance and so many of its deviations ends the program: a
-flight that comes from there gives the place where it reaches the map, or a larger deviation."""
+"""A start farther off the map than this distance and so many deviations ends the program."""
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
@@ -434,11 +432,8 @@ def gnss_watch(
     min_confidence: float,
     clocks: Clocks,
 ) -> GnssWatch:
-    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder.
-
-    `used`: camera, its mount and stated latency; after a change of them, what they add to the
-    difference is learnt again.
-    """
+    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
+    change of what is `used` (camera, mount, latency), what that adds is learnt again."""
     if options.gnss == "correct" and options.state is None:
         raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2

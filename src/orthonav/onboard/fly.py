@@ -1,7 +1,6 @@
 """The loop of `orthonav fly`: newest image, telemetry at its exposure, position, messages.
 
-It runs on one thread, fed by a camera thread and a link thread. Views are located by
-`orthonav.onboard.run.locate_view`, as those of a recorded flight are, so a log can be replayed.
+It runs on one thread, fed by a camera thread and a link thread.
 """
 
 import logging
@@ -227,7 +226,7 @@ class Runner:
     def _withheld(
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency
     ) -> ViewResult:
-        """Log and publish a view whose time of exposure is in doubt: the track must not get it."""
+        # Its time of exposure is in doubt: the track must not get it.
         reason = latency.reason or ""
         self._count(reason)
         result = self._result(image, NoFix(reason, latency.detail), math.nan)
@@ -388,10 +387,7 @@ class Runner:
         return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
 
     def _map_changed(self) -> NoFix | None:
-        """Reason to give no position where the map file was changed in place.
-
-        Parts in memory would still give positions; stopping shows the fault at once.
-        """
+        # Parts in memory would still give positions; stopping shows the fault at once.
         change = self.options.map_change()
         return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
@@ -607,10 +603,7 @@ class Runner:
 
 
 def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> Fix:
-    """The fix of a track with its velocity at the exposure, where it was estimated with a mean.
-
-    A reported velocity and its mean have the same error.
-    """
+    """The fix with the velocity at the exposure instead of the mean, which has the same error."""
     if mean is None or reported is None or mean == reported:
         return fix
     own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")

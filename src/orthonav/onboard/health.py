@@ -1,8 +1,4 @@
-"""Health of a flight: OK, DEGRADED or FAILED, with reasons; diagnosis of telemetry and start.
-
-`judge` is a pure function of counts over the last seconds. docs/onboard.md lists the reasons and
-their causes.
-"""
+"""Health of a flight with reasons (docs/onboard.md); diagnosis of telemetry and start."""
 
 import logging
 import math
@@ -33,8 +29,7 @@ IMAGE_AGE_S, TELEMETRY_AGE_S, LINK_AGE_S = 3.0, 3.0, 5.0
 LOW_CONFIDENCE_S, COASTING_S = 10.0, 2.0
 """Longest time without a confident position, in general and by views that do not show the map."""
 LATENCY_S, SHARE = 0.5, 0.2
-"""95th percentile of the time from exposure to message; share of the images in the window that are
-unusable, late or lack telemetry."""
+"""Of the 95th percentile from exposure to message; of images unusable, late, without telemetry."""
 HEADING_DEG, LOG_SCALE = 20.0, 0.2
 """Difference of estimated and reported heading, and of the logarithm of the height."""
 GRACE_S = 5.0

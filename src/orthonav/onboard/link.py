@@ -1,8 +1,4 @@
-"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages.
-
-pymavlink (extra `autopilot`) decodes incoming messages; `orthonav.onboard.messages.mavlink` packs
-outgoing ones.
-"""
+"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages."""
 
 import logging
 import math
@@ -51,8 +47,7 @@ _DOWNWARD = 25
 _FAR_NS = 60 * 10**9
 _ARMED = 128
 _SAME_M = 0.05
-"""Heights above home and above sea level that are the same within this are one height, twice: home
-is not within this of sea level."""
+"""Heights above home and above sea level that are the same within this are one height, twice."""
 
 
 class AutopilotLink:

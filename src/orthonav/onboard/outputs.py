@@ -62,22 +62,17 @@ ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
 DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
 """Standard deviations sent with the autopilot's own height and vertical velocity: assumed."""
 PX4_VISION_S = 0.2
-"""PX4 starts to fuse a local message only where it follows the one before sooner than this, and
-stops after twice this time without one (`EV_MAX_INTERVAL`; docs/autopilots.md)."""
+"""PX4 starts to fuse local messages only at shorter intervals (`EV_MAX_INTERVAL`)."""
 ORIGIN_NS, ORIGIN_REQUESTS = 2 * 10**9, 3
-"""Interval at which the autopilot is asked for its origin until it reports one, and number of
-requests without an answer after which it has none."""
+"""Interval of requests for the origin, and their number after which the autopilot has none."""
 _GPS_GLOBAL_ORIGIN = 49
 _MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
 
 
 @dataclass(frozen=True)
 class MessageOptions:
-    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md).
-
-    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored. `origin`: of the
-    local frame, set on the ground where the autopilot has none.
-    """
+    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md). `origin`: of the
+    local frame, set on the ground where the autopilot has none."""
 
     kinds: tuple[str, ...] = ("global-position",)
     clock: Clock = Clock.UTC
@@ -96,10 +91,8 @@ class MessageOptions:
 
 
 class Messenger:
-    """Builds and sends the messages of a view that are due. Mutable.
-
-    `incomplete`: messages that could not be built; `too_slow`: those too late for PX4.
-    """
+    """Builds and sends the messages that are due; counts those that are `incomplete`, and local
+    ones that are `too_slow` for PX4. Mutable."""
 
     def __init__(
         self, options: MessageOptions, gate: Gate, link: AutopilotLink, clocks: Clocks
@@ -298,8 +291,7 @@ class NmeaOut:
 
 
 class JsonOut:
-    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld` in addition, and
-    lines of health, which begin with the key `health`."""
+    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; the health."""
 
     def __init__(
         self, path: Path | None, stream: TextIO | None = None, identity: Identity = UNKNOWN

@@ -67,18 +67,14 @@ class Clocks:
 
 
 class Travelled(NamedTuple):
-    """Displacement since an arbitrary time: the integral of the reported velocity.
-
-    `part`: number of the uninterrupted part of the telemetry that it was integrated over.
-    """
+    """Integral of the reported velocity over an uninterrupted `part` of the telemetry."""
 
     part: int
     north_m: float
     east_m: float
 
     def since(self, before: "Travelled | None") -> tuple[float, float] | None:
-        """Metres east and north since an earlier one; None where the velocity in between is not
-        known."""
+        """Metres east and north; None where the velocity in between is not known."""
         if before is None or before.part != self.part:
             return None
         return self.east_m - before.east_m, self.north_m - before.north_m
@@ -357,10 +353,7 @@ class ClockSync:
         return self._at_ns + round(since_ns / (1 + self._rate))
 
     def exchange(self, sent_ns: int, received_ns: int, reported_ns: int) -> bool:
-        """Add an exchange; whether a clock was found to have jumped.
-
-        `sent_ns` and `received_ns` are times of our clock, `reported_ns` one of the autopilot's.
-        """
+        """Whether a clock was found to have jumped. `reported_ns`: the autopilot's time."""
         trip_ns = received_ns - sent_ns
         if not 0 <= trip_ns <= self.LONGEST_NS:
             return False

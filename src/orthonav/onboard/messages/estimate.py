@@ -1,8 +1,5 @@
-"""Input of all messages: one position at one exposure, with its accuracy and time.
-
-Unknown values are NaN or None here and are marked as unknown in the message; they never become a
-number that looks like a measurement.
-"""
+"""Input of all messages: one position at one exposure. Unknown values, NaN or None, never become a
+number that looks like a measurement."""
 
 import math
 from dataclasses import dataclass, field, replace

@@ -1,8 +1,7 @@
 """MAVLink messages in the autopilot's local frame: ODOMETRY, VISION_POSITION_ESTIMATE, its origin.
 
-They need more than a map provides: height, attitude and, in part, a 3D velocity. These are the
-autopilot's own values at the exposure (`LocalPose`), sent back to complete the message; its filter
-must fuse the horizontal position only (docs/autopilots.md).
+Height, attitude and vertical velocity are the autopilot's own (`LocalPose`), sent back to complete
+the message; its filter must fuse the horizontal position only (docs/autopilots.md).
 """
 
 import math
@@ -92,8 +91,7 @@ def odometry(
     PX4: pose and velocity in MAV_FRAME_LOCAL_NED; attitude and velocity are NaN where not known.
     ArduPilot: MAV_FRAME_LOCAL_FRD with its x axis north and the velocity in MAV_FRAME_BODY_FRD, the
     only pair that it accepts; it always reads attitude and velocity, so they must be known.
-    `quality` is the confidence in per cent. Raises `EstimateError` where a needed value is not
-    known, or the estimate is of low confidence.
+    `quality` is the confidence in per cent. Raises `EstimateError`.
     """
     require_confident(estimate, min_confidence, "ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, "ODOMETRY")
@@ -143,8 +141,7 @@ def vision_position_estimate(
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
 
-    Raises `EstimateError` where height or attitude is not known (the message cannot mark that), or
-    the estimate is of low confidence.
+    Raises `EstimateError` where height or attitude is not known, or for a low confidence.
     """
     require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
     (x, y, z), variance = _position(estimate, pose, autopilot, "this message")
