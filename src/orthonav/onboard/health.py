@@ -147,12 +147,10 @@ class EventCounter:
     def __init__(self) -> None:
         self._events: deque[tuple[int, str]] = deque()
         self._latencies: deque[tuple[int, float]] = deque()
-        self._counts: Counter[str] = Counter()
         self.total: Counter[str] = Counter()
 
     def add(self, now_ns: int, name: str) -> None:
         self._events.append((now_ns, name))
-        self._counts[name] += 1
         self.total[name] += 1
 
     def add_latency(self, now_ns: int, seconds: float) -> None:
@@ -161,10 +159,10 @@ class EventCounter:
     def counts(self, now_ns: int) -> Counter[str]:
         begin = now_ns - round(WINDOW_S * 1e9)
         while self._events and self._events[0][0] < begin:
-            self._counts[self._events.popleft()[1]] -= 1
+            self._events.popleft()
         while self._latencies and self._latencies[0][0] < begin:
             self._latencies.popleft()
-        return Counter(+self._counts)
+        return Counter(name for _, name in self._events)
 
     def latency_s(self, quantile: float) -> float:
         """Quantile (0 to 1) of the latencies within the window; 0 where there are none."""

@@ -328,7 +328,7 @@ _WEEK_MS = 7 * 86_400_000
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
-    """GPS week (without rollover) and time of week in ms; (0, 0), "not known", before 1980-01-06."""
+    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 1980-01-06."""
     utc_ms = utc_ns // 1_000_000
     leaps = bisect_right(_LEAPS_UNIX_S, utc_ms // 1000)
     since_epoch_ms = utc_ms - _EPOCH_UNIX_S * 1000 + leaps * 1000
