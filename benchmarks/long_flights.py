@@ -19,7 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.looped_flight import read_rows, route_of, write_rows
-from benchmarks.record import Section, Table, number, percent, quantiles, resumed, run, say
+from benchmarks.record import (
+    Section,
+    Table,
+    number,
+    percent,
+    quantiles,
+    resumed,
+    rows_path,
+    run,
+    say,
+)
 from benchmarks.scenes import FAR_M, PAST, PRESENT, area, map_of
 from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight, read_truth
@@ -91,7 +101,7 @@ def measure(options: argparse.Namespace) -> Section:
         for i in options.only or range(count)
     }
     outcomes = []
-    for outcome in resumed(options.work / "flights.jsonl", _followed, tasks):
+    for outcome in resumed(rows_path(options.work, "flights"), _followed, tasks):
         outcomes.append(outcome)
         say("  ".join(_row(outcome)))
     return _section(outcomes, km)

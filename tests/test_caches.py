@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.caches import ByteCache
+from orthonav.core.mapfile.reader import ByteCache
 
 KEYS = "abcdef"
 STEPS = st.lists(st.tuples(st.sampled_from(["get", "put"]), st.sampled_from(KEYS)), max_size=60)

@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.core.errors import CameraError, FlightError, MapFileError
-from orthonav.core.flight import decode_image
+from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map, write_map
@@ -91,11 +90,6 @@ def test_pictures_that_claim_gigapixels(flight_path, tmp_path):
         commands.append(("localize", GOLDEN, flight, "--out", tmp_path / "fixes.jsonl", "-q"))
     for message in refused(*commands):
         assert "image of the flight cannot be decoded" in message and "0001.jpg" in message
-
-
-def test_the_limit_of_pixels_holds_in_tests_too():
-    with pytest.raises(FlightError, match="cannot be decoded"):
-        decode_image(claiming(17_000, 17_000, ".jpg"), "a.jpg")
 
 
 # Maps.

@@ -14,10 +14,9 @@ from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight import open_flight
 from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.camera import Camera
-from orthonav.core.grey import grey_levels
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Telemetry, View
+from orthonav.core.records import Telemetry, View, grey_levels
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 NADIR = Telemetry(0, 0.0, 0.0, 0.0, 100.0)

@@ -48,15 +48,6 @@ def test_errors_are_fine_up_to_the_first_that_is_not():
     np.testing.assert_allclose(found.share, shares, atol=0.03)
 
 
-def test_where_nothing_is_found_no_error_is_fine():
-    found = envelope(0.0)
-    assert (found.tolerated_yaw_deg, found.tolerated_agl_low, found.tolerated_agl_high) == (
-        0.0,
-        0.0,
-        0.0,
-    )
-
-
 def test_heights():
     work = heights_work(PLAN, PLACES)
     assert [plan.agl_m for plan, _ in work] == [100.0 * part for part in HEIGHTS]

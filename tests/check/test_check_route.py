@@ -48,18 +48,6 @@ def test_drift_is_that_of_many_flights(views):
     np.testing.assert_allclose(found, truth, rtol=1e-6, atol=1e-6)
 
 
-def test_without_fixes_drift_grows_with_the_way():
-    distance = np.arange(0, 2001, 25.0)
-    found = expected_drift(distance, np.zeros(81), np.full(81, np.nan), 0.03, SIDE_M)
-    np.testing.assert_allclose(found, 0.03 * distance, atol=1e-6)
-
-
-def test_sure_fixes_leave_their_own_error():
-    distance = np.arange(0, 2001, 25.0)
-    found = expected_drift(distance, np.ones(81), np.full(81, 4.0), 0.03, SIDE_M)
-    np.testing.assert_allclose(found, 4.0)
-
-
 def predicted(probability, error_m):
     """A prediction of these values, with an interval of no width."""
     nothing = np.zeros_like(probability)

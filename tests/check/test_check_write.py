@@ -245,16 +245,6 @@ def test_a_full_disk_leaves_the_old_check(folder, opened, frame, monkeypatch, at
     assert [path.name for path in folder.parent.iterdir()] == ["check"]
 
 
-def test_an_interrupt_leaves_nothing(opened, frame, tmp_path, monkeypatch, undrawn):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("orthonav.ground.check.write.tif_bytes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_check(small_route(frame), opened, tmp_path / "check")
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("module", "extra"),
     [
@@ -274,12 +264,6 @@ def test_missing_extras_are_reported_before_any_work(module, extra, tmp_path, mo
 
 
 # Text
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_text_fits_a_terminal(kind):
-    lines = text(getattr(made_check, kind)(FRAME)).splitlines()
-    assert len(lines) <= 28 and max(map(len, lines)) <= 100
 
 
 def test_text_holds_no_control_characters():

@@ -14,7 +14,7 @@ from orthonav.core.errors import ImageryError
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.imagery.names import date_of, system_of
+from orthonav.ground.imagery.source import date_of, system_of
 
 SCENE = smooth_scene(200)
 PACKAGE = "BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D003_2013-01-01"

@@ -10,7 +10,7 @@ from rasterio.transform import Affine
 
 from orthonav.core.errors import ImageryError, MissingFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery import datum as datums
+from orthonav.ground.imagery import terrain as datums
 from orthonav.ground.imagery.terrain import open_dem
 
 FRAME = LocalFrame(46.5, 2.5)

@@ -87,9 +87,7 @@ def stopped(ortho, out, after=0.5, error=KeyboardInterrupt, **request):
 
 
 @pytest.mark.parametrize(
-    "request_",
-    [{}, {"tile_px": 96}],
-    ids=["chunks in one block", "chunks over blocks"],
+    "request_", [{}, {"tile_px": 96}], ids=["chunks in one block", "chunks over blocks"]
 )
 def test_any_number_of_workers_gives_the_same_bytes(ortho, tmp_path, request_):
     maps = [

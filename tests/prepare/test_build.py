@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.errors import (
-    AreaError,
-    OutputError,
-    VariantError,
-)
+from orthonav.core.errors import AreaError, OutputError, VariantError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.localize.confidence import LogisticConfidence, RegisteredConfidence

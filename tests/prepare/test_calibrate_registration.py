@@ -14,12 +14,7 @@ from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import SheetInfo, open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build import calibrate as module
-from orthonav.ground.build.calibrate import (
-    FLOOR_LIMITS_PX,
-    FLOOR_PX,
-    Crop,
-    calibrate_registration,
-)
+from orthonav.ground.build.calibrate import FLOOR_LIMITS_PX, FLOOR_PX, Crop, calibrate_registration
 from orthonav.ground.build.layer import halved
 
 SIDE_PX, TILE_PX = 240, 64

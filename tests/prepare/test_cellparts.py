@@ -11,10 +11,10 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.cellparts import StoredCells, cell_parts
+from orthonav.ground.build.layer import StoredCells, cell_parts
 
 GRID = TileGrid(0.0, 0.0, 1.0, 128, 32, 6, 5)
 LAYOUT = CellLayout(4, 4)

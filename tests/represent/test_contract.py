@@ -6,8 +6,7 @@ import pytest
 from edge_networks import write
 
 from orthonav.core.errors import VariantError
-from orthonav.core.tiles.gradients import OrientedGradients
-from orthonav.core.tiles.represent import TABLE, Canny, Gray
+from orthonav.core.tiles.represent import TABLE, Canny, Gray, OrientedGradients
 from orthonav.core.variants import make_variant
 from orthonav.research.segments import Segments
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.tiles.exact import BLOCK_ROWS, ExactIndex, rows_within
+from orthonav.core.tiles.position import BLOCK_ROWS, ExactIndex, rows_within
 
 CACHES = pytest.mark.parametrize("cache_bytes", [0, 2**27], ids=["blocks", "cached"])
 

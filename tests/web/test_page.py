@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import subprocess
-from html.parser import HTMLParser
 from importlib.resources import files
 from posixpath import dirname, join, normpath
 from urllib.parse import urlsplit
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from small_run import FRAME, GSD_M, NORTH_M, WEST_M
 
+from html_page import Page
 from orthonav.ground.report.page import static_text
 from orthonav.ground.view.server import SHARED, load_assets
 
@@ -20,28 +20,8 @@ STATIC = files("orthonav.ground.view").joinpath("static")
 OURS = {entry.name: entry.read_text(encoding="utf-8") for entry in STATIC.iterdir()}
 OURS |= {name: static_text(name) for name in SHARED}
 SCRIPTS = {name: text for name, text in OURS.items() if name.endswith(".js")}
-VOID = {"meta", "link", "img", "input", "br", "hr"}
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(NODE is None, reason="node is not installed")
-
-
-class Page(HTMLParser):
-    """Elements with their attributes; fails where tags are not closed in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.elements, self._open = [], []
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag, attributes):
-        self.elements.append((tag, dict(attributes)))
-        if tag not in VOID:
-            self._open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self._open.pop() == tag, f"line {self.getpos()}"
 
 
 @pytest.fixture(scope="module")

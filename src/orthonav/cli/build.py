@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
 
 LEAST_SHIFT_M = 0.3
-"""Drift of a plate that is named: a pixel of the finest orthophotos of countries."""
+"""A pixel of the finest orthophotos of countries."""
 log = logging.getLogger(__name__)
 
 EVERYDAY = (
@@ -36,7 +36,6 @@ RECIPE = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument(
         "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
     )
@@ -91,7 +90,6 @@ def _add_work(group: argparse._ActionsContainer) -> None:
 
 
 def add_recipe(parser: argparse._ActionsContainer) -> None:
-    """The options of `RECIPE`."""
     parser.add_argument(
         "--gsd-m", type=float, help="ground resolution, metres per pixel (default: of the imagery)"
     )
@@ -131,19 +129,16 @@ def add_recipe(parser: argparse._ActionsContainer) -> None:
 
 
 def recipe_of(options: argparse.Namespace) -> dict[str, Any]:
-    """The fields of the recipe that were given."""
     return {name: value for name in RECIPE if (value := getattr(options, name)) is not None}
 
 
 def reporter(options: argparse.Namespace) -> Callable[[str], None]:
-    """A function that prints lines about the work on a terminal, otherwise logs them."""
     if options.quiet or not sys.stderr.isatty():
         return log.info
     return lambda line: print(line, file=sys.stderr)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build the map and print a summary."""
     from orthonav.cli.info import summary, summary_text
     from orthonav.ground.build import BuildRequest, build_map
     from orthonav.ground.planning.route import read_route
@@ -182,7 +177,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _plates(manifest: "Manifest") -> list[dict[str, Any]]:
-    """Systems of the orthophotos that their tectonic plate has moved away from WGS 84 by now."""
+    """Systems that their tectonic plate has moved away from WGS 84 by now."""
     from orthonav.ground.imagery.plates import plate_shift_m
 
     now = time.gmtime()

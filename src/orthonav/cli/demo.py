@@ -42,7 +42,6 @@ WAYPOINTS_EN_M = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument(
         "--out",
         type=Path,
@@ -55,7 +54,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the demo and print its results."""
     from orthonav.core.files import replacing_folder
 
     start = time.perf_counter()

@@ -31,7 +31,6 @@ log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument(
         "fixes",
         type=Path,
@@ -87,7 +86,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, print the table, write JSON and report."""
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
     from orthonav.ground.evaluate.tables import (
@@ -121,7 +119,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check_options(options: argparse.Namespace) -> None:
-    """Raise what is wrong with the options; fill in one flight and one truth per file of fixes."""
     from orthonav.core.errors import FlightError
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
@@ -144,7 +141,6 @@ def _check_options(options: argparse.Namespace) -> None:
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
-    """One path per file of fixes: a single one is for all; none stays none."""
     from orthonav.core.errors import FlightError
 
     if len(given) == 1:
@@ -158,7 +154,6 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
 
 
 def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
-    """Write `--report-changes` by the views of all flights; None where it was not asked for."""
     from orthonav.core.flight import open_flight
     from orthonav.core.flight.fixes import read_results
 
@@ -173,7 +168,6 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
 
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
-    """Metrics of every flight, with its worst views if their images are given."""
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
     from orthonav.ground.evaluate.contact_sheet import worst_rows
@@ -237,7 +231,6 @@ def _warn_of_another_run(
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """A name for each file: its stem, with its folder where stems are equal."""
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         names = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
@@ -265,7 +258,6 @@ def _write_report(
 
 
 def _view_command(options: argparse.Namespace, i: int) -> str:
-    """The command that shows the single views of the flight number `i`; empty without a map."""
     if options.map is None:
         return ""
     words = ["orthonav", "view", str(options.fixes[i]), "--map", str(options.map)]
@@ -279,7 +271,6 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
 
 
 def map_background(opened: "MapFile") -> "Background":
-    """The preview of a map as background; raises `MapFileError` where it is damaged."""
     from orthonav.core.mapfile.layer import preview
     from orthonav.ground.report.drawing import Background
 

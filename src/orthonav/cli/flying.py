@@ -37,8 +37,7 @@ from orthonav.onboard import cameras
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.gnss.biases import Biases
-from orthonav.onboard.gnss.learner import Resumed
+from orthonav.onboard.gnss.biases import Biases, Resumed
 from orthonav.onboard.gnss.watch import (
     GnssSource,
     GnssWatch,

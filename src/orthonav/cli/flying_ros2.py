@@ -9,11 +9,10 @@ from contextlib import ExitStack
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.graph import Graph, Rosout
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.rcl import joined_graph
 from orthonav.onboard.ros2.reader import Ros2Reader
-from orthonav.onboard.ros2.rosout import Rosout
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 

@@ -148,7 +148,7 @@ def geoid_for(flight: "Recording") -> "Undulation | None":
     if first is None or first.telemetry.hae_m is None or first.telemetry.amsl_m is not None:
         return None
     try:
-        from orthonav.ground.imagery.datum import geoid
+        from orthonav.ground.imagery.terrain import geoid
 
         return geoid()
     except (ImageryError, MissingExtraError) as error:

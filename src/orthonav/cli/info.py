@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to describe")
     parser.add_argument("--json", action="store_true", help="print as JSON")
     parser.add_argument(
@@ -30,7 +29,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Open the map, which checks its contents, and print a summary."""
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.shown import footprint_geojson, write_preview
@@ -49,7 +47,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
-    """Summary of a map as JSON values."""
     area_km2 = manifest.area_km2
     size_mb = size_bytes / 1e6
     return {
@@ -84,7 +81,6 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
 
 
 def _confidence(manifest: "Manifest") -> dict[str, Any]:
-    """The radius that fixes state, and whether their confidence was learnt; the same of tiles."""
     tiles = {
         "tile_radius_m": manifest.radius_m,
         "tiles_calibrated": manifest.confidence is not None,
@@ -101,7 +97,6 @@ def _confidence(manifest: "Manifest") -> dict[str, Any]:
 
 
 def _confidence_text(plain: Mapping[str, Any]) -> str:
-    """What the confidence of a fix is the probability of."""
     radius = "-" if plain["radius_m"] is None else f"{plain['radius_m']:g}"
     text = f"{'probability of an error below' if plain['calibrated'] else 'none, for'} {radius} m"
     if plain["registration"] is None:
@@ -111,11 +106,7 @@ def _confidence_text(plain: Mapping[str, Any]) -> str:
 
 
 def _registration(manifest: "Manifest") -> dict[str, Any] | None:
-    """Size of the registration layers of all sheets; None without any.
-
-    `ground_km2` is the area with imagery, which extends beyond the tile centres; `raw_bytes` is the
-    size of the same pixels as uncompressed RGB.
-    """
+    """`ground_km2` extends beyond the tile centres; `raw_bytes` is that of uncompressed RGB."""
     from orthonav.core.mapfile.layer import part_names
 
     size, raw, ground_km2 = 0, 0, 0.0
@@ -140,7 +131,6 @@ def _registration(manifest: "Manifest") -> dict[str, Any] | None:
 
 
 def _terrain(manifest: "Manifest") -> dict[str, Any] | None:
-    """Heights and size of the terrain layer of the first sheet; None without one."""
     from orthonav.core.mapfile.terrain import terrain_part_names
 
     info = manifest.sheets[0].terrain
@@ -162,7 +152,7 @@ def _terrain(manifest: "Manifest") -> dict[str, Any] | None:
 
 
 def _bounds_deg(sheet: "SheetInfo") -> list[float]:
-    """West, south, east, north of the outer tile centres in degrees."""
+    """West, south, east, north of the outer tile centres."""
     import numpy as np
 
     grid = sheet.grid
@@ -178,7 +168,6 @@ def _part_bytes(part: dict[str, Any]) -> int:
 
 
 def summary_text(plain: dict[str, Any]) -> str:
-    """The summary as text."""
     lines = [
         f"map        {plain['map']}  ({plain['created_by']})",
         f"area       {plain['area_km2']:.2f} km2 of tile centres, {plain['tiles']} tiles",
@@ -222,7 +211,6 @@ def _registration_text(layer: dict[str, Any] | None) -> str:
 
 
 def _terrain_lines(layer: dict[str, Any] | None) -> list[str]:
-    """The terrain layer in a line; none without one."""
     if layer is None:
         return []
     printable = "".join(c for c in f"{layer['name']}, {layer['datum']}" if c.isprintable())
@@ -234,7 +222,6 @@ def _terrain_lines(layer: dict[str, Any] | None) -> list[str]:
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:
-    """Method, variants and their parameters in one line."""
     parts = [str(recipe.get("method"))]
     for name in ("represent", "embed"):
         found = recipe.get(name)
@@ -249,7 +236,6 @@ def recipe_text(recipe: dict[str, Any]) -> str:
 
 
 def imagery_text(imagery: Iterable[Mapping[str, Any]]) -> str:
-    """Names, dates and attributions of the imagery of a map, in one line."""
     parts = []
     for source in imagery:
         dates = [str(source[key]) for key in ("date_from", "date") if source.get(key)]

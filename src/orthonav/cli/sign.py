@@ -5,7 +5,6 @@ from pathlib import Path
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?", help="map to sign")
     how = parser.add_mutually_exclusive_group(required=True)
     how.add_argument("--key", type=Path, metavar="private.pem", help="Ed25519 private key (PEM)")
@@ -24,7 +23,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write a key, a signature, or both."""
     from orthonav.core.errors import MapFileError
     from orthonav.core.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
 

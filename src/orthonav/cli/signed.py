@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
 
 def add_signature(group: argparse._ActionsContainer) -> None:
-    """Add both options to a group or the parser."""
     group.add_argument(
         "--require-signed",
         type=Path,
@@ -27,10 +26,7 @@ def add_signature(group: argparse._ActionsContainer) -> None:
 
 
 def checked_signature(options: argparse.Namespace) -> "Signature | None":
-    """The signature of the map, checked; None without `--require-signed`.
-
-    Raises `VariantError`, and as `require_signature`.
-    """
+    """None without `--require-signed`."""
     from orthonav.core.mapfile.signature import require_signature
 
     if options.require_signed is not None:

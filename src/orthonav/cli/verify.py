@@ -5,7 +5,6 @@ from pathlib import Path
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")
     parser.add_argument(
         "--public-key",
@@ -22,7 +21,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Check the signature, then every part; an error where one of them is wrong."""
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.signature import require_signature
 

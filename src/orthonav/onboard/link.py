@@ -11,7 +11,7 @@ from typing import Any
 
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
-from orthonav.onboard.gnss.mavlink import gnss_sample
+from orthonav.onboard.gnss.records import gnss_sample
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
     Message,

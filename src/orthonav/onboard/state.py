@@ -19,8 +19,7 @@ from orthonav.core.errors import MapFileError, OutputError
 from orthonav.core.files import write_text
 from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 from orthonav.core.records import Prior
-from orthonav.onboard.gnss.biases import Biases, biases_from_plain
-from orthonav.onboard.gnss.learner import Resumed, before_flight
+from orthonav.onboard.gnss.biases import Biases, Resumed, before_flight, biases_from_plain
 
 VERSION = 1
 MAX_BYTES = 100_000

@@ -94,7 +94,6 @@ def open_flight(path: Path, *, images_needed: bool = True) -> FlightFolder:
 
 
 def _fitted(camera: Camera, views: Iterable[FlightView]) -> Camera:
-    """The camera at the size of the first image that can be decoded."""
     for view in views:
         try:
             height, width = view.grey().shape

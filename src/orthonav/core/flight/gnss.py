@@ -13,8 +13,7 @@ from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import Evidence
 
 FILE = "gnss.csv"
-FIX_3D = 3
-"""GPS_FIX_TYPE of MAVLink from which a position is three-dimensional."""
+FIX_3D = 3  # GPS_FIX_TYPE of MAVLink from which a position is three-dimensional
 FAULTS = (
     *("gnss_lost", "gnss_frozen", "gnss_jump", "gnss_step", "gnss_drift"),
     *("gnss_velocity", "gnss_offset", "gnss_disagrees", "gnss_returning"),

@@ -26,11 +26,9 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.records import Fix, Prior, Telemetry
 
-PROFILE = "orthonav"
-"""Profile in the header of an MCAP file that marks a flight log of orthonav."""
+PROFILE = "orthonav"  # profile in the header of an MCAP file that marks a flight log of orthonav
 FORMAT = 1
-MAX_CHUNK_BYTES = 128 * 2**20
-"""Largest chunk, uncompressed; readers refuse those that claim more."""
+MAX_CHUNK_BYTES = 128 * 2**20  # largest chunk, uncompressed; readers refuse those that claim more
 MAX_PICTURE_BYTES = MAX_CHUNK_BYTES // 2
 MAX_JSON_BYTES = 2**20
 FRAME_ID = "camera"
@@ -212,16 +210,11 @@ class Message:
 class LoggedView:
     """A view in a log."""
 
-    index: int
-    """Number in the log, from 0 without gaps; the sequence number of all its messages."""
-    number: int
-    """Number that the runner gave it, which counts skipped images too."""
-    frame: str
-    """Its name."""
-    telemetry: Telemetry
-    """Telemetry of its exposure."""
-    picture: str
-    """State of its image, one of `PICTURES`."""
+    index: int  # number in the log, from 0 without gaps; the sequence number of all its messages
+    number: int  # number that the runner gave it, which counts skipped images too
+    frame: str  # its name
+    telemetry: Telemetry  # telemetry of its exposure
+    picture: str  # state of its image, one of `PICTURES`
     camera_latency_ms: float | None = None
     """Latency that was subtracted from its arrival; None where the exposure was known."""
     withheld: bool = False
@@ -419,7 +412,6 @@ def picture_of(message: bytes) -> tuple[bytes, str]:
 
 
 def _worded(value: Any) -> Any:
-    """Plain values with texts for numbers that are not finite."""
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     if isinstance(value, Mapping):

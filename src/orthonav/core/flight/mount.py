@@ -38,16 +38,12 @@ class Bias:
 class Mount:
     """Constant errors of telemetry."""
 
-    heading_deg: Bias
-    """Degrees, clockwise."""
+    heading_deg: Bias  # degrees, clockwise
     log_scale: Bias
     """Natural logarithm of true over reported height; includes errors of the focal length."""
-    pitch_deg: Bias
-    """Degrees, positive ahead."""
-    roll_deg: Bias
-    """Degrees, positive to the left."""
-    views: int
-    """Number of views that the estimate is based on."""
+    pitch_deg: Bias  # degrees, positive ahead
+    roll_deg: Bias  # degrees, positive to the left
+    views: int  # number of views that the estimate is based on
 
     def corrected(self, telemetry: Telemetry) -> Telemetry:
         """Telemetry without these errors; unknown values stay unknown.

@@ -81,10 +81,6 @@ def read_camera_file(path: Path) -> Camera:
 def camera_from_numbers(
     size_px: Sequence[int], matrix: Sequence[float], distortion: Sequence[float], model: str
 ) -> Camera:
-    """A camera from width and height, fx, fy, cx, cy in OpenCV's convention, and a model's name.
-
-    Raises `CameraError` for models that orthonav does not have.
-    """
     fx, fy, cx, cy = (float(number) for number in matrix)
     numbers = tuple(float(number) for number in distortion)
     if model in _FISHEYE:
@@ -111,10 +107,9 @@ def _yaml(text: str) -> Any:
 
 
 def _check_events(yaml: Any, text: str) -> None:
-    """Raises `CameraError` for YAML that could exhaust memory or time, before it is built.
+    """Refuses YAML that could exhaust memory or time, before it is built.
 
-    Aliases of aliases expand exponentially, nesting recurses as deep as the stack, and numbers
-    with colons take time with the square of their length.
+    Aliases expand exponentially, nesting fills the stack, numbers with colons take quadratic time.
     """
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
@@ -139,7 +134,6 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
 
 
 def _plain(plain: Any, name: str | None = None) -> Camera:
-    """A camera of ROS or Kalibr; of several the one of that name."""
     if not isinstance(plain, Mapping):
         raise TypeError(f"a mapping was expected, got {type(plain).__name__}")
     cameras = [name for name in plain if str(name).startswith("cam") and str(name)[3:].isdecimal()]

@@ -35,9 +35,8 @@ from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.store import Store
-from orthonav.ground.build.block_cache import digest
 from orthonav.ground.build.build import BuildRequest, build_map
-from orthonav.ground.build.sheet import grid_of, rounded_gsd_m
+from orthonav.ground.build.sheet import digest, grid_of, rounded_gsd_m
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area

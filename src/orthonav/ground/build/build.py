@@ -1,8 +1,7 @@
 """Building a map: read the sheet, learn the embedding, calibrate, write the map.
 
-Imagery is read block by block, so memory depends on the area, not on the orthophotos. In memory
-stay seven numbers per micro-cell (about 0.5 MB per km2 at 1 m and 256 px tiles) and the compressed
-registration layer (0.15 to 0.35 MB per km2 at 1 m).
+Imagery is read by blocks. In memory stay seven numbers per micro-cell (about 0.5 MB per km2 at 1 m
+and 256 px tiles) and the compressed registration layer (0.15 to 0.35 MB per km2 at 1 m).
 """
 
 import logging
@@ -41,7 +40,6 @@ from orthonav.ground.build.calibrate import (
     calibrate,
     calibrate_registration,
 )
-from orthonav.ground.build.cellparts import cell_parts
 from orthonav.ground.build.encoders import (
     EncoderRecipe,
     Learning,
@@ -52,6 +50,7 @@ from orthonav.ground.build.encoders import (
     stored_representation,
     usual_edges,
 )
+from orthonav.ground.build.layer import cell_parts
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
 from orthonav.ground.build.terrain import TerrainParts, terrain_of_dem
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -61,7 +60,6 @@ from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import estimate_map
 
 MAX_WORKERS = 64
-"""Sanity limit on threads."""
 MAX_CALIBRATION_VIEWS = 2 * CROPS
 """Number of crops collected while the imagery is read."""
 
@@ -94,7 +92,7 @@ class BuildRequest:
     - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
     - `dem_datum`: what its heights count from, where the file does not state it
-      (`orthonav.ground.imagery.datum.OPTION`).
+      (`orthonav.ground.imagery.terrain.OPTION`).
     - `dem_needed`: whether an area in which the model has no height is refused; else the map has
       no terrain layer.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
@@ -132,20 +130,13 @@ class BuildRequest:
 
 @dataclass(frozen=True)
 class BuildResult:
-    """A finished build: the manifest as written, and the size of the file in bytes."""
-
     manifest: Manifest
     size_bytes: int
 
 
 @dataclass(frozen=True, eq=False)
 class BuildInputs:
-    """Opened and validated inputs of a build.
-
-    `mosaic`: reference imagery. `other_dates`: one mosaic per other date. `area`, `grid`: extent
-    and tiles of the map. `representation`: variant of `represent`. `recipe`: embedding to learn.
-    `terrain`: the map's terrain layer, None without one.
-    """
+    """`representation`: variant of `represent`. `recipe`: embedding to learn."""
 
     request: BuildRequest
     mosaic: Mosaic
@@ -158,10 +149,6 @@ class BuildInputs:
 
     @classmethod
     def open(cls, request: BuildRequest) -> "BuildInputs":
-        """Open the imagery and check the request.
-
-        Raises `MissingFileError`, `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
-        """
         edges = request.edges or usual_edges(request.method)
         representation = make_variant(represent.TABLE, edges)
         recipe = method_recipe(request.method, representation)
@@ -187,11 +174,10 @@ class BuildInputs:
 
     @property
     def learns_network(self) -> bool:
-        """Whether the embedding is learned from images of the tiles, not from cell means."""
+        """From images of the tiles, not from cell means."""
         return not isinstance(self.recipe, WhitenedRecipe)
 
     def estimate_text(self) -> str:
-        """Estimated size of the map and duration of the build, as one line."""
         grid = self.grid
         need = estimate_map(
             self.area,
@@ -235,14 +221,11 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
 
 
 _FAR_DEG = 0.02
-"""An area farther than this from the box of the imagery, about 2 km, is certainly outside it."""
+"""About 2 km: an area farther from the box of the imagery is certainly outside it."""
 
 
 def _check_not_far(area: Area, outline_deg: NDArray[np.float64]) -> None:
-    """Raise `AreaError` for an area far from the imagery, or in it with swapped coordinates.
-
-    `outline_deg` (N, 2): outline of the imagery. Areas that overlap its box are accepted.
-    """
+    """Refuse an area far from the imagery (outline (N, 2)), or in it with swapped coordinates."""
     south, west = outline_deg.min(axis=0)
     north, east = outline_deg.max(axis=0)
 
@@ -267,11 +250,11 @@ __all__ = ["BuildRequest", "BuildResult", "build_map"]
 log = logging.getLogger(__name__)
 
 MIN_VIEW_VALID_SHARE = 0.4
-"""Least share of a tile that a view must cover; below, tile matching fails."""
+"""Of a tile that a view must cover; below, tile matching fails."""
 HEADING_STEP_DEG = 6.0
 """Spacing of the headings that tile matching tries."""
 SEARCH_MS = 100.0
-"""Largest estimated search time per view in calibration, which places many views."""
+"""Per view in calibration, which places many views."""
 RADIUS_PX = 10.0
 MIN_RADIUS_M = 35.0
 """A registered view is correct within this many pixels or metres, whichever is more: unreported
@@ -281,10 +264,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class LearnedEmbedding:
-    """Reference tiles with their embeddings.
-
-    `centres_en_m` (N, 2) float32, `embeddings` (N, D) float16; `embedder` embeds views.
-    """
+    """Tile centres (N, 2) float32, embeddings (N, D) float16, and what embeds views."""
 
     centres_en_m: NDArray[np.float32]
     embedder: ViewEmbedder
@@ -332,7 +312,6 @@ def _sheet_reader(inputs: BuildInputs) -> SheetReader:
 
 
 def _cache_folders(request: BuildRequest) -> tuple[Path, Path | None]:
-    """Folders for finished blocks: next to the map, and in the work folder if one is given."""
     default = request.out.with_name(f"{request.out.name}.work")
     return default, None if request.work is None else request.work / f"blocks-{request.out.name}"
 
@@ -340,10 +319,6 @@ def _cache_folders(request: BuildRequest) -> tuple[Path, Path | None]:
 def learn_embedding(
     inputs: BuildInputs, sheet: SheetReader, progress: Progress
 ) -> LearnedEmbedding:
-    """Learn the embedding from the reference tiles of a sheet, and embed them.
-
-    Raises `AreaError` if no tile has imagery.
-    """
     grid, recipe, request = inputs.grid, inputs.recipe, inputs.request
     tiles_rc = tiles_of(inputs.area, grid, sheet.cells)
     tiles_px = tiles_rc * grid.stride_px
@@ -375,7 +350,6 @@ def learn_embedding(
 def calibrate_tiles(
     sheet: SheetReader, embedding: LearnedEmbedding, progress: Progress
 ) -> TileCalibration:
-    """Calibrate the confidence of tile matches on generated views of the sheet."""
     representation = sheet.representation
     name = stored_representation(representation)["name"]
     is_usual = isinstance(embedding.embedder.recipe, WhitenedRecipe) and name == "gradient"
@@ -399,7 +373,7 @@ def map_content(
     embedding: LearnedEmbedding,
     calibration: TileCalibration,
 ) -> tuple[Manifest, Arrays]:
-    """Manifest and arrays of the map, without the calibration of registration."""
+    """Without the calibration of registration."""
     request, grid, embedder = inputs.request, inputs.grid, embedding.embedder
     grey, grey_parts = (None, {}) if sheet.layer is None else sheet.layer.finish()
     tiles = len(embedding.centres_en_m)
@@ -446,7 +420,7 @@ def registration_record(
     arrays: Arrays,
     progress: Progress,
 ) -> dict[str, Any]:
-    """The `registration` record of the manifest, calibrated on the map as it will be written."""
+    """Calibrated on the map as it will be written."""
     request, grid = inputs.request, inputs.grid
     radius_m = max(RADIUS_PX * grid.gsd_m, MIN_RADIUS_M)
     unfitted = {"confidence": None, "radius_m": radius_m, "position_floor_px": FLOOR_PX}
@@ -473,7 +447,7 @@ def registration_record(
 
 
 def _crops_of(mosaic: Mosaic, inputs: BuildInputs, crops: Sequence[Crop]) -> list[Crop]:
-    """Crops of another date at the positions of the reference crops, where fully covered."""
+    """Crops of another date at the positions of the reference crops."""
     found = []
     with mosaic.grid_sheet(inputs.area.frame, inputs.grid) as raster:
         for crop in crops:

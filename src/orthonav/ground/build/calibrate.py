@@ -1,11 +1,10 @@
-"""Calibration of the confidence of tile matches from the imagery of the map itself.
+"""Calibration of confidence from the imagery of the map itself.
 
 Views are cropped from the reference at random positions with simulated ageing: light, contrast,
 blur, noise, heading and height errors, and up to two thirds of the image replaced by another
 position. Mirrored views serve as negatives: no place is the mirror image of another. Both are
-searched, and a logistic regression is fitted to the outcome. The result is conservative rather than
-exact, because no second date is used. Where too few views are found, the usual confidence is drawn
-to them.
+searched, and a logistic regression is fitted to the outcome. Where too few views are found, the
+usual confidence is drawn to them.
 """
 
 import math
@@ -50,10 +49,9 @@ def changed(
 ) -> NDArray[np.uint8]:
     """`grey` (S, S) uint8 with the changes of years.
 
-    `other` is an image that must not occur on the map. Parts are replaced by it, and its detail is
-    mixed into the rest; brightness and contrast of fields change, some invert their contrast;
-    light, blur and noise differ. `most_replaced`: largest replaced share (0..1). `most_mixed`:
-    largest weight of the detail of `other` in the rest (0..1).
+    Parts are replaced by `other`, an image that must not occur on the map; its detail is mixed into
+    the rest; brightness and contrast of fields change, some invert; light, blur and noise differ.
+    `most_replaced`, `most_mixed`: largest replaced share and largest weight of that detail (0..1).
     """
     size = grey.shape[0]
     resized = np.asarray(cv2.resize(other, (size, size)), dtype=np.float32)
@@ -78,7 +76,6 @@ def changed(
 def _detail(
     picture: NDArray[np.float32], size: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """High-pass and low-pass part of an image (S, S)."""
     broad = np.asarray(cv2.GaussianBlur(picture, (0, 0), size / 16), dtype=np.float32)
     return picture - broad, broad
 
@@ -94,25 +91,23 @@ CROPS = 192
 SLOW_CROPS = 32
 """The same for representations that take minutes per view."""
 CROP_TILES = 1.5
-"""Width of a crop in tiles: a rotated tile fits into it."""
+"""A rotated tile fits into it."""
 SMALL_TILES = 2.5
-"""Sheets less wide, in tiles, whose border is not all imagery, have few crops of that width."""
+"""Sheets less wide whose border is not all imagery have few crops of that width."""
 HEADING_STD_DEG = 5.0
 SCALE_STD = 0.05
 """Errors of heading and height: those of the benchmarks."""
 MAX_REPLACED = 0.65
 MIRRORED_WEIGHT = 0.25
-"""Weight of a mirrored view; a flight sees fewer places outside the map than inside."""
+"""A flight sees fewer places outside the map than inside."""
 PASTED_SHARE = 0.25
-"""Share of replacements by another position of the map; the others are mirrored."""
+"""Of replacements by another position of the map; the others are mirrored."""
 RADIUS_STRIDES = 0.75
 """A fix is correct if its error is below this many strides."""
 MIN_VALID = 0.9
 """Least share of valid pixels in a crop, where there are too few whole ones."""
 ENOUGH_CROPS = 48
-"""Whole crops from which on no others are taken."""
 MIN_RIGHT = 10
-"""Fewest correct fixes for a fit of all weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,18 +121,13 @@ class Crop:
 
 @dataclass(frozen=True)
 class TileCalibration:
-    """Calibration of tile matches.
-
-    `position_std_m`: standard deviation per axis of a correct fix.
-    """
+    """`position_std_m`: standard deviation per axis of a correct fix."""
 
     confidence: LogisticConfidence
     position_std_m: float
 
 
 class CropSampler:
-    """Collects crops at random positions from a stream of blocks of imagery."""
-
     def __init__(self, tile_px: int, seed: int, sheet_px: float = math.inf) -> None:
         """`sheet_px`: shorter side of the sheet; on a small one crops are no larger than tiles."""
         self._rng = np.random.default_rng([seed, 1])
@@ -148,10 +138,10 @@ class CropSampler:
         self._partial: list[Crop] = []
 
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        """Random first pixels (row, col), (N, 2), of crops in a block.
+        """Random first pixels (row, col), (N, 2), of crops in a block with a `share` of all
+        imagery.
 
-        `share`: size of the block as a share of all imagery. Independent of the imagery, so that
-        blocks may be read in any order once positions are drawn for all.
+        They are drawn for all blocks first, so that these may be read in any order.
         """
         size = self._crop_px(height, width)
         if size < self._tile_px:
@@ -165,11 +155,7 @@ class CropSampler:
     def cut(
         self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], places: NDArray[np.intp]
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Crops (N, S, S) of a block at places with contrast; these places and whether all pixels
-        are valid (N, 3).
-
-        Few pixels may be invalid, such as marks on the imagery; they get the mean grey level.
-        """
+        """Crops (N, S, S) at places with contrast; these places and whether all is valid (N, 3)."""
         size = self._crop_px(*grey.shape)
         crops = np.zeros((len(places), size, size), np.uint8)
         found: list[tuple[int, int, bool]] = []
@@ -185,10 +171,7 @@ class CropSampler:
     def take(
         self, crops: NDArray[np.uint8], places: NDArray[np.intp], row_px: int, col_px: int
     ) -> None:
-        """Add the crops of a block whose first pixel is (row_px, col_px) of the sheet.
-
-        `crops`, `places`: of `cut`.
-        """
+        """Add what `cut` gave for a block whose first pixel is (row_px, col_px) of the sheet."""
         for grey, (row, col, whole) in zip(crops, places.tolist(), strict=True):
             known = self._whole if whole else self._partial
             if len(known) < 2 * CROPS:
@@ -197,7 +180,6 @@ class CropSampler:
 
     @property
     def crops(self) -> list[Crop]:
-        """The whole crops, with others where these are fewer than `ENOUGH_CROPS`."""
         missing = max(ENOUGH_CROPS - len(self._whole), 0)
         return self._whole + self._partial[:missing]
 
@@ -220,8 +202,7 @@ def calibrate(
 ) -> TileCalibration:
     """Search changed and mirrored crops on the new map and fit the confidence to the outcome.
 
-    `usual`: the confidence of such embeddings on other maps, None if unknown. A `slow`
-    representation (minutes per crop) is tried on `SLOW_CROPS` only.
+    `usual`: the confidence of such embeddings on other maps, None if unknown.
     """
     sampled = sampler.crops
     rng = np.random.default_rng([len(sampled), 2])
@@ -314,7 +295,6 @@ def _queries(
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
-"""Errors of heading and height (a share): those of the benchmarks."""
 FOCAL_PX = 1000.0
 """Any value: views have the resolution of the map, and only the ratio to the height matters."""
 SIDES = (0.55, 1.0)
@@ -322,7 +302,7 @@ SIDES = (0.55, 1.0)
 ENOUGH_RIGHT = 10
 """Fewest correct views of another date that anything is learnt from."""
 FLOOR_PX = 0.6
-"""Usual standard deviation per axis, in pixels, between orthophotos of two dates."""
+"""Usual standard deviation per axis between orthophotos of two dates."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
 MIN_NEGATIVES = 5
 """Mirrored views from which on the scores of chance are their medians."""
@@ -333,16 +313,12 @@ fit (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
 FALLBACK_CHANCE = 40.0
 """Score of a chance match if no negative has one."""
 USUAL_FINE, USUAL_FINE_VIEWS = 1.45, 8.0
-"""Prior of the ratio by which one more level raises the score of a chance match, and its weight in
-views."""
+"""Ratio by which one more level raises the score of a chance match: prior, and its weight."""
 
 
 @dataclass(frozen=True)
 class RegistrationCalibration:
-    """Calibration of registration.
-
-    `floor_px`: lower bound of the reported standard deviation per axis, pixels.
-    """
+    """`floor_px`: lower bound of the reported standard deviation per axis."""
 
     confidence: RegisteredConfidence
     floor_px: float
@@ -363,11 +339,7 @@ def calibrate_registration(
     seed: int,
     progress: Progress,
 ) -> RegistrationCalibration:
-    """Locate mirrored views and views of other dates, and learn from the outcome.
-
-    `crops` and `other_dates` are crops of the map and of other dates of its area. At most `views`
-    mirrored views are located, and as many of other dates.
-    """
+    """Locate at most `views` mirrored views, and as many of other dates; learn from the outcome."""
     rng = np.random.default_rng([seed, 3])
     order = rng.permutation(len(crops))
     later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
@@ -396,7 +368,6 @@ def _placed(
     picture: NDArray[np.uint8],
     mirror: bool,
 ) -> _Outcome | None:
-    """Outcome of locating one view of the picture of a crop; None if there is no fix."""
     view = _view(rng, picture, localizer.grid)
     search = localizer.search(view, _prior(rng, localizer, crop))
     best = search if isinstance(search, NoFix) else search.run()
@@ -407,10 +378,7 @@ def _placed(
 
 
 def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
-    """Prior that limits the search on a large map to a square with the crop in its middle half.
-
-    None searches the whole map.
-    """
+    """On a large map, limits the search to a square with the crop in its middle half."""
     grid = localizer.grid
     if grid.height_px * grid.width_px <= WHOLE_PX**2:
         return None
@@ -450,7 +418,6 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
 def _registration_calibration(
     outcomes: Sequence[_Outcome], radius_px: float
 ) -> RegistrationCalibration:
-    """The confidence of errors below a radius, and the floor from views of other dates."""
     negatives = [each.evidence for each in outcomes if each.mirrored]
     chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
     confidence, floor_px = RegisteredConfidence.usual(chances), FLOOR_PX
@@ -468,7 +435,7 @@ def _registration_calibration(
 
 
 def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
-    """The scores of chance by the evidence of mirrored views.
+    """The scores of chance.
 
     The strength of a view that is judged and finished at one level is the sum of one score, not of
     two: with small tiles most views are such, and say nothing of the sum.
@@ -492,6 +459,5 @@ def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float
 
 
 def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
-    """Median of one number of the evidence over the views that have it, at least 1."""
     values = [each[name] for each in evidence if math.isfinite(each[name])]
     return max(float(np.median(values)), 1.0) if values else FALLBACK_CHANCE

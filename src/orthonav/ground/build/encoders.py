@@ -36,23 +36,19 @@ LEARNT_WITH = {
     "triplet": ("torch", "onnx", "onnxruntime"),
     "bovw": ("faiss",),
 }
-"""Modules of the extra "train" that learning a method needs."""
+"""Modules of the extra "train"."""
 USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
 DEVICES = ("auto", "cpu", "cuda")
 LOCAL_FIELDS = ("weights", "cache")
 
 
 def usual_edges(method: str) -> str:
-    """The default representation of a method; for methods of the paper, its choice."""
     name = method.partition(":")[0]
     return USUAL_EDGES.get(name, "gradient")
 
 
 def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
-    """The recipe of a method; one-channel images are whitened on finer cells by default.
-
-    Raises `VariantError`, and `MissingExtraError` naming all that learning it needs and lacks.
-    """
+    """One-channel images are whitened on finer cells by default."""
     name, _, parameters = method.partition(":")
     absent = [each for each in LEARNT_WITH.get(name, ()) if find_spec(each) is None]
     if absent:
@@ -76,7 +72,6 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
 
 
 def check_device(name: str) -> None:
-    """Raise `VariantError` for an unknown device, and for a GPU that PyTorch does not see."""
     if name not in DEVICES:
         raise VariantError(f"device must be {', '.join(DEVICES)}, got '{name}'")
     if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
@@ -84,10 +79,7 @@ def check_device(name: str) -> None:
 
 
 def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:
-    """Raise `VariantError` if a triplet network without other dates would need days.
-
-    Its positives would be segmented anew at every step: seconds to minutes each.
-    """
+    """A triplet network without other dates would need days with a slow representation."""
     if isinstance(recipe, TripletRecipe) and not represent.TABLE[_name_of(representation)].flies:
         raise VariantError(
             f"a triplet network on {_name_of(representation)} edges needs orthophotos of other "
@@ -96,7 +88,7 @@ def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any)
 
 
 def stored_representation(representation: Any) -> dict[str, Any]:
-    """Recipe of a representation for a manifest, without local paths and devices."""
+    """For a manifest: without local paths and devices."""
     recipe = variant_recipe(represent.TABLE, representation)
     return {name: "" if name in LOCAL_FIELDS else value for name, value in recipe.items()}
 
@@ -138,7 +130,6 @@ def learn_encoder(
 
     A triplet network's positives are the same tiles of `other_dates`; without any, the tiles
     themselves with simulated ageing. CAEVL learns from one date.
-    Raises `MissingExtraError` if PyTorch or faiss is needed and missing.
     """
     tiles = pictures.tiles(tiles_px, progress)
     if isinstance(recipe, WordsRecipe):
@@ -172,7 +163,6 @@ def learn_encoder(
 def _require_as_in_flight(
     embedder: NetworkEmbedder, tiles: SheetTiles, embedded: NDArray[np.float16]
 ) -> None:
-    """Raise `VariantError` if a device embeds tiles otherwise than the encoder that flies."""
     some = np.unique(np.linspace(0, len(tiles) - 1, CHECKED_TILES).astype(np.intp))
     flown, found = embedder.views(tiles.batch(some)), embedded[some].astype(np.float32)
     away = float(np.abs(flown - found).max())
@@ -197,7 +187,7 @@ def _word_tiles(tiles: SheetTiles) -> Iterator[tuple[NDArray[np.uint8], NDArray[
 def _changed_tiles(
     tiles: SheetTiles, representation: Any
 ) -> Callable[[np.random.Generator, NDArray[np.uint8]], NDArray[np.float32]]:
-    """Function that generates a positive (1, S, S) from the grey levels (S, S) of a tile."""
+    """Generates a positive (1, S, S) from the grey levels (S, S) of a tile."""
 
     def positive(rng: np.random.Generator, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
         # Mirrored, so that it does not occur on the map.

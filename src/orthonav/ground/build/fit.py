@@ -1,4 +1,4 @@
-"""Fits of confidences to views that came out right or not, when a map is built."""
+"""Fits of confidences to views that came out right or not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,22 +18,20 @@ from orthonav.core.localize.confidence import (
 )
 
 RIDGE = 3e-2
-"""Weight of the usual bias where views of another date of the map's area are fitted."""
+"""Weight of the usual bias."""
 MAX_SHIFT = 5.0
-"""Largest change of the bias by them."""
 LEAST = 1e-9
-"""Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
+"""Keeps the loss finite."""
 TILE_RIDGE = 1e-3
-"""Weight of the ridge: only against weights without bound where right and wrong separate fully."""
+"""Only against weights without bound where right and wrong separate fully."""
 FEW_RIGHT, FEW = 0.5, 5.0
-"""Trials, right ones and all, that are added to those of a map without a usual confidence."""
+"""Trials, right ones and all, added to those of a map without a usual confidence."""
 
 
 def fit_registered(
     evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
 ) -> RegisteredConfidence:
-    """The usual confidence with its first bias fitted to views (N) that came out right or not (N,)
-    and drawn to the usual one."""
+    """The usual confidence with its first bias fitted to views (N) and drawn to the usual one."""
     usual = RegisteredConfidence.usual(chances)
     features = [features_of(each, chances) for each in evidence]
 
@@ -51,7 +49,6 @@ def fit_registered(
 def fit_logistic(
     features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
 ) -> LogisticConfidence:
-    """Confidence from `features` (N, len(TILE_FEATURES)), as `fit_weights` fits it."""
     return LogisticConfidence(*fit_weights(features, right, sample_weight))
 
 
@@ -61,7 +58,7 @@ def fit_few(
     sample_weight: NDArray[np.float64],
     usual: LogisticConfidence | None,
 ) -> LogisticConfidence:
-    """Confidence from trials, as in `fit_logistic`, of which too few came out right for a fit.
+    """Confidence from trials of which too few came out right for a fit.
 
     It is the `usual` one, its bias drawn to the trials as far as they go. Without one, or without
     any trial, it is the share of the trials that came out right, whatever the evidence.
@@ -88,8 +85,8 @@ def fit_weights(
 ) -> tuple[float, tuple[float, ...]]:
     """Bias and weights of a logistic regression: weighted maximum likelihood with a slight ridge.
 
-    Weights are bounded at zero. `features` (N, F), `right` (N,) whether the fix was right,
-    `sample_weight` (N,). Features are standardized inside, the result applies to raw ones.
+    Weights are bounded at zero. `features` (N, F) are standardized inside; the result applies to
+    raw ones. `right`, `sample_weight` (N,).
     """
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
     scaled = (features - mean) / std

@@ -1,7 +1,9 @@
-"""Writing the registration layer: blocks of grey in, compressed chunks of a pyramid out.
+"""Layers of pixels in a map: the grey pyramid of registration, and the means of micro-cells.
 
 A chunk is encoded as soon as it is complete, and passed at half the resolution to the next level,
-so memory holds compressed chunks and incomplete ones.
+so memory holds compressed chunks and incomplete ones. Cell means, from which new tiles are embedded
+without imagery, are quantized to a byte each, relative to the largest of a cell, which is a
+float16: the rounding error is at most 0.4 % of the largest.
 """
 
 import zlib
@@ -11,8 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.errors import MapFileError
 from orthonav.core.mapfile.layer import ChunkTable, part_names
 from orthonav.core.mapfile.manifest import MAX_LEVELS, GreyInfo
+from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.whitened import CellSheet
 
 CHUNK_PX = 256
 """A view touches few chunks, and each decodes in 0.1 to 0.2 ms (docs/map-format.md)."""
@@ -21,7 +27,7 @@ COARSEST_PX = 64
 QUALITY = 70
 """Registration peaks are within 1 % of those of uncompressed imagery (docs/map-format.md)."""
 COARSER_QUALITIES = (50, 30)
-"""Used for chunks of noise, so that the size of a map is bounded."""
+"""For chunks of noise, so that the size of a map is bounded."""
 MAX_BYTES_PER_PX = 0.5
 _HEADER_BYTES = 512
 _BLOBS = ("jpeg", "mask")
@@ -29,7 +35,6 @@ Parts = dict[str, NDArray[Any]]
 
 
 def level_count(height_px: int, width_px: int) -> int:
-    """Levels of the pyramid of a sheet."""
     levels = 1
     while max(height_px, width_px) > COARSEST_PX << (levels - 1) and levels < MAX_LEVELS:
         levels += 1
@@ -42,7 +47,7 @@ def halved(
     """Grey and valid (H, W) at half the resolution, (ceil(H / 2), ceil(W / 2)).
 
     A pixel is the mean of the valid ones of the four below it, rounded half up; it is valid if two
-    or more of them are. Pixels outside the image are not valid.
+    or more of them are.
     """
     rows, cols = grey.shape
     if rows % 2 == cols % 2 == 0 and valid.all():
@@ -64,8 +69,6 @@ def _sum_of_four(values: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 
 class _Pending:
-    """An incomplete chunk."""
-
     def __init__(self, shape: tuple[int, int]) -> None:
         self.grey = np.zeros(shape, dtype=np.uint8)
         self.valid = np.zeros(shape, dtype=bool)
@@ -73,7 +76,7 @@ class _Pending:
 
 
 class GreyLayerWriter:
-    """Compresses the grey levels of a sheet, given as blocks of any size in any order."""
+    """Takes blocks of any size in any order."""
 
     def __init__(self, height_px: int, width_px: int, chunk_px: int = CHUNK_PX) -> None:
         self._chunk_px = chunk_px
@@ -84,15 +87,12 @@ class GreyLayerWriter:
         self._valid_px = 0
 
     def add(self, row: int, col: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> None:
-        """Add a block (H, W) that begins at (row, col); no pixel may be added twice.
-
-        Pixels that are never added are not valid.
-        """
+        """Add a block (H, W); no pixel may be added twice, and those never added are invalid."""
         self._valid_px += int(np.count_nonzero(valid))
         self._add(0, row, col, grey, valid)
 
     def add_block(self, row: int, col: int, parts: Parts) -> None:
-        """Add the result of `compressed_block` for the block that begins at (row, col)."""
+        """Add the result of `compressed_block`."""
         number, ends = 0, [np.concatenate([[0], parts[f"{kind}_ends"]]) for kind in _BLOBS]
         rows, cols = self._table.shapes[0]
         small = parts["half_valid"].shape
@@ -111,7 +111,6 @@ class GreyLayerWriter:
             self._add(1, row // 2, col // 2, parts["half"], parts["half_valid"])
 
     def finish(self, sheet: int = 0) -> tuple[GreyInfo, dict[str, NDArray[np.uint8 | np.int64]]]:
-        """The record of the layer for the manifest, and its parts by name."""
         for level, pending in enumerate(self._pending):
             for place in sorted(pending):
                 self._complete(level, place)
@@ -151,7 +150,6 @@ class GreyLayerWriter:
                     self._complete(level, place)
 
     def _complete(self, level: int, place: tuple[int, int]) -> None:
-        """Encode a chunk and pass it on to the next level."""
         chunk = self._pending[level].pop(place)
         if chunk.valid.any():
             number = self._table.number(level, *place)
@@ -163,10 +161,10 @@ class GreyLayerWriter:
 
 
 def compressed_block(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Parts:
-    """The compressed layer of a block (H, W) that begins at a chunk of `CHUNK_PX`.
+    """The compressed layer of a block (H, W) that fills whole chunks of `CHUNK_PX`.
 
-    The block must end at the end of a chunk or of the sheet. `jpeg`, `mask` (B,) with `.._ends`
-    (chunks,) are its chunks by rows, `half` and `half_valid` the next level.
+    `jpeg`, `mask` (B,) with `.._ends` (chunks,) are its chunks by rows, `half` and `half_valid` the
+    next level.
     """
     chunks = [
         encode_chunk(grey[part], valid[part]) if valid[part].any() else (b"", b"")
@@ -187,7 +185,7 @@ def _chunks(size_px: int) -> int:
 
 
 def encode_chunk(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:
-    """Bytes of a chunk (H, W) as JPEG, and of its mask (empty if all of it is valid)."""
+    """JPEG of a chunk (H, W), and its mask, empty if all of it is valid."""
     if valid.all():
         return _jpeg(grey), b""
     # Filling with the mean gives the smallest file and the weakest edge.
@@ -203,3 +201,78 @@ def _jpeg(grey: NDArray[np.uint8]) -> bytes:
         if len(encoded) <= MAX_BYTES_PER_PX * grey.size + _HEADER_BYTES:
             break
     return encoded
+
+
+MIDDLE, LEVELS = 128, 127
+WHOLE = 255
+_ROWS_AT_ONCE = 256
+_SMALLEST = float(np.finfo(np.float16).tiny)
+
+
+def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
+    """Valid shares only where not all are 1."""
+    codes = np.full(cells.means.shape, MIDDLE, dtype=np.uint8)
+    scale = np.zeros(cells.valid.shape, dtype=np.float16)
+    valid = np.zeros(cells.valid.shape, dtype=np.uint8)
+    for first in range(0, len(codes), _ROWS_AT_ONCE):
+        rows = slice(first, first + _ROWS_AT_ONCE)
+        means = cells.means[rows]
+        scale[rows] = np.abs(means).max(axis=2) / LEVELS
+        unit = np.maximum(scale[rows].astype(np.float32), _SMALLEST)[..., None]
+        codes[rows] = np.clip(np.rint(means / unit) + MIDDLE, MIDDLE - LEVELS, WHOLE)
+        valid[rows] = cells.valid[rows] * WHOLE + 1e-3  # truncated: only complete cells get 255
+    names = _names(sheet)
+    parts: dict[str, NDArray[Any]] = {names["codes"]: codes, names["scale"]: scale}
+    return parts if (valid == WHOLE).all() else {**parts, names["valid"]: valid}
+
+
+class StoredCells:
+    """Cell means of a sheet in an opened map. May be shared between threads."""
+
+    def __init__(self, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0) -> None:
+        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
+        grid = opened.manifest.sheets[sheet].grid
+        names = _names(sheet)
+        self.layout = layout
+        self.shape = layout.samples(grid.height_px), layout.samples(grid.width_px)
+        self._codes = opened.array(names["codes"], np.uint8, 3)
+        self._scale = opened.array(names["scale"], np.float16, 2)
+        whole = names["valid"] not in opened.arrays
+        self._valid = None if whole else opened.array(names["valid"], np.uint8, 2)
+        shapes = [part.shape for part in (self._scale, self._valid) if part is not None]
+        if self._codes.shape != (*self.shape, channels) or set(shapes) != {self.shape}:
+            raise MapFileError(
+                f"map's cells must be {self.shape} of {channels} numbers, got "
+                f"{self._codes.shape}: {opened.path}"
+            )
+
+    @classmethod
+    def of(
+        cls, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0
+    ) -> "StoredCells | None":
+        there = _names(sheet)["codes"] in opened.arrays
+        return cls(opened, layout, channels, sheet) if there else None
+
+    def read(
+        self, row: int, col: int, height: int, width: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Means (height, width, C) and shares (height, width) of a window; 0 outside the sheet."""
+        channels = self._codes.shape[2]
+        means = np.zeros((max(height, 0), max(width, 0), channels), dtype=np.float32)
+        share = np.zeros(means.shape[:2], dtype=np.float32)
+        top, left = max(row, 0), max(col, 0)
+        bottom, right = min(row + height, self.shape[0]), min(col + width, self.shape[1])
+        if top >= bottom or left >= right:
+            return means, share
+        part = np.s_[top:bottom, left:right]
+        inside = np.s_[top - row : bottom - row, left - col : right - col]
+        scale = self._scale[part].astype(np.float32)
+        means[inside] = (self._codes[part].astype(np.float32) - MIDDLE) * scale[..., None]
+        share[inside] = 1.0
+        if self._valid is not None:
+            share[inside] = self._valid[part] / np.float32(WHOLE)
+        return means, share
+
+
+def _names(sheet: int) -> dict[str, str]:
+    return {kind: f"sheet{sheet}/cells/{kind}" for kind in ("codes", "scale", "valid")}

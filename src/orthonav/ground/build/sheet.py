@@ -1,15 +1,21 @@
 """Reading a sheet: from blocks of imagery to cell means, crops and the registration layer.
 
-Blocks are read, represented and compressed by several threads, each with its own datasets; results
-are collected in the order of the blocks, so the map is the same for any number of threads. The
-result of a block is a dictionary of arrays, which can be cached in a folder: an interrupted build
-resumes from it.
+Several threads read blocks, each with its own datasets; results are collected in the order of the
+blocks, so the map is the same for any number of threads. The result of a block is a dictionary of
+arrays, one file in a cache from which an interrupted build resumes; its name holds a digest of
+everything that determines it.
 """
 
+import contextlib
+import hashlib
+import json
 import logging
 import math
 import queue
+import re
+import shutil
 import threading
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -23,15 +29,14 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.cores import usable_cores
-from orthonav.core.errors import AreaError, VariantError
-from orthonav.core.files import Progress, no_progress
+from orthonav.core.errors import AreaError, OutputError, VariantError
+from orthonav.core.files import Progress, no_progress, replacing
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
-from orthonav.ground.build.block_cache import BlockCache, digest
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
 from orthonav.ground.imagery.mosaic import GreyPixels, Mosaic, SheetRaster
@@ -57,8 +62,8 @@ def in_order(
     """Results of a worker for each item, in the order of the items.
 
     `opened` opens the worker of each thread. At most `workers + AHEAD` items are started and not
-    yet consumed. The first error, in the order of the items, is raised here. After an error, and if
-    the caller stops early, the threads finish their current items and start no new ones.
+    yet consumed. The first error, in the order of the items, is raised here; the threads then
+    finish their current items and start no new ones.
     """
     workers = min(workers, len(items))
     if workers > 1:
@@ -70,8 +75,6 @@ def in_order(
 
 
 class _Crew(Generic[Item, Made]):
-    """Threads that take items from one queue; each item has a queue for its result."""
-
     def __init__(self, items: Sequence[Item], opened: Callable[[], Worker[Item, Made]]) -> None:
         self._items, self._opened = items, opened
         self._todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
@@ -116,7 +119,7 @@ class _Crew(Generic[Item, Made]):
 
 @dataclass(frozen=True)
 class Block:
-    """A rectangle of a sheet's raster, in pixels."""
+    """In pixels of a sheet."""
 
     row: int
     col: int
@@ -138,7 +141,7 @@ class Block:
         return slice(row, row + self.height), slice(col, col + self.width)
 
     def cut(self, side_px: int) -> Iterator["Block"]:
-        """Parts of the block, divided at multiples of `side_px` of the raster."""
+        """Parts, divided at multiples of `side_px` of the raster."""
         bottom, right = self.row + self.height, self.col + self.width
         for row in range(self.row // side_px * side_px, bottom, side_px):
             for col in range(self.col // side_px * side_px, right, side_px):
@@ -157,7 +160,6 @@ class BlockPixels:
     left: int
 
     def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
-        """Rows and columns of the block in the pixels, with `beyond_px` more to south and east."""
         return (
             slice(self.top, self.top + self.block.height + beyond_px),
             slice(self.left, self.left + self.block.width + beyond_px),
@@ -165,7 +167,6 @@ class BlockPixels:
 
 
 def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
-    """Blocks of at most `side_px` that fill the raster of a grid."""
     for row in range(0, grid.height_px, side_px):
         for col in range(0, grid.width_px, side_px):
             height, width = min(side_px, grid.height_px - row), min(side_px, grid.width_px - col)
@@ -173,7 +174,7 @@ def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
 
 
 def margins(grid: TileGrid, block: Block, margin_px: int) -> tuple[int, int, int, int]:
-    """Top, left, bottom, right margin of a block: `margin_px`, less at the raster border."""
+    """Top, left, bottom, right: `margin_px`, less at the raster border."""
     return (
         min(margin_px, block.row),
         min(margin_px, block.col),
@@ -183,7 +184,6 @@ def margins(grid: TileGrid, block: Block, margin_px: int) -> tuple[int, int, int
 
 
 def read_block(raster: SheetRaster, grid: TileGrid, block: Block, margin_px: int) -> BlockPixels:
-    """Read a block with `margins` around it."""
     top, left, bottom, right = margins(grid, block, margin_px)
     width, height = left + block.width + right, top + block.height + bottom
     pixels = raster.read_grey(block.col - left, block.row - top, width, height)
@@ -191,18 +191,13 @@ def read_block(raster: SheetRaster, grid: TileGrid, block: Block, margin_px: int
 
 
 class Preview:
-    """A grey overview of a sheet, at most `across_px` wide or high, filled block by block."""
-
     def __init__(self, grid: TileGrid, across_px: int) -> None:
         self._scale = min(1.0, across_px / max(grid.width_px, grid.height_px))
         height, width = grid.height_px * self._scale, grid.width_px * self._scale
         self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
 
     def small(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The overview of a block: (h, w), empty if it is smaller than a pixel.
-
-        `grey`: an image of the block at its resolution or a coarser one.
-        """
+        """The overview (h, w) of a block in any resolution; empty if it is smaller than a pixel."""
         y0, y1, x0, x1 = self._edges(block)
         if y1 <= y0 or x1 <= x0:
             return np.zeros((0, 0), np.uint8)
@@ -210,20 +205,18 @@ class Preview:
         return np.asarray(small, dtype=np.uint8)
 
     def put(self, block: Block, small: NDArray[np.uint8]) -> None:
-        """Insert the result of `small` for a block."""
         if small.size:
             y0, y1, x0, x1 = self._edges(block)
             self._grey[y0:y1, x0:x1] = small
 
     def _edges(self, block: Block) -> tuple[int, int, int, int]:
-        """Top, bottom, left, right of a block in the overview."""
+        """Top, bottom, left, right in the overview."""
         rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
         return y0, min(y1, rows), x0, min(x1, cols)
 
     def jpeg(self) -> NDArray[np.uint8]:
-        """The overview as bytes of a JPEG."""
         encoded = cv2.imencode(".jpg", self._grey, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
         return np.asarray(encoded, dtype=np.uint8).reshape(-1)
 
@@ -231,17 +224,14 @@ class Preview:
 log = logging.getLogger(__name__)
 
 MIN_TILE_VALID_SHARE = 0.5
-"""Tiles with less imagery are omitted: no view can match most of them."""
+"""No view can match most tiles with less imagery."""
 _TILES_AT_ONCE = 2**17
 
 
 def grid_of(
     area: Area, imagery_gsd_m: float, gsd_m: float | None, tile_px: int, overlap: float
 ) -> TileGrid:
-    """The tile grid of an area; `gsd_m` None uses the resolution of the imagery.
-
-    Raises `AreaError` if tiles are larger than an area without a route.
-    """
+    """The tile grid of an area; `gsd_m` None uses the resolution of the imagery."""
     gsd_m = rounded_gsd_m(imagery_gsd_m) if gsd_m is None else gsd_m
     overlap = _whole_cells(tile_px, overlap)
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
@@ -261,7 +251,7 @@ def grid_of(
 
 
 def rounded_gsd_m(gsd_m: float) -> float:
-    """Ground resolution rounded to few digits: 5.002 to 5, 0.2431 to 0.243."""
+    """To few digits: 5.002 to 5, 0.2431 to 0.243."""
     for digits in (1, 2, 3):
         rounded = float(f"{gsd_m:.{digits}g}")
         if abs(rounded / gsd_m - 1) < 0.005:
@@ -270,9 +260,9 @@ def rounded_gsd_m(gsd_m: float) -> float:
 
 
 def _whole_cells(tile_px: int, overlap: float) -> float:
-    """The overlap adjusted so that the stride is a multiple of a micro-cell, if it is at least one.
+    """The overlap adjusted so that tiles share all their cells.
 
-    Tiles then share all their cells; otherwise memory would grow with the square of the ratio.
+    Otherwise memory would grow with the square of the ratio of stride to cell.
     """
     micro_px = max(1, tile_px // MICRO)
     stride_px = tile_px * (1 - overlap)
@@ -282,10 +272,7 @@ def _whole_cells(tile_px: int, overlap: float) -> float:
 
 
 def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
-    """Grid rows and columns (N, 2) of the tiles in the area that have imagery.
-
-    Raises `AreaError` if there are none.
-    """
+    """Grid rows and columns (N, 2) of the tiles in the area that have imagery."""
     tiles = np.concatenate(_inside(area, grid))
     share = cells.valid_share(tiles * grid.stride_px)
     if not (share >= MIN_TILE_VALID_SHARE).any():
@@ -312,15 +299,11 @@ def _inside(area: Area, grid: TileGrid) -> list[NDArray[np.intp]]:
 
 
 def is_per_tile(representation: Any) -> bool:
-    """Whether every tile is represented by itself, not cut out of the sheet's representation."""
     return getattr(representation, "per", "sheet") == "tile"
 
 
 class SheetPictures:
-    """Grey levels or edges of a sheet, filled block by block; 1 to 2 bytes per pixel.
-
-    Raises `VariantError` for representations of several channels, which encoders cannot use.
-    """
+    """Grey levels or edges of a sheet, filled block by block; 1 to 2 bytes per pixel."""
 
     def __init__(self, grid: TileGrid, representation: Any) -> None:
         if representation.channels != 1:
@@ -348,7 +331,6 @@ class SheetPictures:
         return parts
 
     def put(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
-        """Insert the `parts` of a block."""
         where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
         self._pixels[0][where] = parts["pixels"]
         self._valid[where] = parts["pixels_valid"]
@@ -372,20 +354,15 @@ class SheetPictures:
 def sheet_maps(
     representation: Any, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Representation (C, H, W) of a part of a sheet; zeros if tiles are represented singly."""
+    """Representation (C, H, W); zeros if tiles are represented singly."""
     if is_per_tile(representation):
         return np.zeros((representation.channels, *grey.shape), np.float32)
     return np.asarray(representation(grey, valid), np.float32)
 
 
 def read_pictures(
-    mosaic: Mosaic,
-    area: Area,
-    grid: TileGrid,
-    representation: Any,
-    progress: Progress,
+    mosaic: Mosaic, area: Area, grid: TileGrid, representation: Any, progress: Progress
 ) -> SheetPictures:
-    """Images of the tiles of a sheet at another date."""
     pictures = SheetPictures(grid, representation)
     blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
     with mosaic.grid_sheet(area.frame, grid) as raster:
@@ -399,13 +376,113 @@ def read_pictures(
 
 
 BLOCK_PX = 1024
-"""Least width of a block: a few MB of memory per thread."""
+"""Least width: a few MB of memory per thread."""
 PREVIEW_PX = 384
-"""Limit of the map format (docs/map-format.md)."""
+"""Limit of the map format."""
 MIN_CACHED_BLOCKS = 16
 """Smaller builds do not cache blocks by default: they are quickly rebuilt."""
 CACHED_BYTES_PER_PX = 1.6
-"""Disk space per pixel of a cached block; a corridor of the generated landscape at 1 m took 1.3."""
+"""A corridor of the generated landscape at 1 m took 1.3."""
+
+
+FORMAT = 2
+"""Of the arrays of a block: increase it when they change."""
+_OURS = re.compile(r"\.?r\d+-c\d+-[0-9a-f]{24}\.npz(\..*\.tmp\.npz)?")
+
+
+def digest(values: Any) -> str:
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class BlockCache:
+    """A folder of finished blocks. May be shared between threads.
+
+    As a context manager around a build it deletes the blocks when the build succeeds, or fails with
+    an `AreaError`; on any other error or interrupt the blocks stay.
+    """
+
+    def __init__(self, folder: Path, request: str, needed_bytes: int) -> None:
+        """`request`: digest of the inputs common to all blocks."""
+        self._folder = folder
+        self._request = request
+        self._names: dict[Block, str] = {}
+        parent = next(each for each in [folder, *folder.absolute().parents] if each.exists())
+        room = shutil.disk_usage(parent).free + sum(path.stat().st_size for path in self._files())
+        if room < needed_bytes:
+            raise OutputError(
+                f"finished blocks need about {needed_bytes / 1e6:.0f} MB until the map is written, "
+                f"but only {room / 1e6:.0f} MB are free; free disk space or name another folder "
+                f"(--work): {folder}"
+            )
+        log.info("caching finished blocks in %s: about %.0f MB", folder, needed_bytes / 1e6)
+
+    def __enter__(self) -> "BlockCache":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
+    ) -> None:
+        if error is None or isinstance(error, AreaError):
+            self.discard()
+        elif count := len(self._files()):
+            log.warning(
+                "%d finished blocks are cached; rerun the same build to resume: %s",
+                count,
+                self._folder,
+            )
+
+    def begin(self, blocks: Sequence[tuple["Block", Any]]) -> int:
+        """Register the blocks, each with the inputs that it alone depends on; remove all others.
+
+        Returns the number of cached blocks.
+        """
+        self._names = {
+            block: f"r{block.row}-c{block.col}-{digest([FORMAT, self._request, own])[:24]}.npz"
+            for block, own in blocks
+        }
+        wanted = set(self._names.values())
+        there = 0
+        for path in self._files():
+            if path.name in wanted:
+                there += 1
+            else:
+                path.unlink(missing_ok=True)
+        return there
+
+    def load(self, block: "Block") -> dict[str, NDArray[Any]] | None:
+        """None if it is not cached or damaged."""
+        path = self._folder / self._names[block]
+        try:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            log.warning("cached block is damaged (%s) and is recomputed: %s", error, path)
+            return None
+
+    def store(self, block: "Block", parts: dict[str, NDArray[Any]]) -> None:
+        path = self._folder / self._names[block]
+        try:
+            with replacing(path) as temporary:
+                np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
+        except OutputError as error:
+            raise OutputError(
+                f"{error}; earlier blocks stay cached for a rerun of the same build; or name "
+                "another folder (--work)"
+            ) from error
+
+    def discard(self) -> None:
+        for path in self._files():
+            path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # missing, or not empty
+            self._folder.rmdir()
+
+    def _files(self) -> list[Path]:
+        if not self._folder.is_dir():
+            return []
+        return [path for path in self._folder.iterdir() if _OURS.fullmatch(path.name)]
 
 
 @dataclass(frozen=True)
@@ -419,9 +496,7 @@ class Job:
 class SheetReader:
     """Reads a sheet and collects the input of all later steps.
 
-    `cells`: cell means. `preview`: grey overview. `sampler`: crops for calibration. `layer`: the
-    registration layer, None without `registration`. `pictures`: images of all tiles, for methods
-    that learn from them, else None.
+    `pictures`: images of all tiles, for methods that learn from them.
     """
 
     def __init__(
@@ -450,19 +525,12 @@ class SheetReader:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks."""
         return len(self._jobs)
 
     def read(
-        self,
-        progress: Progress,
-        workers: int | None = None,
-        cache: BlockCache | None = None,
+        self, progress: Progress, workers: int | None = None, cache: BlockCache | None = None
     ) -> None:
-        """Read all blocks that are not in `cache`, with `workers` threads (None: one per core).
-
-        Raises `AreaError` if no pixel is valid, `ImageryError`, `OutputError`.
-        """
+        """Read all blocks that are not in `cache`, with `workers` threads (None: one per core)."""
         workers = usable_cores() if workers is None else workers
         if not represent.TABLE[self._recipe["name"]].flies:
             workers = 1  # one network in memory, which uses threads itself
@@ -484,10 +552,7 @@ class SheetReader:
     def block_cache(
         self, default: Path, folder: Path | None
     ) -> AbstractContextManager[BlockCache | None]:
-        """Cache of finished blocks in `folder`, or, if there are many, in `default`; else None.
-
-        Raises `OutputError` if the disk has too little free space.
-        """
+        """Cache in `folder`, or, if there are many blocks, in `default`; else None."""
         pixels = sum(job.block.height * job.block.width for job in self._jobs)
         worthwhile = folder is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
         needed_bytes = round(CACHED_BYTES_PER_PX * pixels) if worthwhile else 0
@@ -593,7 +658,7 @@ class SheetReader:
 
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
-    """OpenCV on one thread, where each of our threads works on a block of its own."""
+    """Each of our threads works on a block of its own."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -603,7 +668,6 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block]:
-    """The blocks of a grid that tiles of an area may need."""
     side_px = _block_side_px(grid.tile_px, layout.micro_px)
     return [block for block in blocks_of(grid, side_px) if block.may_matter(area, grid)]
 
@@ -611,10 +675,7 @@ def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block
 def layer_parts(
     area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> Parts:
-    """The registration layer of a block; compressed if its chunks do not extend into other blocks.
-
-    Chunks too far from the route are omitted.
-    """
+    """Compressed if the chunks of the block do not extend into other blocks."""
     grey, valid = grey.copy(), valid.copy()
     for chunk in block.cut(CHUNK_PX):
         if not chunk.may_matter(area, grid):
@@ -636,7 +697,6 @@ def _whole_chunks(grid: TileGrid, block: Block) -> bool:
 
 
 def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
-    """Insert the result of `layer_parts` for a block into a layer."""
     if "jpeg" in parts:
         layer.add_block(block.row, block.col, parts)
     else:
@@ -644,7 +704,7 @@ def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
 
 
 def _block_side_px(tile_px: int, micro_px: int) -> int:
-    """Width of a block: a multiple of the micro-cell, and of the layer chunk if possible."""
+    """A multiple of the micro-cell, and of the layer chunk if possible."""
     least = max(BLOCK_PX, 2 * tile_px)
     step = math.lcm(micro_px, CHUNK_PX)
     if step > 1.5 * least:

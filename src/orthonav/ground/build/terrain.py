@@ -1,4 +1,4 @@
-"""Making the terrain layer of a map: heights of the ground sampled in the sheet's plane."""
+"""Making the terrain layer of a map."""
 
 import logging
 import math
@@ -24,14 +24,11 @@ CHUNK_PX = 128
 UNIT_M = 0.1
 Array = NDArray[np.float64]
 Sampler = Callable[[float, float, int, int], Array]
-"""Function of the north-west corner (metres in the plane) and of rows and columns: heights above
-mean sea level of samples at the posting, NaN where unknown."""
+"""Heights above mean sea level of rows and columns of samples from a north-west corner, metres."""
 log = logging.getLogger(__name__)
 
 
 class TerrainParts(NamedTuple):
-    """A finished terrain layer: its record for the manifest, and its arrays by name."""
-
     info: TerrainInfo
     arrays: dict[str, NDArray[Any]]
 
@@ -39,11 +36,7 @@ class TerrainParts(NamedTuple):
 def terrain_of_dem(
     dem: Dem, area: Area, grid: TileGrid, *, needed: bool = True
 ) -> TerrainParts | None:
-    """The terrain layer of a sheet from a terrain model.
-
-    Where the model has no height in the area: `AreaError`, or None unless `needed`. Raises
-    `ImageryError` where it cannot be read.
-    """
+    """None where the model has no height in the area; `AreaError` if it is `needed`."""
     posting_m = min(max(POSTING_M, rounded_gsd_m(dem.gsd_m)), MAX_POSTING_M)
 
     def sampled(west_m: float, north_m: float, rows: int, cols: int) -> Array:
@@ -63,10 +56,7 @@ def terrain_of_dem(
 def terrain_parts(
     area: Area, grid: TileGrid, posting_m: float, name: str, datum: str, sampled: Sampler
 ) -> TerrainParts | None:
-    """The terrain layer of a sheet from any source of heights; None where it has none.
-
-    `name`, `datum`: of the source, for people. Holes stay holes; a warning names them.
-    """
+    """None where the source has no height; smaller holes stay holes, and a warning names them."""
     west_m, north_m = grid.west_m - posting_m, grid.north_m + posting_m
     rows = math.ceil(grid.height_px * grid.gsd_m / posting_m) + 2
     cols = math.ceil(grid.width_px * grid.gsd_m / posting_m) + 2

@@ -57,7 +57,6 @@ class SeenCells:
 
 
 def cell_side_m(flights: Sequence[tuple[Camera, Sequence[ViewResult]]]) -> float | None:
-    """Side of the cells for these flights, by the median view; None without a confident fix."""
     sides = [
         result.outcome.agl_m * math.sqrt(math.prod(camera.extent))
         for camera, results in flights
@@ -74,11 +73,8 @@ def views_beside_map(
     results: Sequence[ViewResult],
     progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[SeenCells]:
-    """The confident views of a flight beside the map, those left out that hardly moved.
-
-    Pictures that cannot be decoded are left out. Raises `CameraError` where one has not the
-    camera's size.
-    """
+    """The confident views of a flight beside the map, without those that hardly moved or cannot be
+    decoded. Raises `CameraError` where one has not the camera's size."""
     confident: Mapping[str, Fix] = {
         result.frame: result.outcome
         for result in results
@@ -108,7 +104,6 @@ def views_beside_map(
 def beside_map(
     registration: RegistrationLocalizer, grid: ChangeGrid, view: View, fix: Fix
 ) -> SeenCells | None:
-    """A view beside the map where its fix puts it; None where it cannot be compared there."""
     pitch_deg, roll_deg = fix.tilt_deg(view.telemetry)
     telemetry = replace(
         view.telemetry,
@@ -241,7 +236,6 @@ class _Tone:
 def changed_ground(
     views: Sequence[SeenCells], grid: ChangeGrid, *, map_name: str = "", map_sha256: str = ""
 ) -> ChangedGround:
-    """Scores of all cells of `grid` by these views of one or several flights over one map."""
     count = grid.rows * grid.cols
     shown = np.zeros(count, np.int32)
     score, structure, tone = (np.full(count, np.nan) for _ in range(3))

@@ -19,6 +19,7 @@ from orthonav.core.records import MAP_STD_M
 from orthonav.ground.changes.record import CellGrid
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
+    Findings,
     blind_stretches,
     envelope_of,
     envelope_work,
@@ -26,6 +27,7 @@ from orthonav.ground.check.findings import (
     heights_of,
     heights_work,
     predicted_along,
+    verdict_of,
 )
 from orthonav.ground.check.outcome import (
     Along,
@@ -50,7 +52,6 @@ from orthonav.ground.check.trials import (
     require_overlap,
     run_many,
 )
-from orthonav.ground.check.verdict import verdict_of
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
@@ -145,7 +146,6 @@ class _Check:
         return plan
 
     def _leg_bands_m(self) -> tuple[float, ...]:
-        """Width of the band of every leg of the route, which is validated."""
         route, band_m, prior_std_m = (
             self.request.route,
             self.request.band_m,
@@ -159,7 +159,6 @@ class _Check:
         return route.bands_m(band_m) or ()
 
     def _area(self) -> Area | None:
-        """The band of the route in the plane of the map."""
         route = self.request.route
         if route is None:
             return None
@@ -171,7 +170,6 @@ class _Check:
         return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
 
     def result(self) -> CheckResult:
-        """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
         places = trial_places(
@@ -198,7 +196,7 @@ class _Check:
             radius_m=self.radius_m,
             prior_std_m=request.prior_std_m,
         )
-        verdict = verdict_of(
+        findings = Findings(
             along,
             stretches,
             lookalikes,
@@ -218,7 +216,7 @@ class _Check:
             conditions=self.conditions,
             frame=self.sheet.frame,
             cells=cells,
-            verdict=verdict,
+            verdict=verdict_of(findings),
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
             mean=mean,
             second_date=bool(other),
@@ -254,18 +252,15 @@ class _Check:
 
     @property
     def _least_error_m(self) -> float:
-        """Errors of a fix that trials do not show, root mean square.
-
-        How well orthophotos of two dates agree, the displacement of the map as a whole, and the
-        unreported tilt of the camera, at a height that may be off.
-        """
+        """Errors of a fix that trials do not show, root mean square: two orthophotos against each
+        other, the displacement of the map as a whole, the unreported tilt at a height that may be
+        off."""
         floor_m = self.floor_px * self.sheet.grid.gsd_m
         high_m = self.plan.agl_m * math.hypot(1.0, self.request.agl_std)
         tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
         return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
 
     def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
-        """Trials with the map's imagery, and with that of the second date."""
         other_date, plan = self.request.other_date, self.plan
         work = [(plan, places)]
         if other_date is not None:
@@ -285,7 +280,6 @@ class _Check:
     def _extra_trials(
         self, own: Sequence[Trial], rng: np.random.Generator
     ) -> tuple[Envelope | None, list[list[Trial]]]:
-        """The envelope of errors, and trials from other heights."""
         # Where views are not placed, errors of heading and height make no difference.
         placed = [each.en_m for each in own if each.right]
         order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
@@ -355,7 +349,6 @@ class _Check:
     def _alternatives(
         self, heights: list[list[Trial]], own: Sequence[Trial], cells: Cells
     ) -> tuple[Alternative, ...]:
-        """Other heights, where these were tried, and narrower bands, where all legs have one."""
         found: tuple[Alternative, ...] = ()
         if heights:
             found = heights_of(self.plan, own, heights)

@@ -16,8 +16,6 @@ _Z95 = 1.959963984540054  # two-sided 95 % of a normal distribution
 
 @dataclass(frozen=True)
 class Longest:
-    """The longest of several stretches in time, and in metres of the true path."""
-
     seconds_s: float
     path_m: float
 
@@ -28,12 +26,10 @@ def share(part: int | np.integer, whole: int) -> float:
 
 
 def share_of(flags: BoolArray, whole: int | None = None) -> float:
-    """Share of true `flags` (N,), of `whole` or of all; NaN for none."""
     return share(np.count_nonzero(flags), flags.size if whole is None else whole)
 
 
 def mean(values: FloatArray) -> float:
-    """Mean of `values` (N,); NaN for none."""
     return float(values.mean()) if values.size else math.nan
 
 
@@ -71,14 +67,12 @@ def upper_bound(part: int, whole: int) -> float:
 
 
 def frozen(values: FloatArray | Sequence[float]) -> FloatArray:
-    """A read-only copy as float64."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
 
 
 def runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """Start and stop of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -97,7 +91,6 @@ def seconds_since_first(times_ns: Sequence[float]) -> FloatArray:
 
 
 def path_so_far_m(truth_en_m: FloatArray) -> FloatArray:
-    """(N,) metres along the true positions (N, 2) until each of them."""
     steps_m = np.hypot(*np.diff(truth_en_m, axis=0).T)
     return np.concatenate([[0.0], np.cumsum(steps_m)])
 
@@ -110,7 +103,6 @@ def longest_stretch(flags: BoolArray, until: FloatArray) -> float:
 
 
 def longest(flags: BoolArray, seconds_s: FloatArray, path_m: FloatArray) -> Longest:
-    """The longest run of true flags (N,) in time and in metres of the path; NaN without views."""
     if not flags.size:
         return Longest(math.nan, math.nan)
     return Longest(longest_stretch(flags, seconds_s), longest_stretch(flags, path_m))

@@ -35,8 +35,6 @@ _N_WORST = 10
 
 @dataclass(frozen=True)
 class MadeFrom:
-    """What a report was made from, as text; empty where unknown."""
-
     map_name: str = ""
     recipe: str = ""
     imagery: str = ""
@@ -47,17 +45,13 @@ class MadeFrom:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The figures of one section: general, of its track, of its worst views."""
-
     general: tuple[Figure, ...]
     track: tuple[Figure, ...] = ()
     worst: tuple[Figure, ...] = ()
 
     def named(self, name: str, file_name: str) -> "_Drawn":
-        """The same with the flight's name in texts and, if given, in file names.
-
-        Two dashes separate it: neither `file_names` nor the names of figures contain any.
-        """
+        """With the flight's name in texts and, if given, in file names, set off by two dashes,
+        which neither `file_names` nor the names of figures contain."""
         start = f"{file_name}--" if file_name else ""
 
         def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
@@ -77,10 +71,8 @@ def write_report(
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
-    `whole`: what `total` gives for these flights, computed where it is None. Figures are also
-    written beside the page, as `orthonav.ground.report.page.write_page` does. Raises `ValueError`
-    as `total`, `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot
-    be written.
+    `whole`: what `total` gives, computed where it is None. Figures are also written beside it.
+    Raises `ValueError` as `total` and `OutputError` as `write_figures`.
     """
     whole = whole or total(flights)
     several = len(flights) > 1
@@ -150,7 +142,6 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
 
 
 def _compared(metrics: Metrics) -> list[tuple[str, ...]]:
-    """Confident and all fixes side by side."""
     kinds = (
         ("confident fixes", metrics.accuracy_of_confident, metrics.of_confident),
         ("all fixes", metrics.accuracy_of_fixes, metrics.standard),
@@ -182,7 +173,6 @@ def _notes(metrics: Metrics) -> list[str]:
 
 
 def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
-    """What the template shows of one flight."""
     return {
         "name": flight.name,
         "view_command": flight.view_command,
@@ -200,7 +190,6 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
 
 
 def _trust(metrics: Metrics) -> dict[str, Any]:
-    """Standard figures, criteria and calibration, for one flight or all."""
     return {
         "standard": standard_rows(metrics),
         "standard_more": [
@@ -262,7 +251,6 @@ def _drawn(flight: FlightReport) -> _Drawn:
 
 
 def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:
-    """The worst views as images; empty where these were not requested."""
     if not flight.worst:
         return ()
     caption = (
@@ -274,7 +262,6 @@ def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:
 
 
 def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
-    """The figures without positions, which can be drawn of several flights too."""
     return (
         Figure(
             "error-curve",

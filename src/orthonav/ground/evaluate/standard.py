@@ -95,7 +95,6 @@ def relative_errors_m(
 
 
 def error_statistics(errors_m: FloatArray) -> ErrorStatistics:
-    """Statistics of errors (N,)."""
     if not errors_m.size:
         return ErrorStatistics(0, *[math.nan] * 5)
     return ErrorStatistics(

@@ -20,8 +20,7 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web
 
 SERVICE = "https://data.geopf.fr/telechargement"
-PAGE = 50
-"""Packages per page, the most that the service returns."""
+PAGE = 50  # packages per page, the most that the service returns
 MAX_PAGES = 200
 ATTRIBUTION = "IGN, BD ORTHO; Licence Ouverte / Open Licence 2.0 (Etalab)"
 _ASKED = re.compile(r"^(D?\d{2,3}|D?\d[AB]|D?0\d[AB]):(\d{4})(?::(RVB|IRC))?$", re.IGNORECASE)
@@ -133,7 +132,6 @@ def download_package(
 
 
 def _check(file: PackageFile, part: Path) -> None:
-    """Raise `FetchError` where the size or MD5 of a downloaded file is wrong."""
     size = part.stat().st_size
     if file.size_bytes not in (None, size):
         problem = f"has {size} bytes instead of {file.size_bytes}"
@@ -151,7 +149,6 @@ def _md5(path: Path) -> str:
 
 
 def _entries(web: Web, url: str, parameters: dict[str, str]) -> list[Element]:
-    """Entries of all pages of a feed. Raises `FetchError`."""
     found: list[Element] = []
     for number in range(1, MAX_PAGES + 1):
         feed = web.get_xml(with_query(url, parameters | {"page": str(number), "limit": str(PAGE)}))

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 RASTERS = {".tif", ".tiff", ".jp2", ".j2k", ".vrt", ".mbtiles", ".gpkg", ".img"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp"}
-"""Image formats that are orthophotos only with a world file or GDAL's sidecar."""
+"""Orthophotos only with a world file or GDAL's sidecar."""
 CLOSED = {".ecw": "ECW", ".sid": "MrSID"}
 _ARCHIVE = re.compile(r"\.(?:7z|zip|tar|gz|tgz|rar)(?:\.\d{3})?$", re.IGNORECASE)
 _SMALL_PICTURE = re.compile(
@@ -30,8 +30,7 @@ NAMED = 5
 def sources_in(folder: Path) -> list[Source]:
     """The orthophotos of a folder and its folders, newest first, then the finest, then by name.
 
-    Other files are skipped and logged. Raises `ImageryError` where no orthophoto is left, with the
-    kinds of files seen, and where one is damaged or has no coordinate system.
+    Other files are skipped and logged.
     """
     files, skipped = _orthophotos_in(folder)
     sources, unfit = open_sources(files, folder)
@@ -43,20 +42,12 @@ def sources_in(folder: Path) -> list[Source]:
     if _ARCHIVES in skipped:
         log.warning("archives in the folder are not read; unpack them first: %s", folder)
     if skipped:
-        log.info(
-            "%d orthophotos; skipped %s: %s",
-            len(sources),
-            _summary(skipped),
-            folder,
-        )
+        log.info("%d orthophotos; skipped %s: %s", len(sources), _summary(skipped), folder)
     return sorted(sources, key=_preference)
 
 
 def _orthophotos_in(folder: Path) -> tuple[list[Path], dict[str, int]]:
-    """Files that may be orthophotos by their names, and the number of skipped ones by reason.
-
-    Raises `ImageryError` where there are none.
-    """
+    """Files that may be orthophotos by their names, and the number of skipped ones by reason."""
     files: list[Path] = []
     skipped: Counter[str] = Counter()
     for path in _files(folder):
@@ -89,7 +80,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _why_not(path: Path) -> str | None:
-    """Why a file is not an orthophoto; None where it may be one, "" for a sidecar."""
+    """None where a file may be an orthophoto, "" for a sidecar."""
     suffix = path.suffix.lower()
     if suffix in CLOSED:
         return f"{CLOSED[suffix]} files, which GDAL as installed cannot read"
@@ -127,13 +118,11 @@ def _nothing(folder: Path, skipped: dict[str, int]) -> ImageryError:
 
 
 def _suffixes(folder: Path) -> str:
-    """The kinds of files in a folder, the most common first."""
     counted = Counter(path.suffix.lower() or path.name for path in _files(folder))
     named = [f"{count} {suffix}" for suffix, count in counted.most_common(NAMED)]
     return ", ".join(named) or "nothing, it is empty"
 
 
 def _preference(source: Source) -> tuple[object, ...]:
-    """Sort key: newest first, then finest, then by kind, then by name."""
     date = tuple(-int(part) for part in (source.date or "0").split("-"))
     return date, round(source.gsd_m, 3), source.crs, source.dtype, source.colours, str(source.path)

@@ -22,17 +22,16 @@ from rasterio.windows import Window
 from orthonav.ground.imagery.source import Source
 
 STRIP_PX = 4 * 2**20
-"""Pixels that are averaged at once."""
 MAX_OFF_PX = 0.05
-"""Largest deviation of a tile from the lattice, pixels: far below the error of orthophotos."""
+"""Largest deviation of a tile from the lattice: far below the error of orthophotos."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """Sources on one pixel lattice; where several overlap, the first wins.
 
-    `members` are indexes of the mosaic's sources. Pixel (0, 0) of the lattice is the corner that
-    `transform` places; `boxes_px` (N, 4) are left, top, right, bottom of the members in it.
+    `members`: indexes of the mosaic's sources. `boxes_px` (N, 4): left, top, right, bottom of each
+    from the corner that `transform` places.
     """
 
     members: tuple[int, ...]
@@ -42,28 +41,27 @@ class Lattice:
 
     @property
     def first(self) -> Source:
-        """The source whose CRS, type and resolution all share."""
+        """All share its CRS, type and resolution."""
         return self.sources[0]
 
     @cached_property
     def size_px(self) -> tuple[int, int]:
-        """Columns and rows that hold all members."""
+        """Columns and rows."""
         return int(self.boxes_px[:, 2].max()), int(self.boxes_px[:, 3].max())
 
     def open(self, near: NDArray[np.bool_]) -> Any:
-        """The members that are `near` (N,) as one dataset, which has their palette's colours."""
+        """The members that are `near` (N,) as one dataset."""
         if self._is_plain:
             return rasterio.open(self.first.name)
         return rasterio.open(self._vrt(np.flatnonzero(near).tolist()))
 
     @property
     def bands(self) -> list[int]:
-        """The bands of the dataset that are used."""
         return list(self.first.bands if self._is_plain else range(1, self.first.colours + 1))
 
     @property
     def _is_plain(self) -> bool:
-        """Whether it is one file, whose bands and mask are used as GDAL gives them."""
+        """One file, whose bands and mask are used as GDAL gives them."""
         first = self.first
         has_false_alpha = first.marked_alpha and first.masks == first.other_masks
         return len(self.members) == 1 and not (first.has_palette or has_false_alpha)
@@ -73,8 +71,8 @@ class Lattice:
     ) -> tuple[NDArray[Any], NDArray[np.uint8], Affine]:
         """Bands (C, h, w), mask (h, w), 0 (invalid) to 255, and transform of a window.
 
-        Averaged to about `gsd_m` where that is coarser, which avoids aliasing and uses overviews
-        where the files have them. All windows average alike. Raises as rasterio does.
+        Averaged to about `gsd_m` where that is coarser, all windows alike: this avoids aliasing and
+        uses overviews. Raises as rasterio does.
         """
         factor = self._factor(max(1, round(gsd_m / self.first.gsd_m)))
         (left, top), (width, height) = (window.col_off, window.row_off), self.size_px
@@ -98,7 +96,7 @@ class Lattice:
     def _read(
         self, dataset: Any, window: Window, factor: int
     ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-        """Bands (C, h, w) and mask (h, w) of a window, averaged over squares of `factor` pixels."""
+        """Averaged over squares of `factor` pixels."""
         shape = max(1, round(window.height / factor)), max(1, round(window.width / factor))
         how: dict[str, Any] = {"window": window}
         if factor > 1 and not self.first.has_palette:
@@ -117,9 +115,9 @@ class Lattice:
         return values, dataset.dataset_mask(out_shape=shape, **how)
 
     def _factor(self, wanted: int) -> int:
-        """Pixels per side that are averaged, at best `wanted`.
+        """Pixels per side that are averaged.
 
-        Down to half of it, the largest factor with which squares end where tiles do, if any.
+        From `wanted` down to half of it, the largest with which squares end where tiles do, if any.
         """
         if len(self.members) > 1:
             for factor in range(wanted, max(1, (wanted + 1) // 2) - 1, -1):
@@ -148,10 +146,7 @@ class Lattice:
         )
 
     def _placed(self, members: list[int]) -> Iterator[tuple[Source, str]]:
-        """Members, the last first, each with the XML of its file and its place.
-
-        Those that an earlier one covers, as of another year, are left out.
-        """
+        """Members not covered by others, the last first, with the XML of file and place."""
         shown, covered = [], set[tuple[int, ...]]()
         for index in members:
             box = tuple(self.boxes_px[index].tolist())
@@ -178,7 +173,6 @@ def _gdal_type(dtype: str) -> str:
 
 
 def _values(source: Source, place: str, band: int) -> str:
-    """The XML of a band of the VRT, from 0, of one file."""
     number, more = source.bands[0 if source.has_palette else band], ""
     if source.has_palette:
         more = f"<ColorTableComponent>{band + 1}</ColorTableComponent>"
@@ -189,7 +183,7 @@ def _values(source: Source, place: str, band: int) -> str:
 
 
 def _mask(source: Source, place: str) -> str:
-    """The XML of the mask of the VRT, of one file: 255 everywhere, or the union of its masks."""
+    """255 everywhere, or the union of the masks of a file."""
     everywhere = "<ScaleOffset>255</ScaleOffset><ScaleRatio>0</ScaleRatio>"
     valid = [(mask, "<NODATA>0</NODATA>") for mask in source.masks]
     return "".join(
@@ -199,10 +193,7 @@ def _mask(source: Source, place: str) -> str:
 
 
 def lattices_of(sources: Sequence[Source]) -> list[Lattice]:
-    """The sources grouped into lattices.
-
-    Only consecutive sources share one, so that earlier sources still cover later ones.
-    """
+    """Only consecutive sources share one, so that earlier sources still cover later ones."""
     runs: list[list[int]] = []
     for index, source in enumerate(sources):
         if runs and _offset_px(sources[runs[-1][0]], source) is not None:
@@ -222,7 +213,7 @@ def _lattice(members: list[int], sources: list[Source]) -> Lattice:
 
 
 def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
-    """Columns and rows from the corner of one to that of another; None where no lattice fits."""
+    """Columns and rows from corner to corner; None where no lattice fits."""
     alike = (
         first.crs == other.crs
         and first.colours == other.colours

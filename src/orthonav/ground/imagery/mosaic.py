@@ -1,5 +1,6 @@
 """One or several orthophotos as one image, resampled into a sheet's plane and read by windows."""
 
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -27,7 +28,6 @@ from orthonav.ground.imagery.folder import sources_in
 from orthonav.ground.imagery.joined import Lattice, lattices_of
 from orthonav.ground.imagery.plates import at_epoch
 from orthonav.ground.imagery.source import Source, open_sources, quiet, unreadable
-from orthonav.ground.imagery.stretch import ContrastStretch, sample_stretches
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
@@ -39,6 +39,71 @@ _MARGIN_PX = 4
 """Pixels read around a window: cubic interpolation needs two; the others cover rounding."""
 _REACH_PX = 7
 """Width of the box whose mean fills the edge of holes: beyond the reach of cubic weights."""
+SAMPLE_PX = 512
+"""Side of the decimated image that percentiles are computed from."""
+SAMPLED_SOURCES = 12
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ContrastStretch:
+    low: float
+    high: float
+
+    def apply(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+        scale = 255.0 / (self.high - self.low)
+        scaled = (values.astype(np.float32) - self.low) * scale
+        return np.asarray(np.clip(np.nan_to_num(scaled) + 0.5, 0, 255), dtype=np.uint8)
+
+
+def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None, ...]:
+    """The stretch of each source: None for 8 bit, else common to all of one product.
+
+    From the 0.5 and 99.5 percentiles of valid pixels.
+    """
+    alike: dict[Any, list[int]] = {}
+    for index, source in enumerate(sources):
+        if source.dtype != "uint8" and not source.has_palette:
+            kind = source.dtype, source.colours, round(source.gsd_m, 2), source.crs
+            alike.setdefault(kind, []).append(index)
+    found: list[ContrastStretch | None] = [None] * len(sources)
+    for members in alike.values():
+        stretch = _common([sources[index] for index in members])
+        for index in members:
+            found[index] = stretch
+    deep = sum(len(members) for members in alike.values())
+    if len(alike) > 1 or 0 < deep < len(sources):
+        log.warning(
+            "orthophotos have several pixel types; each kind is stretched to 8 bits separately"
+        )
+    return tuple(found)
+
+
+def _common(sources: list[Source]) -> ContrastStretch:
+    values = []
+    broken: ImageryError | None = None
+    for source in sources[:: max(1, -(-len(sources) // SAMPLED_SOURCES))]:
+        try:
+            values.append(_valid_values(source))
+        except RasterioError as error:  # it may not be needed; reported where it is
+            broken = broken or unreadable(source.path, error)
+    if broken is not None and not values:
+        raise broken
+    every = np.concatenate(values)
+    if every.size == 0:
+        raise ImageryError("orthophotos have no valid pixel (all nodata)")
+    low, high = (float(value) for value in np.percentile(every, [0.5, 99.5]))
+    return ContrastStretch(low, high if high > low else low + 1.0)
+
+
+def _valid_values(source: Source) -> NDArray[Any]:
+    (lattice,) = lattices_of([source])
+    with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
+        shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
+        pixels = data.read(lattice.bands, out_shape=(source.colours, *shape))
+        valid = data.dataset_mask(out_shape=shape) > 0
+    sampled = pixels[:, valid].ravel()
+    return np.asarray(sampled[np.isfinite(sampled)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +121,7 @@ class Mosaic:
         """Inspect files, and all orthophotos of folders, the newest first; nothing stays open.
 
         `epoch`: decimal year at which positions in systems of plates are those of WGS 84; None:
-        they are taken as they are. Raises as `open_source`, `sources_in` and `at_epoch` do.
+        they are taken as they are.
         """
         if not paths:
             raise ImageryError("no orthophoto was given")
@@ -76,22 +141,22 @@ class Mosaic:
 
     @property
     def stretch(self) -> ContrastStretch | None:
-        """The contrast stretch of the first source with more than 8 bits, if any."""
+        """Of the first source with more than 8 bits."""
         return next((each for each in self.stretches if each is not None), None)
 
     @property
     def gsd_m(self) -> float:
-        """Finest ground resolution of the sources in metres."""
+        """The finest."""
         return min(source.gsd_m for source in self.sources)
 
     @property
     def outline_latlon_deg(self) -> NDArray[np.float64]:
-        """Border points (N, 2) of all sources, latitude and longitude in degrees."""
+        """Border points (N, 2) of all sources."""
         return np.concatenate([source.outline_latlon_deg for source in self.sources])
 
     @property
     def common_stamp(self) -> list[list[float] | None]:
-        """The stretches, which all pixels depend on besides their files."""
+        """What all pixels depend on besides their files."""
         found = {(each.low, each.high) for each in self.stretches if each is not None}
         return [list(each) for each in sorted(found)]
 
@@ -106,25 +171,21 @@ class Mosaic:
         return tuple(_described(members) for members in kinds.values())
 
     def sheet(self, frame: LocalFrame, **place: Any) -> "SheetRaster":
-        """The mosaic resampled into `frame`; `place` is that of `SheetRaster`."""
         return SheetRaster(self, frame, **place)
 
     def grid_sheet(
         self, frame: LocalFrame, grid: TileGrid, threads: int | None = None
     ) -> "SheetRaster":
-        """The raster that all tiles of a grid together cover."""
         names = ("west_m", "north_m", "width_px", "height_px", "gsd_m")
         place = {name: getattr(grid, name) for name in names}
         return SheetRaster(self, frame, **place, threads=threads)
 
     @cached_property
     def lattices(self) -> list[Lattice]:
-        """The sources by the pixel lattices that they share, in order of precedence."""
         return lattices_of(self.sources)
 
 
 def _described(sources: Sequence[Source]) -> dict[str, Any]:
-    """A file, or the files of one kind of a folder: their number, first and last date."""
     first = sources[0]
     if first.folder is None:
         return first.describe()
@@ -142,20 +203,20 @@ def _described(sources: Sequence[Source]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """A window of a sheet: `rgb` (H, W, 3) uint8 and `valid` (H, W) bool."""
+    """`rgb` (H, W, 3) uint8 and `valid` (H, W) bool."""
 
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_]
 
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
-        """Grey levels (H, W) uint8 (ITU-R BT.601 weights); 0 where not valid."""
+        """ITU-R BT.601 weights; 0 where not valid."""
         return np.asarray(cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class GreyPixels:
-    """A window of a sheet: `grey` (H, W) uint8, 0 where not valid, and `valid` (H, W) bool."""
+    """`grey` (H, W) uint8, 0 where not valid, and `valid` (H, W) bool."""
 
     grey: NDArray[np.uint8]
     valid: NDArray[np.bool_]
@@ -164,8 +225,7 @@ class GreyPixels:
 class SheetRaster:
     """A north-up raster in a sheet's plane over orthophotos; a context manager.
 
-    Its first pixel begins at `west_m`, `north_m`. It belongs to the thread that enters it; start
-    other threads than the main one inside `quiet`. It uses `threads` of its own (None: all cores).
+    It belongs to the thread that enters it; start other threads than the main one inside `quiet`.
     """
 
     def __init__(
@@ -201,18 +261,12 @@ class SheetRaster:
         self._env.close()
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
-        """Pixels of a window; outside all imagery they are 0 and invalid.
-
-        Raises `ImageryError` where a file cannot be read.
-        """
+        """Pixels of a window; outside all imagery they are 0 and invalid."""
         values, valid = self._composed(Window(col, row, width_px, height_px), 3)
         return Pixels(values, valid)
 
     def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> GreyPixels:
-        """The same in grey, converted before resampling: within one level of `read`, and faster.
-
-        Raises `ImageryError` where a file cannot be read.
-        """
+        """Converted before resampling: within one level of `read`, and faster."""
         values, valid = self._composed(Window(col, row, width_px, height_px), 1)
         return GreyPixels(values[..., 0], valid)
 
@@ -272,7 +326,6 @@ class SheetRaster:
                 )
 
     def _near(self, left: int, top: int, right: int, bottom: int) -> NDArray[np.bool_]:
-        """Which of the sources may overlap a box."""
         boxes = self._boxes_px
         near = (boxes[:, 0] < right) & (boxes[:, 2] > left)
         return np.asarray(near & (boxes[:, 1] < bottom) & (boxes[:, 3] > top))
@@ -338,10 +391,7 @@ class SheetRaster:
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
     ) -> tuple[Window, bool] | None:
-        """Pixels of a lattice that a window of the sheet needs, and whether all of them exist.
-
-        None where none exists.
-        """
+        """Pixels of a lattice that a window needs, and whether all of them exist; None for none."""
         share = np.linspace(0, 1, 9)
         zero, one = np.zeros(9), np.ones(9)
         cols = np.concatenate([share, share, zero, one]) * shape[1]
@@ -367,7 +417,6 @@ class SheetRaster:
         return Window(left, top, right - left, bottom - top), had == wanted
 
     def _dataset(self, lattice: Lattice) -> Any:
-        """The open lattice, with the members that the sheet may need."""
         key = lattice.members[0]
         if key not in self._open:
             near = self._near(0, 0, self.width_px, self.height_px)
@@ -386,7 +435,6 @@ class SheetRaster:
 
 
 def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:
-    """Bands (C, h, w) converted to one or three: colours to grey, or grey to all three."""
     if len(bands) == colours:
         return bands
     if colours == 3:
@@ -396,10 +444,7 @@ def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:
 
 
 def _fill_holes(bands: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-    """Fill invalid pixels near valid ones with the mean of their surroundings.
-
-    Interpolation mixes neighbours, so the fill value of a hole would show next to it.
-    """
+    """Interpolation mixes neighbours, so the fill value of a hole would show next to it."""
     known = (mask > 0).astype(np.float32)
     if known.all() or not known.any():
         return

@@ -31,17 +31,16 @@ _FRAMES = (
     (r"GDA94", "EPSG:4283"),
     (r"GDA2020", "EPSG:7844"),
 )
-"""Geographic systems for which PROJ knows the motion, by the names of those that agree with them
-within some decimetres."""
+"""Geographic systems for which PROJ knows the motion, by names of those that agree to decimetres.
+"""
 
 
 def plate_shift_deg(
     crs: str, lat_deg: float, lon_deg: float, year: float
 ) -> tuple[float, float] | None:
-    """What a position in a system lacks to that in WGS 84 at an epoch: latitude and longitude.
+    """What latitude and longitude in a system lack to those in WGS 84 at an epoch.
 
-    `crs`: text of the system, or the beginning of its WKT. None where it is not fixed to a plate,
-    or its motion is not known.
+    `crs`: text of the system, or the beginning of its WKT. None where no motion is known.
     """
     name = _name(crs)
     frame = next((code for pattern, code in _FRAMES if re.search(pattern, name)), None)
@@ -53,7 +52,6 @@ def plate_shift_deg(
 
 
 def plate_shift_m(crs: str, lat_deg: float, lon_deg: float, year: float) -> float:
-    """Length of `plate_shift_deg` in metres; 0 where there is none."""
     shift = plate_shift_deg(crs, lat_deg, lon_deg, year)
     if shift is None:
         return 0.0
@@ -64,8 +62,7 @@ def plate_shift_m(crs: str, lat_deg: float, lon_deg: float, year: float) -> floa
 def at_epoch(sources: Sequence[Source], year: float) -> list[Source]:
     """The sources moved with their plate to where WGS 84 has them at an epoch, a decimal year.
 
-    Those of one system are moved by the same distance. Raises `ImageryError` for an epoch outside
-    `EPOCHS`, and where no source is in a system whose motion is known.
+    Those of one system are moved by the same distance.
     """
     if not EPOCHS[0] <= year <= EPOCHS[1]:
         raise ImageryError(f"epoch must be a year from {EPOCHS[0]:g} to {EPOCHS[1]:g}, got {year}")
@@ -96,7 +93,7 @@ def _moved(
 
 
 def _name(crs: str) -> str:
-    """Names of a system: that of its geographic system too, as far as it can be read."""
+    """That of its geographic system too, as far as it can be read."""
     try:
         system = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError:  # a WKT that was cut

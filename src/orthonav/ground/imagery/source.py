@@ -1,10 +1,11 @@
 """Inspection of an orthophoto file: usability, georeference, and the bands that are used."""
 
 import logging
+import re
 import threading
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,6 @@ from orthonav.core.errors import ImageryError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery.names import date_of, system_of, tab_transform
 
 try:
     import rasterio
@@ -34,9 +34,8 @@ except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
 OUTLINE_POINTS = 21
-"""Points per side of the border, as rasterio's `transform_bounds` uses."""
+"""Per side, as rasterio's `transform_bounds` uses."""
 ALPHA_SAMPLE_PX = 512
-"""Alpha bands are sampled at about so many pixels a side, in `ALPHA_WINDOWS` windows a side."""
 ALPHA_WINDOWS = 8
 ALPHA_CHECKS = 16
 """Files of one kind that are checked; their producer writes all alike."""
@@ -59,56 +58,44 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Metadata of one orthophoto."""
-
     path: Path
-    """The file."""
     name: str
     """What GDAL opens: the path, or a table in the file."""
     bands: tuple[int, ...]
     """Bands that are used, from 1: one for grey, three for red, green, blue."""
     dtype: str
-    """Pixel type."""
     width_px: int
-    """Columns."""
     height_px: int
-    """Rows."""
     crs: str
-    """Coordinate system as text."""
     system: Any
-    """The same as rasterio's CRS."""
+    """Of rasterio."""
     is_named: bool
-    """Whether the coordinate system was taken from names because the file has none."""
+    """The system was taken from names because the file has none."""
     transform: Affine
     """From column, row to coordinates, of the raster or of a sidecar."""
     gsd_m: float
-    """Ground resolution at the centre, metres per pixel."""
+    """At the centre."""
     outline_latlon_deg: NDArray[np.float64]
-    """The border (N, 2), latitude and longitude in degrees."""
+    """The border (N, 2)."""
     date: str | None
-    """Date of acquisition, YYYY[-MM[-DD]]."""
+    """Of acquisition, YYYY[-MM[-DD]]."""
     has_palette: bool = False
-    """Whether pixels are indexes of colours."""
     marked_alpha: bool = False
-    """Whether a band is marked as alpha."""
     masks: tuple[str, ...] = ()
     """Bands that tell where it is valid, as GDAL's VRT names them; empty where it is everywhere."""
     other_masks: tuple[str, ...] = ()
     """The same where the alpha band is an image, such as near infrared."""
     folder: Path | None = None
-    """The folder given by the user that it was found in."""
+    """Given by the user."""
     stamp: tuple[tuple[str, int, int], ...] = ()
     """Path, size and modification time in ns of its files."""
     terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    """Origin and terms, by the keys of `TERMS`."""
 
     @property
     def colours(self) -> int:
-        """Bands that are read: 1 for grey, 3 for colours."""
         return 3 if self.has_palette else len(self.bands)
 
     def describe(self) -> dict[str, Any]:
-        """Entry of the map's manifest."""
         return {
             "name": self.path.name,
             "date": self.date,
@@ -126,11 +113,6 @@ class UnfitError(ImageryError):
 
 
 def open_source(path: Path) -> Source:
-    """Inspect an orthophoto; of several tables of a GeoPackage, the first.
-
-    Raises `MissingFileError`, or `ImageryError` for a file GDAL cannot read, without a
-    georeference, or without usable bands.
-    """
     return open_sources([path])[0][0]
 
 
@@ -139,8 +121,8 @@ def open_sources(
 ) -> tuple[list[Source], list[str]]:
     """Inspect orthophotos, several at a time; a file may hold several.
 
-    `folder` is the folder given by the user, if any; then rasters that are not orthophotos are
-    left out, and the second list has one reason for each. Raises as `open_source` does.
+    Of a `folder` given by the user, rasters that are not orthophotos are left out; the second list
+    has one reason for each.
     """
     sources: list[Source] = []
     unfit: list[str] = []
@@ -242,8 +224,7 @@ def unwarped(path: Path, dataset: Any) -> str | None:
 
 
 def _terms(tags: Mapping[str, str]) -> Mapping[str, str]:
-    """Licence, attribution and source of a file, as `orthonav fetch` writes them, else its
-    copyright; each cut to `MAX_TERM` letters."""
+    """As `orthonav fetch` writes them, else the copyright."""
     found = {}
     for key, names in TERMS.items():
         text = next((tags[name].strip() for name in names if tags.get(name, "").strip()), "")
@@ -253,7 +234,7 @@ def _terms(tags: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _names_of(path: Path, folder: Path | None) -> list[str]:
-    """Names to search for metadata: the file's, then of the folders up to the given one."""
+    """To search for metadata: the file's, then of the folders up to the given one."""
     names = [path.stem]
     if folder is not None:
         above = path.parent.resolve().relative_to(folder.resolve()).parts
@@ -284,7 +265,7 @@ def _transform(path: Path, dataset: Any) -> Affine:
 
 
 def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
-    """Path, size and modification time in ns of the file, and of those that a VRT refers to."""
+    """Of the file, and of those that a VRT refers to."""
     files = [path, *(dataset.files if dataset.driver == "VRT" else ())]
     known = {str(Path(file).resolve()) for file in files}
     found = [(name, Path(name).stat()) for name in sorted(known) if Path(name).is_file()]
@@ -315,10 +296,7 @@ def _masks(dataset: Any, bands: tuple[int, ...]) -> tuple[tuple[str, ...], tuple
 
 
 def _without_false_alpha(sources: list[Source]) -> list[Source]:
-    """The sources, without `masks` where these are an alpha band that is an image.
-
-    Of many files of one kind only the first `ALPHA_CHECKS` are checked.
-    """
+    """Without `masks` where these are an alpha band that is an image."""
     verdicts: dict[Any, list[bool]] = {}
     checked = []
     for source in sources:
@@ -334,10 +312,7 @@ def _without_false_alpha(sources: list[Source]) -> list[Source]:
 
 
 def _has_false_alpha(source: Source) -> bool:
-    """Whether the alpha band (GDAL marks the fourth of four by default) is not a mask.
-
-    A mask is transparent or opaque nearly everywhere; an image holds all values between.
-    """
+    """GDAL marks the fourth of four bands by default; a mask has few values between its ends."""
     try:
         with rasterio.open(source.name) as dataset:
             values = _sample(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
@@ -355,10 +330,7 @@ def _has_false_alpha(source: Source) -> bool:
 
 
 def _sample(dataset: Any, band: int) -> NDArray[Any]:
-    """Values (N,) of a band: all of a small one, else of windows spread evenly over it.
-
-    A decimated read of a large file without overviews would decode all of it.
-    """
+    """Values (N,) of a small band, else of windows: decimated reads may decode the whole file."""
     if max(dataset.width, dataset.height) <= ALPHA_SAMPLE_PX:
         return np.asarray(dataset.read(band)).ravel()
     side = ALPHA_SAMPLE_PX // ALPHA_WINDOWS
@@ -375,10 +347,7 @@ def _sample(dataset: Any, band: int) -> NDArray[Any]:
 def _outline(
     path: Path, dataset: Any, system: Any, transform: Affine
 ) -> tuple[NDArray[np.float64], float]:
-    """The border (N, 2), latitude and longitude in degrees, and the ground resolution in metres.
-
-    The resolution is the square root of the ground area of the central pixel.
-    """
+    """The border (N, 2), degrees, and the ground resolution: root of the central pixel's area."""
     share = np.linspace(0, 1, OUTLINE_POINTS)
     zero, one = np.zeros(OUTLINE_POINTS), np.ones(OUTLINE_POINTS)
     middle_col, middle_row = dataset.width / 2, dataset.height / 2
@@ -415,7 +384,7 @@ def _outline(
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress rasterio's warnings of cases that are checked or intended, in all threads.
+    """Suppress rasterio's warnings of cases that are checked or intended.
 
     Warning filters belong to the process, and threads that change them would interfere. So this
     does nothing outside the main thread; callers that start threads enter it for them.
@@ -430,7 +399,86 @@ def quiet() -> Iterator[None]:
 
 
 def unreadable(path: Path, error: Exception) -> ImageryError:
-    """GDAL's reason why a file cannot be read, on one line."""
     reason = error.__cause__ or error  # rasterio itself only says "see previous exception"
     line = (str(reason).splitlines() or [type(reason).__name__])[0]
     return ImageryError(f"orthophoto cannot be read ({line}): {path}")
+
+
+_TAGS = ("TIFFTAG_DATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "DATE")
+_DATE = re.compile(  # not 2000x2000, nor 2000px
+    r"(?<!\d)(?<!\dx)(19\d\d|20[0-3]\d)"
+    r"(?:[-_]?(0[1-9]|1[0-2])(?:[-_]?(0[1-9]|[12]\d|3[01]))?)?"
+    r"(?![\dx]|[-_ ]?px)",
+    re.IGNORECASE,
+)
+_IGN_SYSTEMS = {
+    "LAMB93": "EPSG:2154",
+    "LA93": "EPSG:2154",
+    "RGAF09UTM20": "EPSG:5490",
+    "UTM22RGFG95": "EPSG:2972",
+    "RGR92UTM40S": "EPSG:2975",
+    "RGM04UTM38S": "EPSG:4471",
+    "RGSPM06U21": "EPSG:4467",
+}
+"""In names of packages, folders and tiles of IGN (France)."""
+_IGN_SYSTEM = re.compile(rf"(?<![A-Za-z0-9])({'|'.join(_IGN_SYSTEMS)})(?![A-Za-z0-9])")
+_IGN_TILE = re.compile(r"^[0-9][0-9AB]{1,2}-((?:19|20)\d\d)-\d{4}-\d{4}-")
+"""Of BD ORTHO: department, year, kilometres east and north, and more."""
+_IGN_PACKAGE = re.compile(r"_D\d?\d[0-9AB](?:_|-)((?:19|20)\d\d)(?![0-9])")
+_TAB_POINT = re.compile(
+    r"\(\s*([-+.\deE]+)\s*,\s*([-+.\deE]+)\s*\)\s*\(\s*([-+.\deE]+)\s*,\s*([-+.\deE]+)\s*\)"
+)
+_MAX_TAB_BYTES = 100_000
+MAX_TAB_OFF_PX = 0.2
+
+
+def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
+    """YYYY[-MM[-DD]] from tags, else from the first name that has one.
+
+    From IGN's names only the year: the day in them is that of the edition, and kilometres follow
+    the year of a tile.
+    """
+    for tag in _TAGS:
+        found = _DATE.search(str(tags[tag]).replace(":", "-")) if tag in tags else None
+        if found:
+            return "-".join(part for part in found.groups() if part)
+    for name in names:
+        years = _IGN_TILE.search(name) or _IGN_PACKAGE.search(name)
+        if years:
+            return years.group(1)
+        found = _DATE.search(name)
+        if found:
+            return "-".join(part for part in found.groups() if part)
+    return None
+
+
+def system_of(names: Iterable[str]) -> str | None:
+    for name in names:
+        found = _IGN_SYSTEM.search(name)
+        if found:
+            return _IGN_SYSTEMS[found.group(1)]
+    return None
+
+
+def tab_transform(path: Path) -> tuple[float, ...] | None:
+    """Geotransform a..f of MapInfo's sidecar, which GDAL reads for TIFF, but not for JPEG 2000."""
+    for sidecar in (path.with_suffix(".tab"), path.with_suffix(".TAB")):
+        if sidecar.is_file() and sidecar.stat().st_size <= _MAX_TAB_BYTES:
+            return _affine(_TAB_POINT.findall(sidecar.read_text("latin-1")))
+    return None
+
+
+def _affine(points: list[tuple[str, str, str, str]]) -> tuple[float, ...] | None:
+    """Least squares of control points x, y, column, row; None where they are not affine."""
+    try:
+        x, y, col, row = np.array(points, dtype=np.float64).reshape(-1, 4).T
+    except ValueError:
+        return None
+    base = np.stack([col, row, np.ones_like(col)], axis=1)
+    if len(points) < 3 or np.linalg.matrix_rank(base) < 3:
+        return None
+    solved = np.linalg.lstsq(base, np.stack([x, y], axis=1), rcond=None)[0]
+    off = np.abs(base @ solved - np.stack([x, y], axis=1)).max()
+    if off > MAX_TAB_OFF_PX * np.hypot(*solved[0]):
+        return None
+    return tuple(solved.T.ravel().tolist())

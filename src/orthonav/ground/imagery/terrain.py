@@ -1,8 +1,9 @@
 """A terrain model in a file that GDAL reads: heights above mean sea level by position."""
 
+import functools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, bilinear
 try:
     import pyproj
     import rasterio
+    from pyproj.exceptions import ProjError
     from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
@@ -27,32 +29,138 @@ try:
     from rasterio.vrt import WarpedVRT
     from rasterio.windows import Window
 
-    from orthonav.ground.imagery.datum import VerticalDatum, geoid, horizontal_and_vertical
     from orthonav.ground.imagery.source import quiet, unwarped
 except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 
 Array = NDArray[np.float64]
 BLOCK_PX = 256
-"""Side of the windows that are read."""
 SAMPLE_PX = 512
 """Side of the overview from which units and voids are judged."""
 DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
-"""Tag of files that `orthonav fetch` wrote: what their heights count from."""
+"""In files that `orthonav fetch` wrote."""
 _UNITS = {
     "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
     "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048,
     "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,
 }  # fmt: skip
 _OPTIONS = {"GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 64 * 2**20}
+Undulation = Callable[[Array, Array], Array]
+"""Height of the geoid above the ellipsoid (m) by latitudes and longitudes (deg)."""
+NAMED = {"egm96": "EPSG:5773", "egm2008": "EPSG:3855", "msl": "EPSG:5714"}
+ELLIPSOID = "ellipsoid"
+OPTION = f"--dem-datum {'|'.join((*NAMED, ELLIPSOID))}|EPSG:NUMBER"
+GEOIDS = ("us_nga_egm08_25.tif", "egm08_25.gtx", "us_nga_egm96_15.tif", "egm96_15.gtx")
+"""In the order of preference; the second names are those of older PROJ."""
+_DEGREES = "+proj=unitconvert +xy_in=deg +xy_out=rad"
+_RADIANS = "+proj=unitconvert +xy_in=rad +xy_out=deg"
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class VerticalDatum:
+    """What heights count from.
+
+    All but those above the ellipsoid are taken as above mean sea level, from which national systems
+    differ by up to two metres. `unit_m`: metres of one unit.
+    """
+
+    name: str
+    above_ellipsoid: bool
+    unit_m: float = 1.0
+
+
+def horizontal_and_vertical(
+    crs: Any, given: str | None, path: Path
+) -> tuple[pyproj.CRS, VerticalDatum]:
+    """Of a file with the system `crs`; the datum `given` is needed where it states none."""
+    try:
+        system = pyproj.CRS.from_wkt(crs.to_wkt())
+        stated, horizontal = _stated(system)
+        named = None if given is None else datum_of(given)
+    except ProjError as error:
+        raise ImageryError(f"coordinate system cannot be used ({error}): {path}") from error
+    found = stated or named
+    if found is None:
+        raise ImageryError(
+            "terrain file does not state its vertical datum; see its documentation and "
+            f"give {OPTION}: {path}"
+        )
+    if named is not None and found.above_ellipsoid != named.above_ellipsoid:
+        raise ImageryError(
+            f"terrain file states heights as {found.name}, --dem-datum {given} contradicts it; "
+            f"leave the option out: {path}"
+        )
+    return horizontal, found
+
+
+def datum_of(text: str) -> VerticalDatum:
+    if text.lower() == ELLIPSOID:
+        return VerticalDatum("above the ellipsoid of WGS 84", True)
+    try:
+        system = pyproj.CRS.from_user_input(NAMED.get(text.lower(), text))
+    except ProjError:
+        system = None
+    if system is None or not system.is_vertical or system.is_compound:
+        raise ImageryError(f"unknown vertical datum '{text:.40}'; give {OPTION}")
+    return _vertical(system)
+
+
+def _stated(system: pyproj.CRS) -> tuple[VerticalDatum | None, pyproj.CRS]:
+    """The datum that a system states, None without one, and the horizontal system."""
+    if system.is_bound and system.source_crs is not None:
+        system = system.source_crs
+    if system.is_compound:
+        horizontal, vertical = system.sub_crs_list[0], system.sub_crs_list[-1]
+        return _vertical(vertical), horizontal
+    if len(system.axis_info) == 3:
+        unit_m = float(system.axis_info[2].unit_conversion_factor)
+        return VerticalDatum(f"{system.name}, ellipsoidal", True, unit_m), system.to_2d()
+    return None, system
+
+
+def _vertical(system: pyproj.CRS) -> VerticalDatum:
+    axis = system.axis_info[0]
+    if axis.direction != "up":
+        raise ImageryError(
+            f"heights in '{system.name:.60}' count {axis.direction}: a terrain model with heights "
+            "that count up is needed"
+        )
+    return VerticalDatum(system.name, False, float(axis.unit_conversion_factor))
+
+
+@functools.cache
+def geoid() -> Undulation:
+    """From a grid of PROJ on this machine; nothing is downloaded."""
+    for name in GEOIDS:
+        try:
+            found = pyproj.Transformer.from_pipeline(
+                f"+proj=pipeline +step {_DEGREES} +step +proj=vgridshift +grids={name} "
+                f"+multiplier=1 +step {_RADIANS}"
+            )
+        except ProjError:
+            continue
+        return functools.partial(_undulation, found)
+    raise ImageryError(
+        "heights above the ellipsoid need a geoid, and PROJ has none of the grids "
+        f"{', '.join(GEOIDS[::2])} in {pyproj.datadir.get_data_dir()}: install one (projsync "
+        f"--file {GEOIDS[0]}, or Debian's proj-data with PROJ_DATA=/usr/share/proj), or use "
+        "heights above the sea"
+    )
+
+
+def _undulation(transformer: pyproj.Transformer, lat_deg: Array, lon_deg: Array) -> Array:
+    """NaN outside the grid."""
+    lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
+    shifted = transformer.transform(lon, lat, np.zeros_like(lat))[2]
+    found = np.asarray(shifted, np.float64)
+    return np.where(np.isfinite(found), found, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Dem:
     """An open terrain model; calling it gives heights above mean sea level (`TerrainHeights`).
 
-    `path`: its file. `datum`: what its heights count from. `gsd_m`: its ground resolution.
     Heights are read by windows; for one thread.
     """
 
@@ -69,11 +177,7 @@ class Dem:
         object.__setattr__(self, "_system_from_world", turned)
 
     def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
-        """Heights above mean sea level, bilinear; NaN for no data and outside the file.
-
-        Raises `ImageryError` where the file cannot be read, or where its heights count from the
-        ellipsoid and there is no geoid.
-        """
+        """Bilinear; NaN for no data and outside the file."""
         lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
         col, row = self._pixels(lat.ravel(), lon.ravel())
         found = np.full(col.shape, np.nan)
@@ -88,7 +192,6 @@ class Dem:
         return self._above_sea(found.reshape(lat.shape), lat, lon)
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:
-        """Whether a position lies in the file, holes included."""
         col, row = self._pixels(np.array([lat_deg]), np.array([lon_deg]))
         return bool(0 <= col[0] <= self._data.width and 0 <= row[0] <= self._data.height)
 
@@ -101,11 +204,8 @@ class Dem:
         rows: int,
         cols: int,
     ) -> Array:
-        """Mean heights (rows, cols) above mean sea level of squares of `posting_m` in a plane.
-
-        The north-west corner of the first one is `west_m`, `north_m`. NaN for holes. Raises as
-        `__call__`.
-        """
+        """Mean heights (rows, cols) of squares of `posting_m` from a north-west corner; NaN for
+        holes."""
         row, col = np.mgrid[:rows, :cols] + 0.5
         points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
         lat, lon = frame.latlon_from_en(points)
@@ -124,7 +224,6 @@ class Dem:
         return self._above_sea(mean, lat, lon)
 
     def _warped(self, resampling: Resampling, **grid: Any) -> Array:
-        """Heights in metres, resampled onto a grid of `WarpedVRT`."""
         try:
             with (
                 quiet(),
@@ -149,7 +248,7 @@ class Dem:
         return heights
 
     def _metres(self, raw: Any) -> Array:
-        """Heights in metres of stored values; NaN where masked, or where no ground can be."""
+        """NaN where masked, or where no ground can be."""
         data = self._data
         heights = np.ma.filled(raw.astype(np.float64), np.nan)
         heights = (heights * data.scales[0] + data.offsets[0]) * self.datum.unit_m
@@ -190,11 +289,7 @@ class Dem:
 
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
-    """Open a terrain model: one band of heights, in any coordinate system.
-
-    `datum`: what its heights count from, where the file does not state it (`datum.OPTION`).
-    Raises `MissingFileError` or `ImageryError`.
-    """
+    """`datum`: what heights count from, where the file does not state it (`OPTION`)."""
     path = require_file(Path(path), "terrain file")
     try:
         with quiet(), rasterio.Env(**_OPTIONS):
@@ -229,10 +324,7 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
 
 
 def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
-    """The stored value that stands for no height: as stated, else one that no ground can have.
-
-    Raises `ImageryError` where there is no height, or where many are impossible.
-    """
+    """The stored value that stands for no height: as stated, else one that no ground can have."""
     shape = min(data.height, SAMPLE_PX), min(data.width, SAMPLE_PX)
     raw = data.read(1, out_shape=shape, masked=True, resampling=Resampling.nearest)
     values = np.ma.compressed(raw).astype(np.float64)
@@ -266,7 +358,6 @@ def _without(raw: Any, void: float | None) -> Any:
 
 
 def _gsd_m(data: Any, horizontal: pyproj.CRS) -> float:
-    """Ground resolution in metres at the middle of the file."""
     to_world = pyproj.Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True)
     step = data.transform
     col = data.width / 2 + np.array([0, 1, 0])

@@ -43,8 +43,7 @@ from orthonav.ground.recordings.recording import (
     with_options,
 )
 
-MAX_VIEWS = 500_000
-"""Ten a second for 14 hours; a small damaged file can claim far more."""
+MAX_VIEWS = 500_000  # ten a second for 14 hours; a small damaged file can claim far more
 MAX_MESSAGES = 10 * MAX_VIEWS
 MAX_NAME = 200
 MAX_THUMBNAIL_BYTES = 2**20
@@ -246,7 +245,6 @@ def run_of(path: Path) -> str | None:
 
 
 def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
-    """Read a file; warnings about its damage."""
     before, warnings = content.broken, []
     content.read(file)
     damaged, broken = file.walk.damaged, content.broken - before
@@ -263,7 +261,6 @@ def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
 
 
 def _session(data: bytes, path: Path) -> dict[str, Any]:
-    """The session of a log. Raises `FlightError` where it is damaged, or of a newer format."""
     plain = from_json(data)
     number = plain.get("format")
     if isinstance(number, int) and number > FORMAT:
@@ -358,14 +355,12 @@ def _unusable(where: str) -> Grey:
 def _arrivals(
     content: LogContent, camera: Camera, options: SourceOptions
 ) -> Iterator[tuple[SourceView, float]]:
-    """Views with an image, and the latency (s) that was subtracted from their arrival."""
     for each in content.views:
         if _has_image(each, content):
             yield _view(each, content, camera, options), (each.camera_latency_ms or 0.0) / 1e3
 
 
 def _results(files: list[Path]) -> Iterator[ViewResult]:
-    """The results of the flight; damaged ones are skipped."""
     for path in files:
         channels: dict[int, str] = {}
         for _, data in chunks(path, Walk()):

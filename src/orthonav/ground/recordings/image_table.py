@@ -52,8 +52,7 @@ _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
 _DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
-_COMPACT = re.compile(r"(19|20)\d{12}")
-"""A date and time in 14 digits."""
+_COMPACT = re.compile(r"(19|20)\d{12}")  # a date and time in 14 digits
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _LARGEST_S = 9e9
 
@@ -171,7 +170,6 @@ def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
 
 
 def _plain(name: str) -> str:
-    """A name of a column without unit, case and separators."""
     words = re.findall(r"[a-z0-9]+", _BRACKETS.sub("", name.lower()))
     if len(words) > 1 and words[-1] in _UNITS:
         words.pop()
@@ -191,7 +189,6 @@ def _numbers(
     comma: bool,
     path: Path,
 ) -> dict[str, float]:
-    """The numbers of a row, in metres and degrees; raises `FlightError` for other text."""
     values = {}
     for field, (name, metres) in columns.items():
         text = texts[field]
@@ -213,7 +210,6 @@ def _numbers(
 def _is_gimbal(
     columns: Mapping[str, tuple[str, float]], rows: Sequence[Mapping[str, float]]
 ) -> bool:
-    """Whether the pitch counts from the horizon, as that of a gimbal does."""
     if "pitch" not in columns:
         return False
     known = [values["pitch"] for values in rows if "pitch" in values]
@@ -277,7 +273,6 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
 
 
 def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
-    """A warning that names the values a view needs and the table has not."""
     lacks = [
         f"{what} ({spelt})"
         for what, spelt, fields in (

@@ -160,18 +160,12 @@ def _flight_views(
 class Imported:
     """Number of views that were written."""
 
-    views: int
-    """All of them."""
-    with_truth: int
-    """Those with a true position."""
-    complete: int
-    """Those with all telemetry that a fix needs."""
-    broken: int
-    """Views left out because their image cannot be decoded, or has another size."""
-    first_broken: str
-    """The error of the first one of them."""
-    radians: bool
-    """Whether the headings look like radians."""
+    views: int  # all of them
+    with_truth: int  # those with a true position
+    complete: int  # those with all telemetry that a fix needs
+    broken: int  # views left out because their image cannot be decoded, or has another size
+    first_broken: str  # the error of the first one of them
+    radians: bool  # whether the headings look like radians
 
 
 def import_flight(
@@ -213,7 +207,6 @@ def import_flight(
 def _encoded_image(
     view: SourceView, recording: Recording, jpeg_quality: int | None
 ) -> tuple[str, bytes]:
-    """Name and bytes of the image as it is written, once it is decoded."""
     grey, camera = view.grey(), recording.camera
     if grey.shape != (camera.height_px, camera.width_px):
         raise FlightError(

@@ -140,7 +140,6 @@ def _ground(camera: Camera, px: tuple[float, float], values: Array, relief: Reli
 
 
 def _slopes(camera: Camera, px: tuple[float, float], values: Array, relief: Relief | None) -> Array:
-    """Derivatives (2, 6) of the ground at a pixel by metres and degrees of the camera."""
     columns = []
     for step in np.diag(STEPS):
         ahead, behind = (_ground(camera, px, values + sign * step, relief) for sign in (1, -1))

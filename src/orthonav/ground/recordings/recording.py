@@ -45,36 +45,28 @@ that this program is for flies slower, and logs round positions to some metres."
 class SourceOptions:
     """How a recording is read. Raises `FlightError` for invalid values."""
 
-    kind: str | None = None
-    """One of `KINDS`; None: detected by content."""
-    camera: Path | None = None
-    """Camera file; None: the recording's own camera."""
-    rate_hz: float = 1.0
-    """Views per second of a video."""
-    telemetry: Path | None = None
-    """Log to join by time; None: the recording's own telemetry."""
-    time_offset_s: float = 0.0
-    """Added to the times of images to get times of the log, seconds."""
+    kind: str | None = None  # one of `KINDS`; None: detected by content
+    camera: Path | None = None  # camera file; None: the recording's own camera
+    rate_hz: float = 1.0  # views per second of a video
+    telemetry: Path | None = None  # log to join by time; None: the recording's own telemetry
+    time_offset_s: float = 0.0  # added to the times of images to get times of the log, seconds
     mount_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Yaw, pitch, roll of the camera in the body; 0, 0, 0 looks straight down, top forward."""
-    topics: Mapping[str, str] = field(default_factory=dict)
-    """ROS topics by role, one of `ROLES`."""
+    topics: Mapping[str, str] = field(default_factory=dict)  # ROS topics by role, one of `ROLES`
     prior_std_m: float | None = None
     """Use the recorded position as the prior, with this standard deviation per axis."""
     sensor_width_mm: float | None = None
     """Longer side of the sensor, for the focal length of photographs."""
     ground_alt_m: float | None = None
     """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
-    agl_m: float | None = None
-    """Height above ground of all views, in place of a recorded one."""
+    agl_m: float | None = None  # height above ground of all views, in place of a recorded one
     fov_deg: float | None = None
     """Field of view across the width of the image, where there is no camera file."""
     looks_down: bool = False
     """Whether the camera looked straight down where pitch and roll were not recorded."""
     over_terrain: bool = False
     """Whether a terrain turns the heights of the recording into heights above ground later on."""
-    skip_bad_images: bool = False
-    """Whether images that a flight folder names may be missing."""
+    skip_bad_images: bool = False  # whether images that a flight folder names may be missing
 
     def __post_init__(self) -> None:
         with_paths(self, "camera", "telemetry")
@@ -107,16 +99,11 @@ class SourceOptions:
 class SourceView:
     """One view of a recording: a `RecordedView` that can also be written to a flight folder."""
 
-    frame: str
-    """Name, with the suffix of the format that its image is written in."""
-    telemetry: Telemetry
-    """Telemetry of the exposure."""
-    truth_latlon_deg: tuple[float, float] | None
-    """True position, where it is known."""
-    where: str
-    """Location of the image, for messages."""
-    load: Callable[[], Grey]
-    """Decodes the image."""
+    frame: str  # name, with the suffix of the format that its image is written in
+    telemetry: Telemetry  # telemetry of the exposure
+    truth_latlon_deg: tuple[float, float] | None  # true position, where it is known
+    where: str  # location of the image, for messages
+    load: Callable[[], Grey]  # decodes the image
     data: Callable[[], bytes] | None = None
     """Returns the image as it was encoded; None where it was recorded unencoded."""
 

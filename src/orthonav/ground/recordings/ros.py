@@ -255,7 +255,6 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
 
 
 def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
-    """Time and message; damaged messages are skipped."""
     if connection is None:
         return
     for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
@@ -281,7 +280,6 @@ def _samples(
 
 
 def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
-    """Heights above ground, take-off and sea level."""
     agl, home, amsl = (Samples(1) for _ in range(3))
     connection: Any = topics.roles.get("height")
     for time_ns, message in _messages(reader, topics, connection):
@@ -296,7 +294,6 @@ def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:
-    """East and north velocity of an odometry, whose twist is in body axes."""
     turn, twist = message.pose.pose.orientation, message.twist.twist.linear
     for enu_from_flu in rotations_of_wxyz(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]:
         east, north, _ = enu_from_flu @ [twist.x, twist.y, twist.z]

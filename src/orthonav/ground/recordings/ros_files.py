@@ -66,7 +66,6 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def _order(path: Path) -> tuple[str, int]:
-    """Name and number of a file of a bag that was split."""
     match = _SPLIT.fullmatch(path.stem)
     return (match[1], int(match[2])) if match else (path.stem, 0)
 
@@ -193,7 +192,6 @@ def _named(path: Path, stack: contextlib.ExitStack) -> Path:
 
 
 def _is_cut(path: Path) -> bool:
-    """Whether a file of MCAP lacks its end."""
     if path.suffix != ".mcap":
         return False
     with path.open("rb") as stream:
@@ -203,7 +201,6 @@ def _is_cut(path: Path) -> bool:
 
 
 def _whole(named: Path, path: Path, warnings: list[str]) -> "Path | _CutMcap":
-    """The file, with an end where it has none."""
     journal = named.with_name(f"{named.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         warnings.append(
@@ -302,7 +299,6 @@ def check_held(readers: Iterable[Any]) -> None:
 
 
 def _most_held(chunks: Sequence[Any]) -> int:
-    """Largest total of chunks that overlap at one time."""
     edges = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
     edges += [
         (max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size)

@@ -32,8 +32,7 @@ from orthonav.ground.recordings.recording import (
 SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
 _SHORT_NS = 1_000_000_000
 _MISSING_FRAMES = 0.01
-SILENT = 0
-"""OpenCV's level of logging at which it writes nothing."""
+SILENT = 0  # OpenCV's level of logging at which it writes nothing
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -69,7 +68,6 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
 def _track(
     path: Path, last_ns: int, options: SourceOptions
 ) -> tuple[RecordedTrack, Path, list[str]]:
-    """The telemetry of a video, its file, and a warning where it ends early."""
     beside = [path.with_suffix(suffix) for suffix in SIDECARS]
     telemetry_path = options.telemetry or next((one for one in beside if one.is_file()), None)
     if telemetry_path is None:

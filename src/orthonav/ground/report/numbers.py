@@ -43,7 +43,6 @@ def _digits(name: str, digits: int | None) -> int | None:
 
 
 def percent_text(value: float) -> str:
-    """A share as `12.3 %`."""
     return f"{100 * value:.1f} %" if math.isfinite(value) else "-"
 
 
@@ -61,7 +60,6 @@ def metres_text(value: float) -> str:
 
 
 def plain_text(value: float) -> str:
-    """A number without unit, with three decimals."""
     return f"{value:.3f}" if math.isfinite(value) else "-"
 
 

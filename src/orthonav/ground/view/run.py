@@ -41,8 +41,15 @@ from orthonav.ground.report.imagery import (
     window_of,
 )
 from orthonav.ground.report.numbers import to_plain
-from orthonav.ground.view.feed import Batch, Feed, LineFeed
-from orthonav.ground.view.images import FolderImages, NoImages, Shot, ViewImages
+from orthonav.ground.view.feed import (
+    Batch,
+    Feed,
+    FolderImages,
+    LineFeed,
+    NoImages,
+    Shot,
+    ViewImages,
+)
 from orthonav.ground.view.logs import LogReader
 
 Array = NDArray[np.float64]
@@ -56,8 +63,6 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """What to show: see the arguments of `orthonav view`."""
-
     run: Path
     map_path: Path
     second: Path | None = None
@@ -73,9 +78,6 @@ class ViewRequest:
 
 @dataclass(frozen=True)
 class RunLabels:
-    """Names of run, map, images, truth and second run for the page; `live` while the run is in
-    progress."""
-
     name: str
     map_name: str
     images: str
@@ -135,15 +137,12 @@ class Run:
 
     @property
     def count(self) -> int:
-        """Number of views so far."""
         return len(self._results)
 
     def any_known(self, column: str) -> bool:
-        """Whether any view has a value in a column."""
         return any(value is not None for value in self._columns.get(column, ()))
 
     def any_on_map(self) -> bool:
-        """Whether any fix lies on the sheet."""
         grid = self.sheet.grid
         places = zip(self._columns.get("x", ()), self._columns.get("y", ()), strict=True)
         return any(
@@ -152,7 +151,6 @@ class Run:
         )
 
     def summary(self) -> dict[str, Any]:
-        """What does not change while the page is open."""
         return {
             **asdict(self.labels),
             "version": __version__,
@@ -177,7 +175,6 @@ class Run:
             }
 
     def detail(self, index: int) -> dict[str, Any]:
-        """Everything known about one view."""
         result = self._result(index)
         outcome = result.outcome
         found: dict[str, Any] = {
@@ -209,18 +206,15 @@ class Run:
         return plain
 
     def view_png(self, index: int) -> bytes:
-        """The view rectified to nadir, transparent outside."""
         result = self._result(index)
         placed = self._placed(result, self._images.shot(result.frame))
         made = rectified(placed.shot.load(), placed.telemetry, placed.shot.camera, placed.window)
         return png(*made)
 
     def raw_jpeg(self, index: int) -> bytes:
-        """The view as recorded, reduced."""
         return jpeg(shrunk(self._images.shot(self._result(index).frame).load(), RAW_PX))
 
     def map_png(self, index: int, at: str) -> bytes:
-        """The map at the fix or the true position, transparent where there is no imagery."""
         result = self._result(index)
         place = self._truth.get(result.frame) if at == "truth" else _place(result.outcome)
         if place is None:
@@ -230,8 +224,6 @@ class Run:
         return png(*self.sheet.crop(box, (window.size_px, window.size_px)))
 
     def ground(self, index: int, x: float, y: float) -> dict[str, Any]:
-        """The ground at a point of the rectified view, shares of its window from the left and the
-        top, with its 95 % ellipse."""
         result = self._result(index)
         fix = result.outcome
         if not isinstance(fix, Fix):
@@ -264,7 +256,6 @@ class Run:
         return _Placed(shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m))
 
     def _refresh(self) -> None:
-        """Read what is new; a file that cannot be read now is reported and tried again."""
         if not self.labels.live:
             return
         try:
@@ -374,7 +365,6 @@ def _reason(outcome: Fix | NoFix) -> str:
 
 
 def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
-    """Positions (N, 2) in the plane of the sheet, NaN where there is none."""
     en_m = np.full((len(latlon_deg), 2), math.nan)
     known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
     if known:
@@ -384,7 +374,6 @@ def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
 
 
 def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str, list[Any]]:
-    """Both columns of positions (N, 2), in pixels of the sheet."""
     px = sheet.px_from_en(en_m)
     px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
     return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
@@ -459,7 +448,6 @@ def _feed(request: ViewRequest) -> Feed:
 
 
 def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
-    """Results of the second run by frame, None without one; its health is not read."""
     if request.second is None:
         return None
     batch = _feed(replace(request, run=request.second, live=False)).poll()
@@ -489,7 +477,6 @@ def _images(request: ViewRequest, feed: Feed) -> ViewImages:
 
 
 def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
-    """True positions and their source: the given file, or the flight folder."""
     if request.truth is not None:
         return read_truth(request.truth), request.truth.name
     if request.flight is not None and (request.flight / "truth.csv").is_file():
@@ -510,7 +497,6 @@ def _differences(request: ViewRequest, run: Path) -> str:
 
 
 def _warn(request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, LatLon]) -> None:
-    """Log probable mistakes."""
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)

@@ -74,10 +74,6 @@ def page_of(
     leaflet: tuple[str, str],
     json_sha256: str,
 ) -> str:
-    """The page as HTML; `json_sha256` is the digest of the `check.json` beside it.
-
-    Raises `MissingExtraError` without Jinja2.
-    """
     about = result.about
     script, style = leaflet
     scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
@@ -162,7 +158,6 @@ def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
 
 
 def _alternatives(result: CheckResult) -> list[Plain]:
-    """For each planning parameter its name, a sentence and a table."""
     found = result.alternatives
     return [
         {
@@ -183,7 +178,6 @@ def _alternatives(result: CheckResult) -> list[Plain]:
 
 
 def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
-    """What was checked, and with what: the rows above the signature."""
     about = result.about
     return [
         ("map", about.map_name),
@@ -201,8 +195,7 @@ def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
 def _page_data(result: CheckResult, image: Background) -> str:
     """JSON for the scripts: `check.json`, and under `drawn` positions in metres and colours.
 
-    Cells of which nothing is known are left out: around a band they are most of the box. The text
-    contains no `<`, so that no name can end the script element.
+    The text contains no `<`, so that no name can end the script element.
     """
     along, cells = result.along, result.cells
     known_m = cells.error_m[np.isfinite(cells.error_m)]
@@ -274,7 +267,6 @@ def _colours() -> list[str]:
 
 
 def _band(result: CheckResult) -> list[Any]:
-    """Rings of the outline of the band, in metres; empty without a band."""
     if result.route_en_m is None or not result.band_m or len(result.route_en_m) < 2:
         return []
     from shapely import LineString

@@ -38,7 +38,6 @@ SIMULATED = "Predicted from this map alone, with simulated ageing."
 
 
 def verdict_sentence(result: CheckResult) -> str:
-    """The verdict about the route or, without one, the map, and the height it holds for."""
     sentences = AREA_VERDICTS if result.along is None else VERDICTS
     origin = f", {result.about.height}" if result.about.height else ""
     height = f"Checked at {result.conditions.agl_m:.0f} m above ground{origin}."
@@ -64,8 +63,6 @@ def seconds_text(value: float) -> str:
 
 
 def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    """A gap as a row of a table: number, ends, length, duration, probability, drift,
-    allowed drift and outcome."""
     outcome = "recovers" if stretch.recoverable else "lost"
     return (
         str(number),
@@ -81,7 +78,6 @@ def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
 
 
 def stretch_sentence(number: int, stretch: BlindStretch) -> str:
-    """A gap in one sentence."""
     _, _, _, length, duration, probability, drift, allowed, outcome = stretch_row(number, stretch)
     return (
         f"Gap {number}: {length}, {duration}, probability {probability}, error {drift} at its end "
@@ -90,7 +86,6 @@ def stretch_sentence(number: int, stretch: BlindStretch) -> str:
 
 
 def lookalike_sentence(number: int, pair: Lookalike) -> str:
-    """A pair of ambiguous places in one sentence."""
     where = "within" if pair.within_prior else "outside"
     return (
         f"Ambiguous places {number}: {metres_text(pair.apart_m)} apart, similarity "
@@ -99,7 +94,6 @@ def lookalike_sentence(number: int, pair: Lookalike) -> str:
 
 
 def tolerance_sentence(envelope: Envelope) -> str:
-    """The tolerated errors of reported heading and height."""
     low, high = abs(envelope.tolerated_agl_low), abs(envelope.tolerated_agl_high)
     return (
         f"Tolerated: a heading error of up to {envelope.tolerated_yaw_deg:g}°, or a reported "
@@ -114,7 +108,6 @@ def _tilt_error_m(conditions: Conditions) -> float:
 
 
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
-    """The conditions of the check by name."""
     yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
     rows = {
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
@@ -148,7 +141,6 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
 
 
 def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
-    """Whether another value of `what` would be better; empty if unknown."""
     tried = [each for each in alternatives if each.what == what]
     known = [each for each in tried if math.isfinite(each.probability)]
     chosen = next((each for each in known if each.chosen), None)
@@ -166,7 +158,6 @@ def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
 
 
 def remedies(result: CheckResult) -> list[str]:
-    """What may help, of what the check tried or computed, a sentence each; empty for a go."""
     if result.verdict.word is Word.GO:
         return []
     found = [better_sentence(result.alternatives, what) for what in WHAT]
@@ -190,10 +181,7 @@ def remedies(result: CheckResult) -> list[str]:
 
 
 def text(result: CheckResult) -> str:
-    """Verdict, reasons, key figures and gaps, in about 25 lines at most.
-
-    Control characters in names are replaced.
-    """
+    """Verdict, reasons, key figures and gaps; control characters in names are replaced."""
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
     lines += _reasons(result)
     rows = _figures(result)
@@ -267,7 +255,6 @@ def _stretches(result: CheckResult) -> list[str]:
 
 
 def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    """Aligned columns: right, the last one left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
