@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.ground.evaluate.standard import standard_figures
+from orthonav.ground.evaluate.figures import standard_figures
 
 TRUTH = np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0], [180.0, 0.0], [240.0, 0.0]])
 ERRORS = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan], [0.0, 10.0], [0.0, -5.0]])

@@ -10,6 +10,7 @@ from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
 from orthonav.ground.evaluate.figures import share
 from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
 from orthonav.ground.evaluate.tables import (
+    STANDARD_HEADER,
     FlightReport,
     bins_rows,
     confidence_text,
@@ -191,6 +192,7 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
 
 def _trust(metrics: Metrics) -> dict[str, Any]:
     return {
+        "standard_header": STANDARD_HEADER,
         "standard": standard_rows(metrics),
         "standard_more": [
             ("ECE", plain_text(metrics.calibration.ece)),
@@ -198,7 +200,7 @@ def _trust(metrics: Metrics) -> dict[str, Any]:
             ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
         ],
         "criteria_header": criteria_header(metrics),
-        "criteria": criteria_rows(metrics, plots.LABELS),
+        "criteria": criteria_rows(metrics),
         "confidence": confidence_text(metrics),
         "bins": bins_rows(metrics),
         "covariance": covariance_text(metrics.consistency),

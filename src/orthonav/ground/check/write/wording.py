@@ -14,7 +14,7 @@ from orthonav.ground.check.outcome import (
     Word,
     summarize,
 )
-from orthonav.ground.report.numbers import metres_text
+from orthonav.ground.report.numbers import aligned, metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -247,19 +247,4 @@ def _stretches(result: CheckResult) -> list[str]:
     for number, each in enumerate(result.stretches, start=1):
         if each in worst:
             rows.append(stretch_row(number, each))
-    more = len(result.stretches) - len(worst)
-    head = f"gaps without fixes ({len(result.stretches)})" + (
-        f", the {len(worst)} worst" * (more > 0)
-    )
-    return ["", head, *_columns(rows)]
-
-
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if i == len(row) - 1 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    return ["", f"gaps without fixes: {len(result.stretches)}, the worst:", *aligned(rows)]
