@@ -7,12 +7,7 @@ from numpy.testing import assert_array_equal
 
 from helpers import textured
 from orthonav.ground.check import ageing
-from orthonav.ground.check.ageing import (
-    MAX_PERSISTENCE,
-    MIN_PERSISTENCE,
-    another_year,
-    displaced,
-)
+from orthonav.ground.check.ageing import MAX_PERSISTENCE, MIN_PERSISTENCE, another_year, displaced
 from orthonav.ground.check.estimate import LEARNT, Recalibration
 from orthonav.ground.check.trials import reported_persistence
 

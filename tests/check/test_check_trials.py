@@ -29,11 +29,7 @@ EAST = np.array([[200.0, 60.0], [250.0, -90.0], [300.0, 120.0]])
 def plan(half_blank):
     """Views of 154 x 115 m, searched in a part of the map."""
     request = CheckRequest(
-        half_blank.map,
-        camera=CAMERA,
-        prior_std_m=40.0,
-        relief_m=0.0,
-        other_date=half_blank.present,
+        half_blank.map, camera=CAMERA, prior_std_m=40.0, relief_m=0.0, other_date=half_blank.present
     )
     return TrialPlan(request, 120.0)
 

@@ -17,11 +17,7 @@ from orthonav.core.errors import MissingExtraError, OutputError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.outcome import Conditions
 from orthonav.ground.check.write import require_free, write_check
-from orthonav.ground.check.write.plain import (
-    check_to_plain,
-    features,
-    to_json,
-)
+from orthonav.ground.check.write.plain import check_to_plain, features, to_json
 from orthonav.ground.check.write.wording import text
 from orthonav.ground.report.drawing import Drawing
 

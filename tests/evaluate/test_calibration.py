@@ -23,14 +23,8 @@ from orthonav.ground.evaluate.calibration import (
     normalized_squared,
 )
 from orthonav.ground.evaluate.figures import wilson
-from orthonav.ground.evaluate.metrics import (
-    Comparison,
-    compare,
-    measure,
-)
-from orthonav.ground.evaluate.tables import (
-    metrics_to_json,
-)
+from orthonav.ground.evaluate.metrics import Comparison, compare, measure
+from orthonav.ground.evaluate.tables import metrics_to_json
 
 RADIUS_M = 20.0
 RIGHT_M, WRONG_M = 3.0, 300.0

@@ -8,12 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.changed import (
-    add_report_changes,
-    changes_text,
-    changes_to_plain,
-    report_changes,
-)
+from orthonav.cli.changed import add_report_changes, changes_text, changes_to_plain, report_changes
 from orthonav.cli.common import beside, print_json, progress
 from orthonav.cli.needs import require_extras
 

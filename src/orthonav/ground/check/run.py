@@ -37,12 +37,7 @@ from orthonav.ground.check.outcome import (
     Conditions,
     Envelope,
 )
-from orthonav.ground.check.places import (
-    MapCoverage,
-    cell_side_m,
-    checked_m2,
-    trial_places,
-)
+from orthonav.ground.check.places import MapCoverage, cell_side_m, checked_m2, trial_places
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.trials import (
     MIN_VALID,

@@ -14,12 +14,7 @@ from orthonav.ground.evaluate.calibration import (
     nees_mean_bounds,
 )
 from orthonav.ground.evaluate.contact_sheet import Row
-from orthonav.ground.evaluate.figures import (
-    RPE_FRAMES,
-    FloatArray,
-    StandardFigures,
-    percentile,
-)
+from orthonav.ground.evaluate.figures import RPE_FRAMES, FloatArray, StandardFigures, percentile
 from orthonav.ground.evaluate.metrics import (
     Comparison,
     CriterionRow,
