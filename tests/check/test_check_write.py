@@ -21,7 +21,7 @@ from orthonav.ground.check.write.plain import check_to_plain, features, to_json
 from orthonav.ground.check.write.wording import text
 from orthonav.ground.report.drawing import Drawing
 
-KINDS = ("tiny", "small_route", "long_route", "nearly_empty")
+KINDS = ("tiny", "small_route", "nearly_empty")
 FRAME = LocalFrame(48.2, -3.1)
 
 

@@ -192,21 +192,6 @@ def flown(
 OFFSETS = [(3.0, 4.0), (0.0, 30.0), (40.0, 0.0), (500.0, 0.0)]
 
 
-def test_rows_count_accepted_right_and_wrong_fixes() -> None:
-    comparison = flown(OFFSETS, 0.9)
-    low = replace(comparison, criteria={**comparison.criteria, "confidence": np.full(4, math.nan)})
-    values = np.array([0.95, 0.6, 0.92, 0.3])
-    known = replace(comparison, criteria={**comparison.criteria, "confidence": values})
-    rows = {r.threshold: r for r in measure(known, 32.0).criteria if r.name == "confidence"}
-    assert (rows[0.5].n_accepted, rows[0.5].n_right, rows[0.5].n_far) == (3, 2, 1)
-    assert (rows[0.9].n_accepted, rows[0.9].n_right, rows[0.9].n_far) == (2, 1, 1)
-    assert (rows[0.9].recall, rows[0.9].share_far) == (0.5, 0.5)
-    assert (rows[0.99].recall, rows[0.99].n_accepted) == (0.0, 0)
-    assert math.isnan(rows[0.99].share_far)
-    unknown = [r for r in measure(low, 32.0).criteria if r.name == "confidence"]
-    assert all(math.isnan(r.recall) and math.isnan(r.share_far) for r in unknown)
-
-
 def test_json_names_and_keeps_what_was_there() -> None:
     metrics = measure(flown(OFFSETS, 0.9, [[25.0, 0.0], [0.0, 25.0]]))
     values = json.loads(json.dumps(metrics_to_json(metrics), allow_nan=False))

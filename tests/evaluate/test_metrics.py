@@ -56,15 +56,6 @@ def three_fixes() -> Comparison:
     return compare(truth_of(TRUTH_EN_M), results)
 
 
-def test_errors_are_distances_in_metres_and_nan_without_a_fix() -> None:
-    comparison = three_fixes()
-    np.testing.assert_allclose(comparison.errors_m, [5.0, 10.0, math.nan, 500.0], atol=1e-2)
-    np.testing.assert_allclose(comparison.truth_en_m[0], [0.0, 0.0], atol=1e-6)
-    assert comparison.reasons == ("", "", "blank", "")
-    assert comparison.frames == ("a", "b", "c", "d")
-    assert not comparison.errors_m.flags.writeable
-
-
 def test_shares_are_of_all_views_or_of_fixes() -> None:
     metrics = measure(three_fixes(), 15.0, [6.0, 1000.0])
     assert (metrics.n_views, metrics.n_fixes) == (4, 3)

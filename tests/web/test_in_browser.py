@@ -243,27 +243,6 @@ def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
     page.chosen(COUNT - 1, COUNT)
 
 
-def test_everything_is_reached_by_tab_in_order(page):
-    """Once round: each control once, from top to bottom, and seen where it is."""
-    script = """() => { const is = document.activeElement; const style = getComputedStyle(is);
-      return [is.id || is.getAttribute("aria-label") || is.tagName.toLowerCase(),
-        style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2]; }"""
-    reached = []
-    for _ in range(60):
-        page.keyboard.press("Tab")
-        where, outlined = page.js(script)
-        if where == "body" or where in reached:
-            break
-        reached.append(where)
-        assert outlined, where
-    expected = ["help-open", "map", "Zoom in", "Zoom out", "copy", "opacity", "blink", "enlarge"]
-    expected += ["on-map", "summary"]
-    expected += ["which", "order", "named", "button", "first", "before", "play", "after", "last"]
-    expected += ["zoom-in", "zoom-out", "scrub"]
-    assert [each for each in reached if each in expected] == expected
-    assert set(reached) - set(expected) <= {"list-box"}
-
-
 def fits(page):
     """Nothing is wider than the screen or than its box (newer Chromiums count the border too)."""
     wide = page.js(

@@ -55,13 +55,9 @@ Array = NDArray[np.float64]
 ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
 """Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
-"""Narrower bands that are compared, as parts of the planned one."""
 MIN_VIEWS = 20
-"""A check of fewer trial views is refused."""
 MAX_ASPECT = 8.0
-"""Largest ratio of the sides of a view."""
 MIN_COVERED = 0.25
-"""A cell of which the map covers less than this fraction counts as outside the map."""
 MAX_CELLS_AROUND = 250_000
 """Limit of cells in the box around a band, most of them empty."""
 

@@ -54,7 +54,6 @@ Positions = Mapping[str, tuple[float, float]]
 FAR_M = 35.0
 """A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
 NO_RESULT = "no_result"
-"""Reason of true positions that no result belongs to."""
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {

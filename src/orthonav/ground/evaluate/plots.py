@@ -60,14 +60,12 @@ CURVE_STYLES: dict[str, tuple[str, Any, str, float]] = {
     "lowe_ratio": ("#B8558F", (0, (1.5, 1.5)), "^", 2.2),
 }
 MAIN = ("confidence", 0.9)
-"""The criterion and threshold that is highlighted."""
 STATE_STYLES = {
     "searching": ("#E69F00", "^"),
     "tracking": (RIGHT, "o"),
     "coasting": ("#56B4E9", "s"),
     "lost": ("#B8558F", "X"),
 }
-"""State -> colour and mark."""
 MOST_ELLIPSES = 40
 _DASHED: dict[str, Any] = {"color": GREY, "linestyle": (0, (4, 3))}
 _SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}

@@ -41,7 +41,6 @@ _LEARNT = {
     "learnt error of the mount": ((_PITCH, 2, "deg pitch"), (_ROLL, 2, "deg roll")),
     "learnt latency": ((_LATENCY, 0, "ms"),),
 }
-"""Learnt biases as they are shown: keys, digits and units."""
 
 
 @dataclass(frozen=True, eq=False)

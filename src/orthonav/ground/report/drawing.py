@@ -31,7 +31,6 @@ DPI = 220
 MOST_POINTS = 20_000
 """Lines of more points are rasterized in the SVG, which would be too large to open."""
 OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
-"""Arguments of an annotation whose position is an offset in points."""
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
 """Box (`bbox`) that keeps text readable on any background."""
 LEGEND_ABOVE: dict[str, Any] = {
@@ -39,7 +38,6 @@ LEGEND_ABOVE: dict[str, Any] = {
     "bbox_to_anchor": (0.5, 1.0),
     "frameon": False,
 }
-"""Arguments of a legend above the axes."""
 _STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": GREY,

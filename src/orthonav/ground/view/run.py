@@ -55,9 +55,7 @@ from orthonav.ground.view.logs import LogReader
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]
 FAR_AWAY_PX = 1e9
-"""Positions farther away are not drawn."""
 RAW_PX = 640
-"""The longer side of a view as recorded."""
 log = logging.getLogger(__name__)
 
 

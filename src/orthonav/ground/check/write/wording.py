@@ -28,7 +28,6 @@ AREA_VERDICTS = {
     Word.NO_GO: "Do not rely on this map; see the reasons.",
 }
 WHAT = {"agl_m": "height above ground", "band_m": "band width"}
-"""Parameters that an alternative changes, in words."""
 CLEARLY = 0.05
 """Smaller differences may be chance, because an alternative rests on few trials."""
 MAX_STRETCHES = 7
