@@ -30,6 +30,7 @@ from orthonav.ground.check.findings import (
     verdict_of,
 )
 from orthonav.ground.check.outcome import (
+    OF_REQUEST,
     Along,
     Alternative,
     Cells,
@@ -101,15 +102,8 @@ class _Check:
             self.plan.width_m,
             self.plan.height_m,
             self.plan.agl_m,
-            request.yaw_std_deg,
-            request.agl_std,
-            request.prior_std_m,
-            request.accept,
-            self.radius_m,
-            request.speed_mps,
-            request.drift,
-            request.tilt_std_deg,
-            request.other_sensor,
+            radius_m=self.radius_m,
+            **{name: getattr(request, name) for name in OF_REQUEST},
         )
         self.bands_m = self._leg_bands_m()
         self.area = self._area()
@@ -137,15 +131,11 @@ class _Check:
         return plan
 
     def _leg_bands_m(self) -> tuple[float, ...]:
-        route, band_m, prior_std_m = (
-            self.request.route,
-            self.request.band_m,
-            self.request.prior_std_m,
-        )
+        route, band_m = self.request.route, self.request.band_m
         if route is None:
             return ()
         if band_m is None:
-            band_m = default_band_m(self.plan.side_m, prior_std_m)
+            band_m = default_band_m(self.plan.side_m, self.request.prior_std_m)
         Area.from_route(route, band_m)
         return route.bands_m(band_m) or ()
 

@@ -1,9 +1,9 @@
 """The evaluation of flights as one self-contained page, and its figures as files."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from orthonav.ground.evaluate import plots
 from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
@@ -44,8 +44,7 @@ class MadeFrom:
     version: str = ""
 
 
-@dataclass(frozen=True)
-class _Drawn:
+class _Drawn(NamedTuple):
     general: tuple[Figure, ...]
     track: tuple[Figure, ...] = ()
     worst: tuple[Figure, ...] = ()
@@ -54,14 +53,12 @@ class _Drawn:
         """With the flight's name in texts and, if given, in file names, set off by two dashes,
         which neither `file_names` nor the names of figures contain."""
         start = f"{file_name}--" if file_name else ""
-
-        def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
-            return tuple(
-                replace(each, name=f"{start}{each.name}", alt=f"{name}: {each.alt}")
-                for each in figures
+        return _Drawn(
+            *(
+                tuple(replace(f, name=f"{start}{f.name}", alt=f"{name}: {f.alt}") for f in figures)
+                for figures in self
             )
-
-        return _Drawn(named(self.general), named(self.track), named(self.worst))
+        )
 
 
 def write_report(
@@ -107,7 +104,7 @@ def write_report(
         figures = {"name": "all flights", "figures": drawn[-1].general}
         values["total_section"] = {**figures, **_trust(whole)}
     page = render("orthonav.ground.evaluate", "report.html", values)
-    shown = [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    shown = [figure for each in drawn for figures in each for figure in figures]
     return write_page(out_dir, page, shown)
 
 
@@ -165,9 +162,7 @@ def _notes(metrics: Metrics) -> list[str]:
     if metrics.n_without_truth:
         notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
     if metrics.n_without_result:
-        notes.append(
-            f"{metrics.n_without_result} true positions have no result: views without a fix."
-        )
+        notes.append(f"{metrics.n_without_result} true positions have no result, so no fix.")
     if not metrics.n_fixes:
         notes.append("No view has a fix, so errors are not defined.")
     return notes
@@ -249,18 +244,15 @@ def _drawn(flight: FlightReport) -> _Drawn:
     )
     of_track = plots.track_figures(comparison, track, radius_m, background) if track else []
     of_gnss = [plots.gnss_figure(flight.gnss)] if flight.gnss else []
-    return _Drawn(general, (*of_track, *of_gnss), _contact_sheet(flight))
-
-
-def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:
     if not flight.worst:
-        return ()
+        return _Drawn(general, (*of_track, *of_gnss))
     caption = (
         "The worst fixes, those in state tracking first: the view rectified with heading and "
         "height of its fix, north up, beside the map at the same scale; + fix, ○ true position."
     )
     alt = "The worst views. " + "; ".join(map(row_text, flight.worst))
-    return (Figure("worst-views", alt, caption, sheet_picture(flight.worst)),)
+    sheet = Figure("worst-views", alt, caption, sheet_picture(flight.worst))
+    return _Drawn(general, (*of_track, *of_gnss), (sheet,))
 
 
 def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:

@@ -92,7 +92,9 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         canvas.draw()
         png = _png(np.asarray(canvas.buffer_rgba()))
         figure.set_layout_engine("none")  # PNG and SVG share one layout
-        _limit_points(figure)
+        for line in (line for axes in figure.axes for line in axes.lines):
+            if np.size(line.get_xdata()) > MOST_POINTS:
+                line.set_rasterized(True)
         # As `savefig`, which draws once more before, for a layout.
         page: Any = FigureCanvasSVG(figure)
         page.print_svg(svg, metadata=_NO_METADATA)
@@ -106,12 +108,6 @@ def _png(rgba: NDArray[np.uint8]) -> bytes:
     image = Image.fromarray(rgba).convert("RGB").quantize(colors=256)
     image.save(out, format="PNG", compress_level=6, dpi=(DPI, DPI))
     return out.getvalue()
-
-
-def _limit_points(figure: "Figure") -> None:
-    for line in (line for axes in figure.axes for line in axes.lines):
-        if np.size(line.get_xdata()) > MOST_POINTS:
-            line.set_rasterized(True)
 
 
 @contextmanager
