@@ -209,15 +209,9 @@ def test_json_names_and_keeps_what_was_there() -> None:
     }
     assert values["calibration"]["ece"] == pytest.approx(0.65)
     assert values["calibration"]["brier"] == pytest.approx((0.01 + 3 * 0.81) / 4)
-    assert values["calibration"]["bins"][0] == {
-        "lower": 0.0,
-        "upper": 0.1,
-        "n_fixes": 0,
-        "mean_confidence": None,
-        "share_right": None,
-        "right_low": None,
-        "right_high": None,
-    }
+    names = ("mean_confidence", "share_right", "right_low", "right_high")
+    empty = {"lower": 0.0, "upper": 0.1, "n_fixes": 0, **dict.fromkeys(names)}
+    assert values["calibration"]["bins"][0] == empty
     assert values["calibration"]["bins"][9]["n_fixes"] == 4
     covariance = values["covariance"]
     assert (covariance["n_right"], covariance["n_nees"]) == (1, 1)

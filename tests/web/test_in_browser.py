@@ -200,30 +200,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
 
 
-def test_keys_belong_to_what_has_the_focus(page):
-    """The slider of the overlay, the map, and where somebody types."""
-    page.locator("#opacity").focus()
-    page.keyboard.press("ArrowRight")
-    assert page.locator("#opacity").input_value() == "65"
-    page.locator("#map").focus()
-    before = page.on_screen((0, 0), CHUNK_PX)
-    page.keyboard.press("ArrowRight")
-    page.until(lambda: page.on_screen((0, 0), CHUNK_PX)[0] < before[0] - 20)
-    page.locator("#named").fill("view 0")
-    page.keyboard.press("ArrowLeft")
-    page.keyboard.press("b")
-    page.chosen(0, COUNT)
-    expect(page.locator("#shown-count")).to_have_text(f"0 of {COUNT} views")
-    page.locator("#named").fill("")
-    page.locator("#scrub").focus()
-    page.keyboard.press("ArrowRight")
-    page.chosen(1, COUNT)
-    page.locator("#list [aria-current]").focus()
-    page.keyboard.press("ArrowDown")
-    page.chosen(2, COUNT)
-    assert page.js("document.activeElement.dataset.view") == "2"
-
-
 def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
     box = page.locator("#chart").bounding_box()
     left, middle = box["x"] + 52, box["y"] + box["height"] / 2

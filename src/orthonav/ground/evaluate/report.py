@@ -162,7 +162,9 @@ def _notes(metrics: Metrics) -> list[str]:
     if metrics.n_without_truth:
         notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
     if metrics.n_without_result:
-        notes.append(f"{metrics.n_without_result} true positions have no result, so no fix.")
+        notes.append(
+            f"{metrics.n_without_result} true positions have no result: views without a fix."
+        )
     if not metrics.n_fixes:
         notes.append("No view has a fix, so errors are not defined.")
     return notes
