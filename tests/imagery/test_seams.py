@@ -153,14 +153,6 @@ def test_what_is_named_first_covers_what_it_shares_a_lattice_with(tmp_path):
     assert (pixels.rgb[10:-10, 3:8] == 150).all()
 
 
-def test_files_that_a_window_depends_on(tmp_path):
-    paths = cut(tmp_path, smooth_scene(120), placed(), 30)
-    with sheet_of(paths, 100) as sheet:
-        (few,) = [{name for stamp in sheet.stamps(5, 5, 8, 8) for name, _, _ in stamp}]
-        assert few == {str(paths[0].resolve())}
-        assert len(sheet.stamps(0, 0, 100, 100)) == 16 and not sheet.stamps(300, 0, 10, 10)
-
-
 def test_files_that_others_hide_are_not_read(tmp_path):
     """Two years of the same tiles."""
     for year in ("2021", "2015"):

@@ -6,7 +6,7 @@ import numpy as np
 import rasterio
 
 from orthonav.cli.info import imagery_text
-from orthonav.ground.imagery.source import open_source
+from orthonav.ground.imagery.source import open_sources
 
 TAGS = {
     "ORTHONAV_ATTRIBUTION": "IGN,  BD\nORTHO",
@@ -23,7 +23,7 @@ def ortho(path, tags):
     with rasterio.open(path, "w", driver="GTiff", transform=made, **how) as data:
         data.write(np.full((1, 64, 64), 90, np.uint8))
         data.update_tags(**tags)
-    return open_source(path).describe()
+    return open_sources([path])[0][0].describe()
 
 
 def test_terms_of_a_fetched_file(tmp_path):

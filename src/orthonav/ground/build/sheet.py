@@ -8,6 +8,7 @@ everything that determines it.
 
 import contextlib
 import hashlib
+import itertools
 import json
 import logging
 import math
@@ -20,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -66,55 +67,52 @@ def in_order(
     finish their current items and start no new ones.
     """
     workers = min(workers, len(items))
-    if workers > 1:
-        yield from _Crew(items, opened).results(workers)
+    if workers <= 1:
+        with opened() as work:
+            yield from map(work, items)
         return
-    with opened() as work:
-        for item in items:
-            yield work(item)
+    todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+    done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
+    stop = threading.Event()
+    shared = items, opened, todo, done, stop
+    threads = [threading.Thread(target=_serve, args=shared, daemon=True) for _ in range(workers)]
+    waiting = iter(range(len(items)))
+    try:
+        for thread in threads:
+            thread.start()
+        for index in itertools.islice(waiting, workers + AHEAD):
+            todo.put(index)
+        for place in done:
+            made = place.get()
+            if isinstance(made, _Failed):
+                raise made.error
+            for index in itertools.islice(waiting, 1):
+                todo.put(index)
+            yield made
+    finally:
+        stop.set()
+        for _ in threads:
+            todo.put(None)
+        for thread in threads:
+            thread.join()
 
 
-class _Crew(Generic[Item, Made]):
-    def __init__(self, items: Sequence[Item], opened: Callable[[], Worker[Item, Made]]) -> None:
-        self._items, self._opened = items, opened
-        self._todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-        self._done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
-        self._stop = threading.Event()
-
-    def results(self, workers: int) -> Iterator[Made]:
-        threads = [threading.Thread(target=self._serve, daemon=True) for _ in range(workers)]
-        try:
-            for thread in threads:
-                thread.start()
-            for index in range(workers + AHEAD):
-                self._begin(index)
-            for index, place in enumerate(self._done):
-                made = place.get()
-                if isinstance(made, _Failed):
-                    raise made.error
-                self._begin(index + workers + AHEAD)
-                yield made
-        finally:
-            self._stop.set()
-            for _ in threads:
-                self._todo.put(None)
-            for thread in threads:
-                thread.join()
-
-    def _begin(self, index: int) -> None:
-        if index < len(self._items):
-            self._todo.put(index)
-
-    def _serve(self) -> None:
-        at = slice(None)  # all waiting items, until one is started
-        try:
-            with self._opened() as work:
-                while (index := self._todo.get()) is not None and not self._stop.is_set():
-                    at = slice(index, index + 1)
-                    self._done[index].put(work(self._items[index]))
-        except BaseException as error:
-            for place in self._done[at]:
-                place.put(_Failed(error))
+def _serve(
+    items: Sequence[Item],
+    opened: Callable[[], Worker[Item, Made]],
+    todo: "queue.SimpleQueue[int | None]",
+    done: "list[queue.SimpleQueue[Made | _Failed]]",
+    stop: threading.Event,
+) -> None:
+    at = slice(None)  # all waiting items, until one is started
+    try:
+        with opened() as work:
+            while (index := todo.get()) is not None and not stop.is_set():
+                at = slice(index, index + 1)
+                done[index].put(work(items[index]))
+    except BaseException as error:
+        for place in done[at]:
+            place.put(_Failed(error))
 
 
 @dataclass(frozen=True)
@@ -523,10 +521,6 @@ class SheetReader:
         self._margin_px = layout.micro_px + representation.margin_px
         self._jobs = self._drawn_jobs()
 
-    @property
-    def blocks(self) -> int:
-        return len(self._jobs)
-
     def read(
         self, progress: Progress, workers: int | None = None, cache: BlockCache | None = None
     ) -> None:
@@ -550,13 +544,14 @@ class SheetReader:
             )
 
     def block_cache(
-        self, default: Path, folder: Path | None
+        self, out: Path, work: Path | None
     ) -> AbstractContextManager[BlockCache | None]:
-        """Cache in `folder`, or, if there are many blocks, in `default`; else None."""
+        """Cache in `work`, or, if there are many blocks, beside the map; else None."""
         pixels = sum(job.block.height * job.block.width for job in self._jobs)
-        worthwhile = folder is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
+        worthwhile = work is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
         needed_bytes = round(CACHED_BYTES_PER_PX * pixels) if worthwhile else 0
-        cache = BlockCache(folder or default, self._request(), needed_bytes)
+        beside, name = out.with_name(f"{out.name}.work"), f"blocks-{out.name}"
+        cache = BlockCache(work / name if work else beside, self._request(), needed_bytes)
         if not worthwhile:
             cache.discard()  # left by an earlier request for the same map
             return nullcontext()

@@ -112,10 +112,6 @@ class UnfitError(ImageryError):
     """A raster that is not an orthophoto: a small image, heights, or not georeferenced."""
 
 
-def open_source(path: Path) -> Source:
-    return open_sources([path])[0][0]
-
-
 def open_sources(
     paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Source], list[str]]:
