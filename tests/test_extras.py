@@ -198,16 +198,3 @@ def test_what_is_not_made_for_a_machine_is_not_called_missing(
     assert ("pip install" in answer) is available
     shown = version._text(plain)
     assert ("cyclonedds MISSING" in shown) is available and "rosbags MISSING" in shown
-
-
-def test_sources_without_metadata_ask_nothing(monkeypatch):
-    def gone(name):
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "requires", gone)
-    extras._requirements.cache_clear()
-    try:
-        assert extras.packages() == () and extras.missing("geo") == ()
-        extras.require("anything", "geo")
-    finally:
-        extras._requirements.cache_clear()
