@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from lab.terrain import random_relief, seen_view
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.faults import middle_of
@@ -28,7 +29,7 @@ from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
+from orthonav.ground.simulate.perspective import Raster
 
 NAME = "over_terrain"
 PARTS = ("slopes", "wrong", "oblique")

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, error_m, known_map, rendered
+from lab.terrain import random_relief, seen_view
 
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
+from orthonav.ground.simulate.perspective import Raster
 
 SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])
