@@ -279,8 +279,8 @@ class FaultFlight:
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
         self.gate = Gate(GateRules(), Clock.BOOT)
         messages = MessageOptions(("global-position",))
-        messenger = Messenger(messages, self.gate, self.link.send, clocks)
-        publisher = Publisher(self.gate, clocks, messenger=messenger, link=self.link)
+        messenger = Messenger(messages, self.gate, self.link, clocks)
+        publisher = Publisher(self.gate, clocks, messenger=messenger)
         self._camera = LiveCamera(0, clocks, capture=lambda _: Stream(self._seen))
         self._newest = NewestImage()
         self.runner = Runner(

@@ -7,12 +7,7 @@ import pytest
 from blots import CAMERA, GROUND, as_grey
 from lab.terrain import random_relief, seen_view
 
-from orthonav.core.localize.rectify import (
-    Orientation,
-    hidden,
-    node_px,
-    orthorectified,
-)
+from orthonav.core.localize.rectify import Orientation, hidden, node_px, orthorectified
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.simulate.perspective import Raster
 

@@ -106,8 +106,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add("--jsonl", action="append", default=[], metavar="FILE|-", help=text)
     text = "maximum rate of each message (default: one per view)"
     add("--send-rate-hz", type=float, metavar="HZ", help=text)
-    text = "criterion of a confident fix: confidence:0.9 (default), or peak_ratio:1.3 in addition; "
-    text += "other fixes are not sent"
+    text = "criterion of a confident fix and its threshold: confidence:0.9 (default), or "
+    text += "peak_ratio:1.3 in addition; other fixes are not sent"
     add("--accept", default="confidence:0.9", metavar="NAME:MIN", help=text)
     text = "largest standard deviation of a position that is sent (default 50)"
     add("--max-std-m", type=float, default=50.0, metavar="M", help=text)

@@ -24,11 +24,8 @@ def joined(
     frame: LocalFrame,
     min_confidence: float,
 ) -> tuple[Ros2Reader, Ros2Publisher]:
-    """Reader and publisher of a new node; `stack` closes the node.
-
-    `frame` is the local frame of the map; its centre is the origin of the ROS map frame unless
-    `--origin` is given.
-    """
+    """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
+    of the ROS map frame unless `--origin` is given."""
     node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
     stack.callback(node.close)
     _log_as_asked(node, stack)

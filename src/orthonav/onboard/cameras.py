@@ -1,7 +1,6 @@
 """Images of live cameras (devices and streams) and of recordings played in real time.
 
-A thread reads; the consumer gets the newest image, and replaced images are counted. Every image
-carries its time of exposure by our monotonic clock.
+A thread reads; the consumer gets the newest image, and replaced images are counted.
 """
 
 import logging
@@ -29,11 +28,9 @@ RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 GAP_S, GAP_INTERVALS = 0.5, 3.0
-"""A longer time without images, also in usual intervals, may change the latency. Shorter ones are
-usual on a busy computer."""
+"""A longer time without images, also in usual intervals, may change the latency."""
 FROZEN_LEVELS = 0.25
-"""Mean difference in grey levels below which two images are the same: noise alone is four times
-as large."""
+"""Mean difference in grey levels below which two images are the same; noise is four times that."""
 FROZEN_SIDE_PX = 64
 FOLDER_RATE_HZ = 2.0
 """Rate at which a folder of images without times is played."""

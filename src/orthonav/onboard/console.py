@@ -1,8 +1,5 @@
-"""What `orthonav fly` says while it flies: inputs that come and go, states of the track with their
-reason, faults, a status line every few seconds, and a summary at the end.
-
-An output of `Publisher` like the lines of JSON: it takes every view, and the health once a second.
-"""
+"""What `orthonav fly` says while it flies: inputs, states of the track, faults, a status line every
+few seconds, a summary. It is an output of `Publisher`, like the lines of JSON."""
 
 import contextlib
 import logging
@@ -304,26 +301,26 @@ class _AutopilotWatch:
 
     def waits(self, link: AutopilotLink, url: str | None) -> str | None:
         """Note the status of the link; what is waited for, None where telemetry comes."""
-        status = link.status()
-        for each in status.others[self._others :]:
+        others, target = list(link.others), link.target
+        for each in others[self._others :]:
             ids = f"{each.system_id}/{each.component_id}"
             self._console.say(f"autopilot {ids} heard on {url}, not used (see --system-id)")
-        self._others = len(status.others)
-        if status.target is None:
-            why = "" if status.is_open else ", which cannot be opened"
-            if status.damaged:
+        self._others = len(others)
+        if target is None:
+            why = "" if link.is_open else ", which cannot be opened"
+            if link.counts["damaged"]:
                 why += "; messages are damaged, or not signed with this key"
             return f"heartbeat on {url}{why}"
-        ids = f"{status.target.system_id}/{status.target.component_id}"
-        is_heard = status.heard_age_s <= LINK_AGE_S
+        ids = f"{target.system_id}/{target.component_id}"
+        is_heard = link.heard_age_s <= LINK_AGE_S
         if self.is_heard and not is_heard:
             self._console.warn(f"heartbeat lost: nothing heard from autopilot {ids} on {url}")
         elif is_heard and not self.is_heard:
-            self._console.say(f"autopilot {ids}{_KINDS[status.kind]} heard on {url}")
+            self._console.say(f"autopilot {ids}{_KINDS[link.kind]} heard on {url}")
         self.is_heard = is_heard
         if not is_heard:
             return f"autopilot {ids} on {url}"
-        return None if math.isfinite(status.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
+        return None if math.isfinite(link.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
 
 
 def _meaning(reason: str, plain: Mapping[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """The loop of `orthonav fly`: newest image, telemetry at its exposure, position, messages.
 
-It runs on one thread, fed by a camera thread and a link thread. Views are located by
-`orthonav.onboard.run.locate_view`, as those of a recorded flight are, so a log can be replayed.
+It runs on one thread, fed by a camera thread and a link thread.
 """
 
 import logging
@@ -32,12 +31,12 @@ from orthonav.onboard.health import (
     EventCounter,
     Health,
     HealthReporter,
-    Notifier,
     Snapshot,
     StartCheck,
     TelemetryDiagnosis,
     judge,
     mismatch,
+    notify,
 )
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
@@ -108,7 +107,6 @@ class Runner:
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
-        notifier: Notifier | None = None,
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
@@ -122,7 +120,6 @@ class Runner:
         self._start_check: StartCheck | None = None
         self._begin, self._fresh = start, fresh
         self._time_ns = 0
-        self._notifier = notifier or Notifier("")
         self._gnss = gnss
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
         self.health: Health | None = None
@@ -145,7 +142,7 @@ class Runner:
 
     def run(self, stopping: threading.Event) -> None:
         self._log(lambda sink: sink.options(dict(self.options.logged_options)))
-        self._notifier.notify("READY=1", "STATUS=waiting for images")
+        notify("READY=1", "STATUS=waiting for images")
         try:
             is_over = False
             while not stopping.is_set() and not is_over:
@@ -156,7 +153,7 @@ class Runner:
                     log.exception("unexpected error in the flight loop")
                     self._count("internal_error")
         finally:
-            self._notifier.notify("STOPPING=1")
+            notify("STOPPING=1")
             self._save_state()
             self._publisher.close()
             self._log(lambda sink: sink.close())
@@ -229,7 +226,7 @@ class Runner:
     def _withheld(
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency
     ) -> ViewResult:
-        """Log and publish a view whose time of exposure is in doubt: the track must not get it."""
+        # Its time of exposure is in doubt: the track must not get it.
         reason = latency.reason or ""
         self._count(reason)
         result = self._result(image, NoFix(reason, latency.detail), math.nan)
@@ -390,10 +387,7 @@ class Runner:
         return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
 
     def _map_changed(self) -> NoFix | None:
-        """Reason to give no position where the map file was changed in place.
-
-        Parts in memory would still give positions; stopping shows the fault at once.
-        """
+        # Parts in memory would still give positions; stopping shows the fault at once.
         change = self.options.map_change()
         return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
@@ -481,7 +475,7 @@ class Runner:
         plain = self._plain(health, seen.start_off_m)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
-        self._notifier.notify("WATCHDOG=1", f"STATUS={health.text()}")
+        notify("WATCHDOG=1", f"STATUS={health.text()}")
         if self._link is None:
             return
         self._link.system_status = health.level.value
@@ -493,8 +487,7 @@ class Runner:
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
-            link = self._link
-            self._publisher.messenger.find_origin(link.origin, link.target, armed=link.armed)
+            self._publisher.messenger.find_origin()
 
     def _send_text(self, severity: int, text: str) -> None:
         self._texts += 1
@@ -525,7 +518,7 @@ class Runner:
         counts = self.counter.counts(now_ns)
         link, has_origin = None, True
         if self._link is not None:
-            link, messenger = self._link.status(), self._publisher.messenger
+            link, messenger = self._link, self._publisher.messenger
             needed = messenger is not None and messenger.needs_origin
             has_origin = not needed or self._link.origin is not None
         uses_link = link is not None and not self.options.recorded
@@ -545,7 +538,7 @@ class Runner:
             low_confidence_s=(now_ns - self._confident_ns) / 1e9,
             latency_s=self.counter.latency_s(0.95),
             state=state,
-            synced=link.synced if link else True,
+            synced=link is None or link.sync.is_exact,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
@@ -610,10 +603,7 @@ class Runner:
 
 
 def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> Fix:
-    """The fix of a track with its velocity at the exposure, where it was estimated with a mean.
-
-    A reported velocity and its mean have the same error.
-    """
+    """The fix with the velocity at the exposure instead of the mean, which has the same error."""
     if mean is None or reported is None or mean == reported:
         return fix
     own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")

@@ -1,8 +1,4 @@
-"""Health of a flight: OK, DEGRADED or FAILED, with reasons; diagnosis of telemetry and start.
-
-`judge` is a pure function of counts over the last seconds. docs/onboard.md lists the reasons and
-their causes.
-"""
+"""Health of a flight with reasons (docs/onboard.md); diagnosis of telemetry and start."""
 
 import logging
 import math
@@ -33,8 +29,7 @@ IMAGE_AGE_S, TELEMETRY_AGE_S, LINK_AGE_S = 3.0, 3.0, 5.0
 LOW_CONFIDENCE_S, COASTING_S = 10.0, 2.0
 """Longest time without a confident position, in general and by views that do not show the map."""
 LATENCY_S, SHARE = 0.5, 0.2
-"""95th percentile of the time from exposure to message; share of the images in the window that are
-unusable, late or lack telemetry."""
+"""Of the 95th percentile from exposure to message; of images unusable, late, without telemetry."""
 HEADING_DEG, LOG_SCALE = 20.0, 0.2
 """Difference of estimated and reported heading, and of the logarithm of the height."""
 GRACE_S = 5.0
@@ -152,12 +147,10 @@ class EventCounter:
     def __init__(self) -> None:
         self._events: deque[tuple[int, str]] = deque()
         self._latencies: deque[tuple[int, float]] = deque()
-        self._counts: Counter[str] = Counter()
         self.total: Counter[str] = Counter()
 
     def add(self, now_ns: int, name: str) -> None:
         self._events.append((now_ns, name))
-        self._counts[name] += 1
         self.total[name] += 1
 
     def add_latency(self, now_ns: int, seconds: float) -> None:
@@ -166,10 +159,10 @@ class EventCounter:
     def counts(self, now_ns: int) -> Counter[str]:
         begin = now_ns - round(WINDOW_S * 1e9)
         while self._events and self._events[0][0] < begin:
-            self._counts[self._events.popleft()[1]] -= 1
+            self._events.popleft()
         while self._latencies and self._latencies[0][0] < begin:
             self._latencies.popleft()
-        return Counter(+self._counts)
+        return Counter(name for _, name in self._events)
 
     def latency_s(self, quantile: float) -> float:
         """Quantile (0 to 1) of the latencies within the window; 0 where there are none."""
@@ -193,24 +186,19 @@ class HealthReporter:
         return True
 
 
-class Notifier:
-    """Notifies systemd: datagrams to the socket that it names, as `sd_notify(3)` sends them."""
-
-    def __init__(self, address: str | None = None) -> None:
-        address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
-        self._address = "\0" + address[1:] if address.startswith("@") else address
-
-    def notify(self, *lines: str) -> bool:
-        """Send lines such as `READY=1`, `WATCHDOG=1`, `STATUS=..`; whether they were sent."""
-        if not self._address:
-            return False
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
-                out.setblocking(False)
-                out.sendto("\n".join(lines).encode(), self._address)
-        except OSError:
-            return False
-        return True
+def notify(*lines: str) -> bool:
+    """Send `READY=1`, `WATCHDOG=1`, `STATUS=..` to systemd as `sd_notify(3)` does."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    address = "\0" + address[1:] if address.startswith("@") else address
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+            out.setblocking(False)
+            out.sendto("\n".join(lines).encode(), address)
+    except OSError:
+        return False
+    return True
 
 
 def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:

@@ -32,18 +32,16 @@ UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mis
 STATED_STD_S = 0.03
 """Least standard deviation of a stated latency: one image at 30 Hz."""
 FIRST_NS = 5 * 10**9
-"""A latency is used after images agreed with it, or after this time without enough motion to
-tell."""
+"""A latency is used after images agreed with it, or after this time without enough motion."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
-"""Interval at which reported states are stored, and how far back, at the start and after a time
-without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_S`)."""
+"""Interval at which reported states are stored, and how far back after a time without images;
+telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_NS`)."""
 GAP_S = 0.5
 """A latency is compared again after an image was frozen for longer."""
 SETTLED_NS = 8 * 10**9
 """After images or positions contradicted the latency, nothing may contradict it for so long."""
 EXPLAINED, UNEXPLAINED = 0.6, 0.3
-"""Share of the motion that is common to images and report from which they agree, and below which
-they contradict each other."""
+"""Shares of the motion common to images and report from which they agree, below which not."""
 SECONDS, LEAST_PAIRS = 4.0, 12
 """Images of so many seconds are compared, at least so many pairs."""
 LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
@@ -52,8 +50,7 @@ the seen over the reported one: height and heading may be off."""
 SUMMED, STANDS_OUT = 4, 3.0
 """Successive pairs that are summed; their motion counts from so many least standard deviations."""
 OUTLIER, OUTLIER_SHARE, MAD_TO_STD = 6.0, 0.1, 1.4826
-"""Pairs that differ by more than so many standard deviations are left out, the worst ones, up to
-this share: one false motion of the picture is in four sums."""
+"""The worst pairs, beyond so many standard deviations, are left out, up to this share."""
 KEEP_S, LONGEST_GAP_S = 5.0, 30.0
 """Earlier positions with which one is compared: a track moves to a new place within seconds. The
 last one counts for longer: a track may have been coasting or lost since."""
@@ -66,9 +63,8 @@ LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 class Latency:
     """The latency to use for one image.
 
-    `arrived_ns`: its arrival by our clock. `delay_s`, `std_s`: exposure to arrival and its standard
-    deviation; 0 and NaN where not stated. `reason`: why the latency must not be used; None if it
-    can be used. `detail`: one sentence about it.
+    `arrived_ns`: by our clock. `delay_s`, `std_s`: exposure to arrival; 0 and NaN where not stated.
+    `reason`: why the latency must not be used. `detail`: one sentence about it.
     """
 
     arrived_ns: int
@@ -89,8 +85,7 @@ class LatencyMonitor:
         mount_deg: Angles = LOOKS_DOWN,
         heading_known: bool = True,
     ) -> None:
-        """`stated_s`: latency as stated by the user, None: not stated. `heading_known`: whether the
-        reported heading gives the direction of the velocity."""
+        """`stated_s`: None: not stated. `heading_known`: the heading gives that of the velocity."""
         self._is_stated, self._delay_s = stated_s is not None, stated_s or 0.0
         self._std_s = stated_std_s if self._is_stated else math.nan
         self._mount_deg = mount_deg
@@ -233,8 +228,7 @@ class MotionCheck:
                 self._rows.append((one.end_ns, row))
 
     def share(self) -> float:
-        """Share of the seen and the reported motion of the last seconds that is common to both; NaN
-        where little moved."""
+        """Share of the last motion that is seen and reported; NaN where little moved."""
         while self._rows and self._rows[0][0] < self._rows[-1][0] - SECONDS * 1e9:
             self._rows.popleft()
         if not self.is_filled:

@@ -1,8 +1,4 @@
-"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages.
-
-pymavlink (extra `autopilot`) decodes incoming messages; `orthonav.onboard.messages.mavlink` packs
-outgoing ones.
-"""
+"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages."""
 
 import logging
 import math
@@ -10,7 +6,7 @@ import select
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from orthonav.core.extras import needed
@@ -51,27 +47,7 @@ _DOWNWARD = 25
 _FAR_NS = 60 * 10**9
 _ARMED = 128
 _SAME_M = 0.05
-"""Heights above home and above sea level that are the same within this are one height, twice: home
-is not within this of sea level."""
-
-
-@dataclass(frozen=True)
-class LinkStatus:
-    """Status of a link. Ages are in seconds, infinite for "never".
-
-    `synced`: whether TIMESYNC is answered. `target`, `kind`: None until the first heartbeat.
-    `others`: autopilots that were heard and are not used. `damaged`: number of messages that could
-    not be decoded, or were not signed as asked.
-    """
-
-    is_open: bool
-    heard_age_s: float
-    attitude_age_s: float
-    synced: bool
-    target: Target | None
-    kind: Autopilot | None
-    others: tuple[Target, ...]
-    damaged: int
+"""Heights above home and above sea level that are the same within this are one height, twice."""
 
 
 class AutopilotLink:
@@ -106,7 +82,7 @@ class AutopilotLink:
         self._transport: Transport | None = None
         self._retry_ns, self._failures = 0, 0
         self.target: Target | None = None
-        self._others: list[Target] = []
+        self.others: list[Target] = []  # heard and not used
         self.kind: Autopilot | None = None
         self.origin: Origin | None = None
         self.armed: bool | None = None
@@ -175,19 +151,18 @@ class AutopilotLink:
         with self._lock:
             return self.sync.boot_ns(mono_ns)
 
-    def status(self) -> LinkStatus:
-        with self._lock:
-            now_ns = self._clocks.mono_ns()
-            return LinkStatus(
-                is_open=self._transport is not None,
-                heard_age_s=_age_s(now_ns, self._heard_ns),
-                attitude_age_s=_age_s(now_ns, self._attitude_ns),
-                synced=self.sync.is_exact,
-                target=self.target,
-                kind=self.kind,
-                others=tuple(self._others),
-                damaged=self.counts["damaged"],
-            )
+    @property
+    def is_open(self) -> bool:
+        return self._transport is not None
+
+    @property
+    def heard_age_s(self) -> float:
+        """Time since the last message; infinite for "never"."""
+        return _age_s(self._clocks.mono_ns(), self._heard_ns)
+
+    @property
+    def attitude_age_s(self) -> float:
+        return _age_s(self._clocks.mono_ns(), self._attitude_ns)
 
     def signing_now(self) -> int | None:
         with self._lock:
@@ -270,8 +245,8 @@ class AutopilotLink:
             return False
         heard = Target(system_id, component_id or _AUTOPILOT_COMPONENT)
         if self.target is not None or self._wanted not in (None, system_id):
-            if heard not in self._others and len(self._others) < _MOST_OTHERS:
-                self._others.append(heard)
+            if heard not in self.others and len(self.others) < _MOST_OTHERS:
+                self.others.append(heard)
             return False
         self.target = heard
         self._packer = None
@@ -436,7 +411,7 @@ class LinkThread:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                if self._link.poll(0.02) == 0 and not self._link.status().is_open:
+                if self._link.poll(0.02) == 0 and not self._link.is_open:
                     self._stop.wait(0.1)
             except Exception:  # one malformed message must not end a flight
                 log.exception("unexpected error in the link to the autopilot")

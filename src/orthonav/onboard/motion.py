@@ -7,7 +7,7 @@ a pyramid, Bouguet 2001) in a small picture, independently of the odometry of th
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,16 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.camera import Camera, undistort
 
 SIDE_PX = 240
-"""Images are compared at this width or height, whichever is larger: corners are then found to about
-0.1 px, 0.03 deg for a usual lens."""
+"""Longer side of compared images: corners are found to 0.1 px, 0.03 deg for a usual lens."""
 CORNERS, LEAST_CORNERS, LEAST_SHARE = 90, 20, 0.5
 """Corners that are sought; those that must be found again, by number and share."""
 RETURN_PX = 0.5
 """A corner tracked forth and back must return within this distance (Kalal et al. 2010)."""
 RANSAC_PX = 1.0
 EVENED_PX, LEAST_CONTRAST = 41, 2.0
-"""Brightness and contrast are evened within squares of this size, contrast (grey levels, standard
-deviation) from this on. Tracking assumes constant brightness: with an automatic exposure that
+"""Brightness and contrast (grey levels) are evened within squares of this size: of an exposure that
 varies by 5 %, 65 % of the pairs were found without it, 99 % with it (benchmarks.faults)."""
 SHORTEST_S, LONGEST_S = 0.08, 1.2
 """Images closer than this are skipped, and not compared if they are further apart."""
@@ -170,13 +168,11 @@ def centre_motion(homographies: Array) -> tuple[Array, Array]:
     return np.asarray(turn), np.asarray(shift)
 
 
-@dataclass(frozen=True, eq=False)
-class ReportedMotion:
-    """Motion of the picture that follows from the reported state, for N pairs of times.
+class ReportedMotion(NamedTuple):
+    """Motion of the picture by the reported state for N pairs of times; NaN where not known.
 
-    `turn_rad` (N,): by the attitudes, and by the velocity where that is known. `tilt_shift`
-    (N, 2): by the attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground. NaN
-    where the state is not known.
+    `turn_rad` (N,): by the attitudes, and the velocity where known. `tilt_shift` (N, 2): by the
+    attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground.
     """
 
     turn_rad: Array

@@ -27,7 +27,6 @@ from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Message,
-    Target,
     external_position_estimate,
     global_position_sensor,
     gps_input,
@@ -63,22 +62,17 @@ ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
 DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
 """Standard deviations sent with the autopilot's own height and vertical velocity: assumed."""
 PX4_VISION_S = 0.2
-"""PX4 starts to fuse a local message only where it follows the one before sooner than this, and
-stops after twice this time without one (`EV_MAX_INTERVAL`; docs/autopilots.md)."""
+"""PX4 starts to fuse local messages only at shorter intervals (`EV_MAX_INTERVAL`)."""
 ORIGIN_NS, ORIGIN_REQUESTS = 2 * 10**9, 3
-"""Interval at which the autopilot is asked for its origin until it reports one, and number of
-requests without an answer after which it has none."""
+"""Interval of requests for the origin, and their number after which the autopilot has none."""
 _GPS_GLOBAL_ORIGIN = 49
 _MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
 
 
 @dataclass(frozen=True)
 class MessageOptions:
-    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md).
-
-    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored. `origin`: of the
-    local frame, set on the ground where the autopilot has none.
-    """
+    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md). `origin`: of the
+    local frame, set on the ground where the autopilot has none."""
 
     kinds: tuple[str, ...] = ("global-position",)
     clock: Clock = Clock.UTC
@@ -97,33 +91,24 @@ class MessageOptions:
 
 
 class Messenger:
-    """Builds and sends the messages of a view that are due. Mutable.
-
-    `incomplete`: messages that could not be built; `too_slow`: those too late for PX4.
-    """
+    """Builds and sends the messages that are due; counts those that are `incomplete`, and local
+    ones that are `too_slow` for PX4. Mutable."""
 
     def __init__(
-        self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
+        self, options: MessageOptions, gate: Gate, link: AutopilotLink, clocks: Clocks
     ) -> None:
-        self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
+        self.options, self._gate, self._link, self._clocks = options, gate, link, clocks
         self._covariance = FilterCovariance(options.min_std_m)
         self.incomplete = self.too_slow = 0
         self._said: set[str] = set()
         self._origin_due_ns = self._requests = 0
 
     def publish(
-        self,
-        estimate: NavigationEstimate,
-        vehicle: VehicleState,
-        *,
-        exposed_ns: int,
-        boot_ns: int | None,
-        target: Target | None,
-        kind: Autopilot | None,
-        origin: Origin | None,
+        self, estimate: NavigationEstimate, vehicle: VehicleState, exposed_ns: int
     ) -> tuple[str, ...]:
-        """Names of the messages sent. `exposed_ns`: by our clock; `boot_ns`: the autopilot's."""
+        """Names of the messages sent."""
         sent = []
+        boot_ns = self._link.boot_ns(exposed_ns)
         for name in self.options.kinds:
             if estimate.dead_reckoned and name != "global-position":
                 continue  # only this message can mark it
@@ -131,21 +116,17 @@ class Messenger:
             stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
             stated = self._covariance.prepare(name, stamped, exposed_ns)
             try:
-                made = self._make(name, stated, vehicle, target or AUTOPILOT, kind, origin)
+                made = self._make(name, stated, vehicle)
             except EstimateError as error:
                 self._not_made(name, error)
                 continue
-            if self._gate.due(KINDS[name], now_ns) and self._send(made):
+            if self._gate.due(KINDS[name], now_ns) and self._link.send(made):
                 sent.append(KINDS[name])
-                self._note(name, exposed_ns, kind)
+                interval_s = self._covariance.interval_s(name, exposed_ns)
+                self._covariance.sent(name, exposed_ns)
+                if name in LOCAL and self._link.kind is not Autopilot.ARDUPILOT:
+                    self.too_slow += PX4_VISION_S <= interval_s < math.inf
         return tuple(sent)
-
-    def _note(self, name: str, exposed_ns: int, kind: Autopilot | None) -> None:
-        """Note that a message was sent, and whether it was too late for PX4."""
-        interval_s = self._covariance.interval_s(name, exposed_ns)
-        self._covariance.sent(name, exposed_ns)
-        if name in LOCAL and kind is not Autopilot.ARDUPILOT:
-            self.too_slow += PX4_VISION_S <= interval_s < math.inf
 
     def _not_made(self, name: str, error: EstimateError) -> None:
         """Count a message that could not be built, and log why, once for each reason."""
@@ -160,33 +141,24 @@ class Messenger:
     def needs_origin(self) -> bool:
         return any(kind in LOCAL for kind in self.options.kinds)
 
-    def find_origin(
-        self, known: Origin | None, target: Target | None, *, armed: bool | None
-    ) -> None:
-        """Ask for the origin of the local frame until it is `known`. Where there is none, set that
-        of the options, unless `armed`: an origin that moves in flight moves the aircraft."""
-        now_ns, origin = self._clocks.mono_ns(), self.options.origin
-        if known is not None:
+    def find_origin(self) -> None:
+        """Ask for the origin of the local frame until it is known. Where there is none, set that of
+        the options, unless armed: an origin that moves in flight moves the aircraft."""
+        now_ns, origin, link = self._clocks.mono_ns(), self.options.origin, self._link
+        if link.origin is not None:
             self._requests = 0
             return
-        if not self.needs_origin or target is None or now_ns < self._origin_due_ns:
+        if not self.needs_origin or link.target is None or now_ns < self._origin_due_ns:
             return
         self._origin_due_ns = now_ns + ORIGIN_NS
-        if origin is not None and armed is False and self._requests >= ORIGIN_REQUESTS:
-            self._send(set_gps_global_origin(origin, target_system=target.system_id))
-        self._requests += self._send(request_message(_GPS_GLOBAL_ORIGIN, target))
+        if origin is not None and link.armed is False and self._requests >= ORIGIN_REQUESTS:
+            link.send(set_gps_global_origin(origin, target_system=link.target.system_id))
+        self._requests += link.send(request_message(_GPS_GLOBAL_ORIGIN, link.target))
 
-    def _make(
-        self,
-        name: str,
-        estimate: NavigationEstimate,
-        vehicle: VehicleState,
-        target: Target,
-        kind: Autopilot | None,
-        origin: Origin | None,
-    ) -> Message:
+    def _make(self, name: str, estimate: NavigationEstimate, vehicle: VehicleState) -> Message:
         chosen = self.options
         clock, least = chosen.clock, chosen.min_confidence
+        target = self._link.target or AUTOPILOT
         if name == "global-position":
             return global_position_sensor(
                 estimate,
@@ -211,8 +183,9 @@ class Messenger:
                 estimate, clock=clock, target=target, min_confidence=least
             )
         make = odometry if name == "odometry" else vision_position_estimate
-        pose = _pose(vehicle, origin)
-        return make(estimate, pose, kind or Autopilot.PX4, clock=clock, min_confidence=least)
+        pose = _pose(vehicle, self._link.origin)
+        kind = self._link.kind or Autopilot.PX4
+        return make(estimate, pose, kind, clock=clock, min_confidence=least)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -318,8 +291,7 @@ class NmeaOut:
 
 
 class JsonOut:
-    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld` in addition, and
-    lines of health, which begin with the key `health`."""
+    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; the health."""
 
     def __init__(
         self, path: Path | None, stream: TextIO | None = None, identity: Identity = UNKNOWN
@@ -372,7 +344,6 @@ class Publisher:
         clocks: Clocks,
         *,
         messenger: Messenger | None = None,
-        link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
         lines: "Sequence[JsonOut | Narrator]" = (),
         graph: "Ros2Publisher | None" = None,
@@ -381,7 +352,7 @@ class Publisher:
     ) -> None:
         """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
         self.gate, self._clocks = gate, clocks
-        self.messenger, self._link = messenger, link
+        self.messenger = messenger
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
         self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
@@ -410,7 +381,8 @@ class Publisher:
             before = self.gate.withheld.copy()
             estimate = self.gate.admit(made, now_ns)
             if estimate is not None:
-                sent = self._send(estimate, exposed_ns, vehicle)
+                if self.messenger is not None:
+                    sent = self.messenger.publish(estimate, vehicle, exposed_ns)
                 if not estimate.dead_reckoned:  # messages of ROS cannot mark it
                     sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
             withheld = None if sent else next(iter(self.gate.withheld - before), None)
@@ -424,21 +396,6 @@ class Publisher:
 
     def close(self) -> None:
         self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
-
-    def _send(
-        self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState
-    ) -> tuple[str, ...]:
-        if self.messenger is None or self._link is None:
-            return ()
-        return self.messenger.publish(
-            estimate,
-            vehicle,
-            exposed_ns=exposed_ns,
-            boot_ns=self._link.boot_ns(exposed_ns),
-            target=self._link.target,
-            kind=self._link.kind,
-            origin=self._link.origin,
-        )
 
     def _to_graph(
         self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int

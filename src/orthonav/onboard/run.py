@@ -20,9 +20,7 @@ from orthonav.core.track import Model
 
 log = logging.getLogger(__name__)
 MAP_CHANGED = "map_file_changed"
-"""Reason of views after the open map file was truncated or rewritten."""
 MAP_DAMAGED = "map_damaged"
-"""Reason of a view for which a part of the map cannot be decoded."""
 LEAST_TILT_DEG = 0.1
 
 

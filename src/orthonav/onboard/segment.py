@@ -1,8 +1,7 @@
 """One MCAP file of a flight log, written in complete chunks.
 
-A chunk that cannot be written completely is truncated, so the file always ends with a complete one.
-After a power cut all chunks but the last are complete, and the index that `finish` writes is
-missing: readers scan the file from the start.
+A chunk that cannot be written completely is truncated, so the file ends with a complete one. After
+a power cut the index that `finish` writes is missing: readers scan the file from the start.
 """
 
 import contextlib

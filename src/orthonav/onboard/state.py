@@ -1,7 +1,7 @@
 """The last position of the aircraft, saved for a restart, and the serial numbers of flown maps.
 
-A small JSON file, replaced atomically about once a second. It is not synced to disk, which can be
-slow on memory cards: it survives a killed process, but not always a power cut.
+Files are replaced atomically, but not synced, which is slow on memory cards: they survive a killed
+process, but not always a power cut.
 """
 
 import contextlib

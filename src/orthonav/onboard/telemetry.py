@@ -1,8 +1,6 @@
 """Telemetry of the last seconds, interpolated to the exposure of a view.
 
-There are two clocks: ours (monotonic) and the autopilot's (since boot). Samples carry times of the
-autopilot's clock; `ClockSync` converts the time of exposure to it. Nothing here reads a clock or a
-port.
+Samples carry times of the autopilot's clock (since boot); `ClockSync` converts ours to it.
 """
 
 import math
@@ -24,9 +22,8 @@ from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Telemetry
 
 HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
-"""Sources of the height above ground, best first: a rangefinder that looks down, the autopilot's
-terrain model, the height above sea level (with the terrain of the map only), and the height above
-home (without that terrain correct over flat ground only) of two messages."""
+"""Sources of the height above ground, best first: a rangefinder, the autopilot's terrain model, the
+height above sea level (with the terrain of the map only), that above home of two messages."""
 _ABOVE_HOME = ("home", "relative")
 _SECOND_AMSL = "altitude"
 """Height above sea level of a second message, where the first gives none."""
@@ -47,14 +44,12 @@ FASTEST_MPS = 300.0
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 UNAIDED_VEL_STD_MPS = 5.0
-"""Of the velocity without GNSS: that of PX4 was 2 to 5 m/s off in simulated flights, and changed
-within 10 s."""
+"""Of the velocity without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
 UNAIDED_TILT_STD_DEG, AIDED_TILT_STD_DEG = 3.0, 1.5
 """Of the horizon: PX4's was 2 to 4 deg off without GNSS. With GNSS, errors of the accelerometers
 and of the mount remain; ArduPilot's was 0.4 deg off without it (docs/closed-loop.md)."""
 LARGEST_AIDED_MPS = 1.0
-"""A filter that claims a larger standard deviation of its velocity does not fuse GNSS, whatever the
-receiver has."""
+"""A filter that claims more for its velocity does not fuse GNSS, whatever the receiver has."""
 STATUS_NS, FIX_NS = 5 * 10**9, 3 * 10**9
 """A status and a fix hold for so long; the autopilots send both at 1 Hz or more."""
 ABSOLUTE = 16
@@ -72,18 +67,14 @@ class Clocks:
 
 
 class Travelled(NamedTuple):
-    """Displacement since an arbitrary time: the integral of the reported velocity.
-
-    `part`: number of the uninterrupted part of the telemetry that it was integrated over.
-    """
+    """Integral of the reported velocity over an uninterrupted `part` of the telemetry."""
 
     part: int
     north_m: float
     east_m: float
 
     def since(self, before: "Travelled | None") -> tuple[float, float] | None:
-        """Metres east and north since an earlier one; None where the velocity in between is not
-        known."""
+        """Metres east and north; None where the velocity in between is not known."""
         if before is None or before.part != self.part:
             return None
         return self.east_m - before.east_m, self.north_m - before.north_m
@@ -362,10 +353,7 @@ class ClockSync:
         return self._at_ns + round(since_ns / (1 + self._rate))
 
     def exchange(self, sent_ns: int, received_ns: int, reported_ns: int) -> bool:
-        """Add an exchange; whether a clock was found to have jumped.
-
-        `sent_ns` and `received_ns` are times of our clock, `reported_ns` one of the autopilot's.
-        """
+        """Whether a clock was found to have jumped. `reported_ns`: the autopilot's time."""
         trip_ns = received_ns - sent_ns
         if not 0 <= trip_ns <= self.LONGEST_NS:
             return False

@@ -1,8 +1,5 @@
-"""Input of all messages: one position at one exposure, with its accuracy and time.
-
-Unknown values are NaN or None here and are marked as unknown in the message; they never become a
-number that looks like a measurement.
-"""
+"""Input of all messages: one position at one exposure. Unknown values, NaN or None, never become a
+number that looks like a measurement."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -16,10 +13,8 @@ from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
 
 AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
-"""Time over which the filters of autopilots average positions, s, where their claim should come to
-the standard deviation `AT_STD_M`; it grows with this power of it. Derived from the default process
-noise of PX4 and ArduPilot, 5.5 s, and chosen on generated flights
-(docs/decisions/correlated-errors.md)."""
+"""Time over which the filters of autopilots average positions, for a claim of `AT_STD_M`; it grows
+with this power of the claim (docs/decisions/correlated-errors.md)."""
 
 
 class EstimateError(OrthonavError, ValueError):
@@ -40,12 +35,10 @@ class NavigationEstimate:
     """Position of the aircraft at one exposure.
 
     `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
-    `confidence`: probability (0 to 1) that the fix is correct; NaN: not known.
+    `confidence`: 0 to 1; NaN: not known.
     `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
-    `processing_s`: time from exposure until the message is sent.
-    `agl_m`: height above ground; NaN where not known, as the next three.
-    `alt_amsl_m`, `alt_std_m`: altitude above mean sea level and its standard deviation.
-    `heading_deg`: heading of the top of the image, clockwise from true north.
+    `processing_s`: from exposure until the message is sent.
+    `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
     `state`: state of the track; None for views that are located one by one.
     `reset_counter`: 0 to 255; changes when the position jumped.
@@ -59,12 +52,10 @@ class NavigationEstimate:
     utc_ns: int | None = None
     boot_ns: int | None = None
     processing_s: float = 0.0
-    agl_m: float = math.nan
     alt_amsl_m: float = math.nan
     alt_std_m: float = math.nan
     vel_en_mps: tuple[float, float] | None = None
     vel_cov_en: NDArray[np.float64] | None = None
-    heading_deg: float = math.nan
     state: str | None = None
     reset_counter: int = 0
     dead_reckoned: bool = False
@@ -148,10 +139,8 @@ def estimate_from_result(
         utc_ns=utc_ns,
         boot_ns=boot_ns,
         processing_s=processing_s,
-        agl_m=fix.agl_m,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
         vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
-        heading_deg=fix.heading_deg,
         state=result.state,
     )
 

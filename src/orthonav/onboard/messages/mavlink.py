@@ -66,11 +66,8 @@ AUTOPILOT = Target()
 
 @dataclass(frozen=True)
 class Signing:
-    """Key and state of MAVLink 2 message signing.
-
-    `timestamp_10us`: tens of microseconds since 2015-01-01; it must never decrease for a link and
-    a key, and grows by one with every message.
-    """
+    """Key and state of MAVLink 2 message signing. `timestamp_10us`, since 2015-01-01, must never
+    decrease for a link and a key; it grows by one with every message."""
 
     secret_key: bytes = field(repr=False)
     timestamp_10us: int
@@ -215,10 +212,7 @@ def external_position_estimate(
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
-
-    `transmission_time` is the time of sending modulo `WRAP_S`. Raises `EstimateError` for an
-    estimate of low confidence, which the command cannot mark.
-    """
+    Raises `EstimateError` for an estimate of low confidence, which it cannot mark."""
     require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
     wrapped_ns = estimate.sent_ns(clock) % round(WRAP_S * 1e9)
     return dialect().MAVLink_command_int_message(
@@ -334,10 +328,7 @@ _WEEK_MS = 7 * 86_400_000
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
-    """GPS week (without rollover at 1024) and time of week in ms, of a UTC time in ns since 1970.
-
-    (0, 0), which receivers read as "not known", before 1980-01-06.
-    """
+    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 1980-01-06."""
     utc_ms = utc_ns // 1_000_000
     leaps = bisect_right(_LEAPS_UNIX_S, utc_ms // 1000)
     since_epoch_ms = utc_ms - _EPOCH_UNIX_S * 1000 + leaps * 1000

@@ -10,6 +10,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -179,8 +180,8 @@ class Ros2Reader:
         for topic, kind, handler in (
             (self._info_topic, "sensor_msgs/msg/CameraInfo", self._take_camera_info),
             (resolved("imu"), "sensor_msgs/msg/Imu", self._take_attitude),
-            (resolved("range"), "sensor_msgs/msg/Range", self._take_range),
-            (resolved("rel_alt"), "std_msgs/msg/Float64", self._take_altitude),
+            (resolved("range"), "sensor_msgs/msg/Range", partial(self._take_height, "distance")),
+            (resolved("rel_alt"), "std_msgs/msg/Float64", partial(self._take_height, "home")),
             (resolved("gnss"), "sensor_msgs/msg/NavSatFix", self._take_gnss),
         ):
             node.subscribe(topic, kind, handler, depth=_TELEMETRY_DEPTH)
@@ -252,13 +253,7 @@ class Ros2Reader:
         if turned is not None:
             self._buffer.add_attitude(time_ns, turned.tolist())
 
-    def _take_range(self, message: Any, cdr: bytes) -> None:
-        self._take_height("distance", message)
-
-    def _take_altitude(self, message: Any, cdr: bytes) -> None:
-        self._take_height("home", message)
-
-    def _take_height(self, source: str, message: Any) -> None:
+    def _take_height(self, source: str, message: Any, cdr: bytes) -> None:
         time_ns, height = self._stamp(message), height_of_message(message)
         if time_ns is None or height is None:
             return
