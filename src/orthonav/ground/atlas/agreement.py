@@ -38,8 +38,7 @@ MAX_CHAIN_LOG_ODDS = 14.0  # so that a chain that became wrong is given up after
 
 @dataclass(frozen=True)
 class Placement:
-    """How a view may have been taken. `lat_deg`, `lon_deg`: place of the camera, if nothing else is
-    said."""
+    """How a view may have been taken, and from which place."""
 
     lat_deg: float
     lon_deg: float
@@ -114,9 +113,8 @@ class Agreement:
     def add_view(
         self, places: Sequence[PlaceEvidence], time_ns: int, side_m: float, chance: float
     ) -> None:
-        """Take in the places where a view `side_m` wide may have been taken. `chance`: probability
-        that the best of the wrong places lies where a chain expects the view, the share of the
-        searched area that was searched there."""
+        """`side_m`: width of the view. `chance`: probability that the best of the wrong places lies
+        where a chain expects it, the share of the searched area that was searched there."""
         gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
         made: list[Chain] = []
         supporting = [each for each in places if _support(each, gain) > 0]

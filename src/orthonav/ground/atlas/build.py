@@ -73,8 +73,7 @@ class AtlasRequest:
 
 @dataclass(frozen=True)
 class SheetTask:
-    """A sheet to be built, with all that a worker on another machine needs. `dem`, `dem_datum`:
-    terrain model and what its heights count from, as for a map."""
+    """A sheet to be built, with all that a worker on another machine needs."""
 
     sheet: Sheet  # its description, without tiles and area yet
     atlas: str  # folder or URL of the atlas
@@ -139,8 +138,7 @@ def request_digest(
     dem: Path | None = None,
     dem_datum: str | None = None,
 ) -> str:
-    """Digest of what a sheet depends on: recipe, versions, the imagery under it, and the terrain.
-    Each file counts with its name, size and second of change, in the order in which files cover
+    """Each file counts with its name, size and second of change, in the order in which files cover
     each other; its folder does not count, as it may differ between machines."""
     stamps = [
         [Path(name).name, size, changed_ns // 10**9]
@@ -259,9 +257,8 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
-    """The files and folders that a worker needs to read the same pixels as from all of them. All of
-    them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from many
-    files together."""
+    """What a worker needs to read the same pixels: all files where the stretch to 8 bits, or
+    whether a fourth band is a mask, was derived from many together."""
     common = any(each is not None for each in mosaic.stretches)
     if common or any(source.marked_alpha for source in mosaic.sources):
         return tuple(orthos)
@@ -295,8 +292,7 @@ Status = Literal["built", "unchanged", "empty", "failed"]
 
 @dataclass(frozen=True)
 class SheetResult:
-    """The result of one sheet and its cost. `status`: `built`; `unchanged`, it was there already;
-    `empty`, there is no imagery; `failed`. `size_bytes`, `area_km2`, `tiles`: of the sheet."""
+    """`unchanged`: the sheet was there already; `empty`: there is no imagery."""
 
     sheet: str  # name
     status: Status

@@ -42,13 +42,12 @@ _SLACK_DEG = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CoarseTiles:
-    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only. `bounds_deg`: box
-    of the sheet: west, south, east, north. `centres_latlon_deg` (N, 2) float64; N is 0 where no
+    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only. N is 0 where no
     tile shows enough imagery."""
 
     recipe: CoarseRecipe  # how they were made
-    bounds_deg: Extent
-    centres_latlon_deg: NDArray[np.float64]
+    bounds_deg: Extent  # of the sheet: west, south, east, north
+    centres_latlon_deg: NDArray[np.float64]  # (N, 2)
     features: NDArray[np.float16]  # (N, F) float16; F is cells x cells x channels
     valid: NDArray[np.uint8]  # (N, cells x cells) uint8; 255 where all of a cell shows imagery
 

@@ -126,8 +126,8 @@ class Sheet:
 
     @classmethod
     def from_item(cls, plain: Any, data: bytes) -> "Sheet":
-        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. That also
-        refuses values of another type, which are converted here."""
+        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. Writing
+        the sheet must give them, which also refuses values of another type."""
         try:
             properties = plain["properties"]
             own = properties["orthonav:sheet"]

@@ -91,10 +91,8 @@ class TileSearch:
     def matches(
         self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
     ) -> list[Placement]:
-        """The tiles most similar to a view under any of the poses, best first, apart from each
-        other: their centres, which are the middle of the ground that the view shows. `view`:
-        rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log scale of
-        each."""
+        """Centres of the tiles most similar to a view, rectified to their resolution, under any of
+        the poses (heading in rad, log scale), best first, apart from each other."""
         embedded = embed_poses(
             self._embedder, self._representation, view.grey, view.valid, poses, self.recipe.tile_px
         )

@@ -334,9 +334,8 @@ def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
 
 @contextmanager
 def storage_errors(place: str, action: str) -> Iterator[None]:
-    """Turn errors raised inside into `StorageError` with the cause. `place`: address to show to
-    people, without a password. `action`: what was attempted, a verb and its object. Every exception
-    is converted: the libraries behind fsspec raise many kinds."""
+    """Turn every error into `StorageError` with the cause: the libraries behind fsspec raise many
+    kinds. `action`: what was attempted, a verb and its object."""
     try:
         yield
     except OrthonavError as error:

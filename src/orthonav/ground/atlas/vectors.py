@@ -99,9 +99,8 @@ class VectorRecipe:
 
 @dataclass(frozen=True, eq=False)
 class Quantizers:
-    """The trained quantizers that all shards of an index share. `rotation` (D, D): rotates vectors
-    so that variance is spread evenly over the quantizers. `halves` (2, sqrt(lists), D / 2): list
-    centres of each half of a rotated vector."""
+    """`rotation` (D, D) spreads variance evenly over the quantizers. `halves` (2, sqrt(lists), D /
+    2): list centres of each half of a rotated vector."""
 
     recipe: VectorRecipe  # how they were made
     rotation: Array
@@ -272,9 +271,8 @@ class ShardInfo:
 def write_shard(
     folder: Path, name: str, quantizers: Quantizers, batches: Iterable[tuple[Places, Array]]
 ) -> int:
-    """Write a shard of unit vectors and return its number of rows. `batches`: latitudes and
-    longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory grows by codes and places,
-    some 40 bytes a vector."""
+    """`batches`: latitudes and longitudes (n, 2) and unit vectors (n, D) of some rows at a time.
+    Memory grows by codes and places, some 40 bytes a vector."""
     folder.mkdir(parents=True, exist_ok=True)
     dims, index = quantizers.recipe.dims, quantizers.empty_index()
     places_deg = [np.empty((0, 2))]

@@ -16,9 +16,8 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A reference area in its own local plane. `extent_en_m` is (west, south, east, north) in
-    metres of `frame`. With `route` the area is the search band around it: the width of each leg, or
-    `band_m` metres for legs without one. Without a route it is the whole extent."""
+    """The extent (west, south, east, north in metres of `frame`), or the search band around a
+    route: the width of each leg, or `band_m` metres for legs without one."""
 
     frame: LocalFrame
     extent_en_m: Extent

@@ -52,9 +52,8 @@ TABLE_1 = {
 
 
 def preset(text: str) -> Route:
-    """The route that `paper:A@46.6,1.9` or `paper:A@46.6,1.9,30` names. A straight line of the
-    trajectory's length about that centre, flown at its height, with its search band; the bearing is
-    in degrees clockwise from north, 90 where it is not given."""
+    """The straight line that `paper:A@46.6,1.9,30` names: about that centre, with the bearing in
+    degrees clockwise from north, 90 where it is not given."""
     name, _, where = text.removeprefix(PREFIX).partition("@")
     shape = TABLE_1.get(name.upper())
     if shape is None:
@@ -131,9 +130,8 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 
 
 def read_route(path: Path) -> Route:
-    """Read a route from a file of one of the formats in `docs/routes.md`. `FILE#NAME` selects a
-    line by its name, or else its number from 1, if a file holds several; `paper:B@46.6,1.9,30` is a
-    preset. Raises `MissingFileError` or `RouteError` (naming found and expected content)."""
+    """`FILE#NAME` selects a line by its name, or else its number from 1; `paper:B@46.6,1.9,30` is a
+    preset. Raises `MissingFileError` or `RouteError`."""
     if str(path).startswith(PREFIX):
         return preset(str(path))
     path, name = _name_apart(Path(path))
@@ -220,9 +218,8 @@ def distance_to_polyline_m(points_en_m: Array, line_en_m: Array) -> Array:
 
 
 def beyond_bands_m(points_en_m: Array, line_en_m: Array, bands_m: Array) -> Array:
-    """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
-    `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)
-    legs. The result is the minimum over the legs of the distance to the leg minus half its band."""
+    """Distance in metres of `(N, 2)` points outside the bands (full widths of max(1, M - 1) legs)
+    of a polyline of `(M, 2)` vertices; negative inside."""
     starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
     legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
     length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)

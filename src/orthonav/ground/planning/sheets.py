@@ -30,9 +30,8 @@ _TRIES = 4  # numbers of columns tried for one row before rows are made lower
 
 
 def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
-    """Boxes (west, south, east, north in degrees) that each fit a sheet and together fill the box.
-    Rows of equal height, from south to north; each row is divided into the number of equal boxes
-    its width requires, from west to east."""
+    """Boxes (west, south, east, north in degrees) that each fit a sheet: rows of equal height, from
+    south to north, each divided into equal boxes, from west to east."""
     west, south, east, north = unwrapped(bounds_deg)
     if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
         hint = swapped_bounds_hint((west, south, east, north))
@@ -85,10 +84,8 @@ def _wrapped(lon_deg: float) -> float:
 
 
 def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
-    """Parts of a route, in order, whose search bands each fit a sheet. The route is divided at
-    waypoints, each part as long as possible. A leg too long for a sheet is divided into equal
-    pieces on the great circle. Each part begins at the end of the previous one. Parts are named
-    sheet-1, sheet-2 and so on."""
+    """Parts of a route, in order, as long as their search bands fit a sheet. A leg too long for one
+    is divided into equal pieces on the great circle."""
     bands_m = route.bands_m(band_m)
     if bands_m is None or _route_fits(route, band_m):
         Area.from_route(route, band_m)  # raises if a band is missing

@@ -48,8 +48,7 @@ class Caution:
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """Footprint of a vertical view of flat ground. `width_m`, `height_m`: sides of the
-    footprint."""
+    """Footprint of a vertical view of flat ground."""
 
     agl_m: float  # height above ground
     width_m: float
@@ -84,13 +83,12 @@ class ViewPlan:
 
     def across_px(self, gsd_m: float) -> float:
         """Size of the view in map pixels: the square root of its area, as in registration."""
-        return math.sqrt(self.width_m * self.height_m) / gsd_m
+        return self.side_m / gsd_m
 
 
 def suited_map(view: ViewPlan) -> tuple[float, int]:
-    """Suitable ground resolution (m) and tile width (px) of a map for a view. The coarsest round
-    resolution at which the view covers a whole tile, with the widest tile for which this is neither
-    finer than the view itself nor than `FINEST_IMAGERY_M`."""
+    """The coarsest round resolution (m) at which the view covers a whole tile, and the widest tile
+    (px) for which this is neither finer than the view nor than `FINEST_IMAGERY_M`."""
     finest_m = max(FINEST_IMAGERY_M, view.gsd_m)
     for tile_px in TILE_SIZES_PX:
         gsd_m = _nice_below(view.short_m / tile_px)
@@ -197,9 +195,8 @@ def estimate_map(
     registration: bool = True,
     maps: int = 1,
 ) -> MapEstimate:
-    """Estimate for the map that `orthonav build` makes of an area. Tiles are counted if that is
-    cheap, else estimated from a sample (within 2 %), which is smaller where this is one of many
-    `maps`. Imagery is assumed everywhere."""
+    """Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is
+    smaller where this is one of many `maps`. Imagery is assumed everywhere."""
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
     raster = (
@@ -229,9 +226,8 @@ def estimate_map(
 def _share(
     area: Area, box_en_m: Extent, margin_m: float, room: int, cells: tuple[int, int] | None = None
 ) -> float:
-    """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
-    Computed from the centres of its `cells` (rows, columns), or of at most about `room` if those
-    are more."""
+    """Share of a box that lies in the area or within a margin of it, computed from the centres of
+    its `cells` (rows, columns), or of at most about `room`."""
     if area.route is None:
         return 1.0
     room = min(room, max(_LEAST_POINTS, _PAIRS // area.route.legs))
@@ -256,13 +252,12 @@ _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 
 @dataclass(frozen=True)
 class LegProfile:
-    """A leg over terrain. `ground_m`: minimum and maximum terrain height above mean sea level along
-    it. `relief`: largest difference of terrain height within a view centred on the leg or on an
-    edge of its search band, as a share of the height above ground; 0 below `LANDING_M`."""
+    """`relief`: largest difference of terrain height within a view centred on the leg or on an edge
+    of its search band, as a share of the height above ground; 0 below `LANDING_M`."""
 
     leg: int  # number, from 1
     length_m: float  # its length
-    ground_m: tuple[float, float]
+    ground_m: tuple[float, float]  # minimum and maximum terrain height above mean sea level
     agl_m: tuple[float, float]  # minimum and maximum height above ground
     relief: float
 

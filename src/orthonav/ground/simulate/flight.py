@@ -322,7 +322,10 @@ def _poses(
             yaw_deg = rng.uniform(0, 360)
             pose = _tilted(request, rng, place, yaw_deg, agl_m, number * 1.0, tilt_deg)
             if _sees_ground(coverage, request, pose):
-                yield _above_sea(request, area, pose)
+                if request.terrain is not None:
+                    below_m = ground_below_m(request.terrain, area.frame, place[None])
+                    pose = replace(pose, amsl_m=pose.agl_m + float(below_m[0]))
+                yield pose
                 break
         else:
             wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, agl_m), axis=0)
@@ -330,13 +333,6 @@ def _poses(
                 f"found no position where a view of {wide:.0f} x {high:.0f} m lies within the "
                 f"imagery of {east - west:.0f} x {north - south:.0f} m; fly lower (--agl-m)"
             )
-
-
-def _above_sea(request: SimulateRequest, area: Area, pose: _Pose) -> _Pose:
-    if request.terrain is None:
-        return pose
-    below_m = ground_below_m(request.terrain, area.frame, pose.position_en_m[None])
-    return replace(pose, amsl_m=pose.agl_m + float(below_m[0]))
 
 
 def _route_poses(

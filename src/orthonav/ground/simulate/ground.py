@@ -85,9 +85,8 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class GroundImagery:
-    """Imagery in a local plane. `west_m`, `north_m`: its north-west corner. `mirror_px`: box (left,
-    top, right, bottom) that is mirrored at its sides to fill pixels without imagery, None for no
-    filling."""
+    """`mirror_px`: box (left, top, right, bottom) that is mirrored at its sides to fill pixels
+    without imagery, None for no filling."""
 
     raster: SheetRaster  # the resampled imagery
     west_m: float
@@ -143,9 +142,8 @@ def ground_below_m(terrain: TerrainHeights, frame: LocalFrame, places_en_m: Arra
 def reported_heights(
     telemetry: Telemetry, agl_m: float, home_m: float | None, amsl_m: float
 ) -> Telemetry:
-    """The telemetry with heights above sea and take-off in place of a measured one above ground.
-    `agl_m`, `home_m`, `amsl_m`: true heights; all are reported with the error of that above ground.
-    As in imports without a terrain, the height above take-off stands for that above ground."""
+    """True heights above sea and take-off, with the error of that above ground, in its place. As in
+    imports without a terrain, the one above take-off stands for it."""
     error_m = telemetry.agl_m - agl_m
     above_home_m = None if home_m is None else round(home_m + error_m, 3)
     return replace(

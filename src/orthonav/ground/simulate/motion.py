@@ -25,9 +25,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Wind:
-    """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts. Gusts
-    are an Ornstein-Uhlenbeck process per axis with the standard deviation `GUST_STD` (a share of
-    the wind speed) and the time constant `GUST_TIME_S`."""
+    """Wind that comes from `from_deg` (clockwise from true north). Gusts are an Ornstein-Uhlenbeck
+    process per axis."""
 
     speed_mps: float
     from_deg: float = 270.0
@@ -150,9 +149,8 @@ def gauss_markov(step: float, count: int, rng: np.random.Generator) -> Array:
 
 
 def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
-    """Velocities (N, 2) as reported by odometry with a drifting scale and direction. The scale
-    error (a share) and the direction error (rad) have the standard deviation `drift` and the time
-    constant `DRIFT_TIME_S`."""
+    """Velocities (N, 2) as reported by odometry whose scale (a share) and direction (rad) err with
+    the standard deviation `drift`."""
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
     off = drift * gauss_markov(step_s / DRIFT_TIME_S, len(times_s), rng)
     cos, sin = np.cos(off[:, 1]), np.sin(off[:, 1])

@@ -155,18 +155,10 @@ class Jam(Good):
         )
 
 
-RECEIVERS: Table = MappingProxyType(  # receivers that `orthonav simulate --receiver` knows
+RECEIVERS: Table = MappingProxyType(  # those that `orthonav simulate --receiver` knows
     {
-        name: Variant(f"orthonav.ground.simulate.receiver:{cls.__name__}")
-        for name, cls in (
-            ("good", Good),
-            ("step", Step),
-            ("drag", Drag),
-            ("drift", Drift),
-            ("frozen", Frozen),
-            ("jumping", Jumping),
-            ("jam", Jam),
-        )
+        cls.__name__.lower(): Variant(f"orthonav.ground.simulate.receiver:{cls.__name__}")
+        for cls in (Good, Step, Drag, Drift, Frozen, Jumping, Jam)
     }
 )
 
