@@ -104,16 +104,14 @@ def _hours(text: str) -> float:
 
 
 def run(options: argparse.Namespace) -> int | None:
-    actions = {
-        "build": _build,
-        "info": _info,
-        "check": _check,
-        "add": _add,
-        "retire": _retire,
-        "index": _index,
-        "cut": _cut,
-    }
-    return actions[options.action](options)
+    from orthonav.ground.atlas.catalog import Atlas
+
+    if options.action == "build":
+        return _build(options)
+    if options.action == "add":
+        return _add(options)
+    actions = {"info": _info, "check": _check, "retire": _retire, "index": _index, "cut": _cut}
+    return actions[options.action](options, Atlas.open(options.atlas))
 
 
 def _add_build(parser: argparse.ArgumentParser) -> None:
@@ -266,10 +264,8 @@ def _failures(plain: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _info(options: argparse.Namespace) -> None:
-    from orthonav.ground.atlas.catalog import Atlas
-
-    plain = summary(Atlas.open(options.atlas))
+def _info(options: argparse.Namespace, atlas: "Atlas") -> None:
+    plain = summary(atlas)
     if options.json:
         print_json(plain)
     else:
@@ -331,11 +327,9 @@ def summary_text(plain: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _check(options: argparse.Namespace) -> int:
-    from orthonav.ground.atlas.catalog import Atlas
+def _check(options: argparse.Namespace, atlas: "Atlas") -> int:
     from orthonav.ground.atlas.integrity import check_atlas
 
-    atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
         found = check_atlas(
             atlas, options.deep, shown, clean=options.clean, min_age_s=options.min_age_h * 3600
@@ -369,21 +363,16 @@ def _add(options: argparse.Namespace) -> None:
     print(f"{len(copied)} sheets added, {len(unchanged)} unchanged: {atlas.store}")
 
 
-def _retire(options: argparse.Namespace) -> None:
-    from orthonav.ground.atlas.catalog import Atlas
-
-    atlas = Atlas.open(options.atlas)
+def _retire(options: argparse.Namespace, atlas: "Atlas") -> None:
     for sheet in dict.fromkeys(options.sheets):
         atlas.retire(sheet)
         print(f"retired    {sheet}")
     atlas.snapshot()
 
 
-def _index(options: argparse.Namespace) -> None:
-    from orthonav.ground.atlas.catalog import Atlas
+def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
     from orthonav.ground.atlas.index import make_index
 
-    atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
         made = make_index(atlas, progress=shown, rebuild=options.rebuild)
     if made is None:
@@ -394,15 +383,13 @@ def _index(options: argparse.Namespace) -> None:
     print(f"{rows} tiles of {len(made.sheets)} sheets, {size / 1e6:.3f} MB: {atlas.store}")
 
 
-def _cut(options: argparse.Namespace) -> None:
+def _cut(options: argparse.Namespace, atlas: "Atlas") -> None:
     from orthonav.cli.info import summary as map_summary
     from orthonav.cli.info import summary_text as map_text
-    from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.cut import cut_map
     from orthonav.ground.planning.area import Area, require_one_area
     from orthonav.ground.planning.route import read_route
 
-    atlas = Atlas.open(options.atlas)
     if options.route is None:
         require_one_area(None, options.band_m, options.bounds)
         area = Area.from_bounds(options.bounds)

@@ -80,13 +80,13 @@ class VectorRecipe:
             )
 
     @classmethod
-    def for_count(cls, count: int, dims: int, seed: int = 0) -> "VectorRecipe":
+    def for_count(cls, count: int, dims: int) -> "VectorRecipe":
         """The recipe for `count` vectors: lists of up to 1600, 4 bits for every two components."""
         list_bits = 4
         while list_bits < 16 and count > 800 * 2 ** (list_bits + 1):
             list_bits += 2
         quantizers = dims // 2 if dims % 4 == 0 else 2
-        return cls(dims, list_bits, quantizers, seed)
+        return cls(dims, list_bits, quantizers)
 
     @property
     def lists(self) -> int:
