@@ -12,8 +12,6 @@ from pathlib import Path
 
 import fsspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from orthonav.core.errors import AtlasError, MissingFileError, StorageError
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe, copy_sheets
@@ -482,36 +480,6 @@ def test_dates_become_times_of_stac(dates, times):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
     assert found == times
     assert read_item(sheet.item_name, canonical(sheet.to_item())) == sheet
-
-
-@pytest.fixture(scope="module")
-def wide(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wide")
-    recipe = AtlasRecipe(gsd_m=10.0, sheet_km=40.0)
-    atlas = Atlas.open_or_create(folder / "atlas", recipe)
-    (folder / "map").write_bytes(b"map")
-    boxes = [(1.0, 46.0, 2.5, 47.0), (179.5, -17.0, -179.5, -16.5), (0.0, 89.9, 10.0, 90.0)]
-    for sheet in {each for box in boxes for each in recipe.sheets.over(box)}:
-        description = replace(described(), id=sheet, bounds_deg=recipe.sheets.bounds_deg(sheet))
-        atlas.put({"map": folder / "map"}, description)
-    return atlas
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    st.sampled_from([(1.7, 46.5), (179.9, -16.8), (-179.9, -16.7), (5.0, 89.99), (100.0, 0.0)]),
-    st.floats(-1, 1),
-    st.floats(-1, 1),
-    st.floats(0, 1),
-    st.floats(0, 1),
-)
-def test_sheets_over_a_box_are_those_of_the_lattice(wide, place, right, up, width, height):
-    west, south = place[0] + right, min(90.0, place[1] + up)
-    east, north = west + width, min(90.0, south + height)
-    box = tuple(lon - 360 if lon > 180 else lon for lon in (west, east))
-    box = (box[0], south, box[1], north)
-    expected = set(wide.recipe.sheets.over(box)) & set(wide.sheets())
-    assert {sheet.id for sheet in wide.over(box)} == expected
 
 
 def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):

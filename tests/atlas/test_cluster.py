@@ -17,7 +17,7 @@ from test_atlas_build import SMALL, content, made
 from orthonav.core.errors import MissingExtraError, WorkerError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.cluster import Failure, RayRunner, attempted
+from orthonav.ground.atlas.cluster import RayRunner
 
 LONGER = {**SMALL, "calibration_views": 96}
 """A sheet takes about a second."""
@@ -119,22 +119,6 @@ def test_tasks_of_ray_fail_by_themselves_and_are_stopped_at_the_end(fake_ray):
         assert len(fake_ray.begun) == 2  # waiting ones are never begun
         assert fake_ray.cancelled == [("1", False)]
         assert runner.everywhere(os.getpid) == [("a", os.getpid())]
-
-
-def test_failures_are_values():
-    assert attempted(float, "2") == 2.0
-    failure = attempted(float, "two")
-    assert (failure.kind, "could not convert" in failure.text) == ("ValueError", True)
-    assert failure.trace
-
-    def exhausted(item):
-        raise MemoryError
-
-    def refused(item):
-        raise WorkerError("no")
-
-    assert attempted(exhausted, 1) == Failure("MemoryError", "out of memory")
-    assert attempted(refused, 1) == Failure("WorkerError", "no")
 
 
 def test_ray_is_required_only_where_it_is_used(monkeypatch):

@@ -156,10 +156,6 @@ def test_a_removed_sheet_is_retired_and_a_new_one_is_added(copied, tmp_path, mon
         (lambda plain: plain.update(shards=7), "another kind"),
         (lambda plain: plain.update(more=7), "altered"),
     ],
-    ids=[
-        *("name", "base", "rows", "truth", "sheet", "retired"),
-        *("outside", "size", "sha256", "shards", "more"),
-    ],
 )
 def test_an_untrusted_index_is_checked(atlas, change, words):
     plain = json.loads(atlas.store.read(MANIFEST))

@@ -59,16 +59,6 @@ def polylines(least=1):
         {"type": "GeometryCollection", "geometries": [POINT, LINE, OTHER_LINE]},
         feature({"type": "GeometryCollection", "geometries": [LINE]}),
     ],
-    ids=[
-        "bare",
-        "with height",
-        "feature",
-        "collection",
-        "first line",
-        "parts",
-        "geometries",
-        "nested",
-    ],
 )
 @pytest.mark.parametrize("suffix", [".geojson", ".json", ".GeoJSON"])
 def test_geojson_is_read(tmp_path, document, suffix):

@@ -159,10 +159,7 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
         (plan({"type": "ComplexItem", "complexItemType": "survey"}), "no VisualTransectPoints"),
         (plan(transects("survey", ((1,),))), "cannot be read"),
         (plan(transects("CorridorScan", (A, B), CorridorWidth=-5)), "band of a leg must be wider"),
-        (
-            plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}),
-            "cannot be read",
-        ),
+        (plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "cannot be read"),
     ],
 )
 def test_invalid_plans_are_refused(read, document, message):
