@@ -109,7 +109,8 @@ def run(options: argparse.Namespace) -> int | None:
     if options.action == "build":
         return _build(options)
     if options.action == "add":
-        return _add(options)
+        _add(options)
+        return None
     actions = {"info": _info, "check": _check, "retire": _retire, "index": _index, "cut": _cut}
     return actions[options.action](options, Atlas.open(options.atlas))
 
