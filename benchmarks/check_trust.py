@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.placing import views_in
-from benchmarks.record import Section, Table, resumed, run, say
+from benchmarks.record import Section, Table, resumed, rows_path, run, say
 from benchmarks.scenes import (
     WIDE,
     Pair,
@@ -37,9 +37,9 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
 from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
+from orthonav.ground.check.findings import GO_LOW, NARROW_PX
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.run import check_map
-from orthonav.ground.check.verdict import GO_LOW, NARROW_PX
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
 
@@ -118,7 +118,7 @@ def measure(options: argparse.Namespace) -> Section:
             tasks[name] = (pair, width_px, prior, views, options)
     found = []
     for each in resumed(
-        options.work / f"conditions-{options.seed}.jsonl",
+        rows_path(options.work, f"conditions-{options.seed}"),
         _measured,
         dict(list(tasks.items())[: options.conditions]),
     ):

@@ -126,7 +126,6 @@ class Path2D:
         return np.array([np.interp(time_s, self._times, each) for each in self._places.T])
 
     def reported(self, time_s: float) -> State:
-        """Telemetry of an undisturbed autopilot."""
         yaw, pitch, roll = self.attitude(time_s)
         east, north = (np.interp(time_s, self._times, each) for each in self._velocity.T)
         off = yaw + YAW_OFF_DEG, pitch + PITCH_OFF_DEG, roll
@@ -204,7 +203,6 @@ class Report:
     withheld: dict[str, int] = field(default_factory=dict)
 
     def during(self) -> list[Sent]:
-        """Messages during the fault."""
         return [each for each in self.sent if self.fault_s[0] <= each.at_s < self.fault_s[1]]
 
     def wrong(self) -> list[Sent]:
@@ -281,8 +279,8 @@ class FaultFlight:
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
         self.gate = Gate(GateRules(), Clock.BOOT)
         messages = MessageOptions(("global-position",))
-        messenger = Messenger(messages, self.gate, self.link.send, clocks)
-        publisher = Publisher(self.gate, clocks, messenger=messenger, link=self.link)
+        messenger = Messenger(messages, self.gate, self.link, clocks)
+        publisher = Publisher(self.gate, clocks, messenger=messenger)
         self._camera = LiveCamera(0, clocks, capture=lambda _: Stream(self._seen))
         self._newest = NewestImage()
         self.runner = Runner(
@@ -303,7 +301,6 @@ class FaultFlight:
 
     @property
     def since_s(self) -> float:
-        """Seconds since the start."""
         return (self.time.now_ns - BEGIN_NS) / S
 
     def fly(self) -> Report:
@@ -363,7 +360,6 @@ class FaultFlight:
         self._hear(*frames)
 
     def _seen(self) -> Grey:
-        """The image that arrives now."""
         t = self._fault_t()
         grey = self.seen_at(self.exposed_s)
         if t is not None and self.fault.picture is not None:
@@ -379,7 +375,6 @@ class FaultFlight:
         return self.world.picture(place, attitude, self.path.agl_m, rng or self.rng)
 
     def _image(self) -> None:
-        """One image arrives."""
         t, delay_s = self._fault_t(), STATED_S
         self._number += 1
         if t is not None and self.fault.arrives and not self.fault.arrives(self._number, t):
@@ -407,12 +402,10 @@ class FaultFlight:
 
 
 def undisturbed(seconds: float) -> Fault:
-    """A flight without a fault."""
     return Fault("undisturbed", "none", seconds=seconds)
 
 
 def combined(camera: Fault, telemetry: Fault) -> Fault:
-    """Two faults at once."""
     return replace(
         camera,
         name=f"{camera.name}, {telemetry.name}",

@@ -151,7 +151,6 @@ def _computer_jumps(flight: FaultFlight) -> None:
 
 
 def _elsewhere(state: State) -> State:
-    """Telemetry of another vehicle."""
     return State(state.yaw + 120, -3.0, 10.0, -state.north, 12.0, 0.4 * state.height)
 
 

@@ -100,7 +100,6 @@ class Ground:
         camera: Camera = CAMERA,
         effects: ViewEffects = EFFECTS,
     ) -> Grey:
-        """What the camera sees."""
         pose, corner, gsd_m = (*attitude, agl_m), self._corner - place, self._gsd_m
         seen = render_view(camera, pose, self._rgb, corner, gsd_m, effects, rng)
         return np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), np.uint8)

@@ -255,7 +255,6 @@ def delay(
 
 
 def false_alarm_table(hours: float) -> Table:
-    """False alarms and learnt displacements."""
     rows: list[list[str]] = []
     for receiver in ("good", "good:std_m=5"):
         for name, errors in MAPS.items():
@@ -279,7 +278,6 @@ def false_alarm_table(hours: float) -> Table:
 
 
 def delay_table(trials: int) -> Table:
-    """Delays until faults are named."""
     rows = []
     for name, text in FAULTS.items():
         found = [delay(text, seed, MAPS["usual"]) for seed in range(trials)]

@@ -160,7 +160,7 @@ def fly(map_path: Path, folder: Path, smooth: bool) -> dict[str, Any]:
     from orthonav.core.flight import open_flight
     from orthonav.core.localize import Localizer
     from orthonav.core.track.tracker import Tracker
-    from orthonav.onboard.run import localize_flight
+    from orthonav.ground.recordings.localize import localize_flight
 
     cv2.setNumThreads(1)
     tracker = Tracker(Localizer(open_map(map_path)), use_prior=False, smooth=smooth)

@@ -19,7 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.looped_flight import read_rows, route_of, write_rows
-from benchmarks.record import Section, Table, number, percent, quantiles, resumed, run, say
+from benchmarks.record import (
+    Section,
+    Table,
+    number,
+    percent,
+    quantiles,
+    resumed,
+    rows_path,
+    run,
+    say,
+)
 from benchmarks.scenes import FAR_M, PAST, PRESENT, area, map_of
 from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight, read_truth
@@ -29,9 +39,9 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
+from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind
-from orthonav.onboard.run import localize_flight
 
 NAME = "long_flights"
 CAMERA = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)
@@ -91,7 +101,7 @@ def measure(options: argparse.Namespace) -> Section:
         for i in options.only or range(count)
     }
     outcomes = []
-    for outcome in resumed(options.work / "flights.jsonl", _followed, tasks):
+    for outcome in resumed(rows_path(options.work, "flights"), _followed, tasks):
         outcomes.append(outcome)
         say("  ".join(_row(outcome)))
     return _section(outcomes, km)

@@ -245,7 +245,6 @@ def _seen(
 
 
 def _ways(row: Row, opened: MapFile, hills: Raster) -> Iterator[tuple[str, Locate]]:
-    """Level ground and terrain."""
     frame = opened.manifest.sheets[0].frame
     rows, cols = (side // FINER for side in hills.values.shape)
     coarse = cv2.resize(hills.values, (cols, rows), interpolation=cv2.INTER_AREA)

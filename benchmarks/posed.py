@@ -56,7 +56,6 @@ class Picture:
 
     @property
     def gsd_m(self) -> float:
-        """Ground resolution."""
         return self.grid.gsd_m * self.factor
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:

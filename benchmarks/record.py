@@ -61,7 +61,6 @@ class Section:
     failed: bool = False
 
     def markdown(self) -> str:
-        """Title and tables in Markdown."""
         return "\n".join([f"## {self.title}", "", *(table.markdown() for table in self.tables)])
 
 
@@ -74,7 +73,6 @@ def number(value: float) -> str:
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """A share as text."""
     return "-" if math.isnan(share) else f"{share:.{digits}%}"
 
 
@@ -85,7 +83,6 @@ def quantiles(values: Any, *percents: float) -> list[str]:
 
 
 def say(text: str) -> None:
-    """A line on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -136,6 +133,11 @@ def side_by_side(
     # Not forked: threads of this process would be lost in a child.
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         yield from pool.map(function, tasks)
+
+
+def rows_path(work: Path, name: str) -> Path:
+    """The file of `resumed`: rows of another commit are not taken for those of this one."""
+    return work / f"{name}-{git('rev-parse', '--short=10', 'HEAD') or 'unknown'}.jsonl"
 
 
 def resumed(

@@ -14,8 +14,9 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
 from orthonav.core.track.tracker import Tracker
+from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.onboard.run import Locator, SingleViews, localize_flight
+from orthonav.onboard.run import Locator, SingleViews
 
 NAME = "tracking"
 SIDES_M = (1000, 4000, 10000)

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from benchmarks.placing import views_in
-from benchmarks.record import Section, Table, percent, resumed, run, say
+from benchmarks.record import Section, Table, percent, resumed, rows_path, run, say
 from benchmarks.scenes import (
     USUAL,
     Pair,
@@ -350,7 +350,7 @@ def measure(options: argparse.Namespace) -> Section:
         ortho(each.views, options.work)
     views = 2 if options.quick else options.views
     tasks = {each.name: (each, pairs, views, options.seed, options.work) for each in pairs}
-    stored = options.work / f"views-{views}-{options.seed}.jsonl"
+    stored = rows_path(options.work, f"views-{views}-{options.seed}")
     rows: list[dict[str, Any]] = []
     for name, found in zip(tasks, resumed(stored, views_of, tasks, options.workers), strict=True):
         rows += found

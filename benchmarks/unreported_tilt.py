@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.placing import views_in
-from benchmarks.record import Section, Table, number, quantiles, resumed, run, say
+from benchmarks.record import Section, Table, number, quantiles, resumed, rows_path, run, say
 from benchmarks.scenes import (
     FAR_M,
     Pair,
@@ -120,7 +120,6 @@ def level_telemetry(true: Telemetry, rng: np.random.Generator) -> Telemetry:
 
 
 def compared(fix: Fix, each: Flown, frame: LocalFrame) -> Placed:
-    """A fix against the truth."""
     position = frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
     off = position - each.camera_en_m
     if fix.ground_latlon_deg is None:
@@ -166,7 +165,7 @@ def measure(options: argparse.Namespace) -> Section:
         for width_px in options.width
         for tilt in options.tilt
     }
-    stored = options.work / f"rows-{views}-{options.seed}.jsonl"
+    stored = rows_path(options.work, f"rows-{views}-{options.seed}")
     rows = []
     for row in resumed(stored, measured, tasks, options.workers):
         rows.append(row)

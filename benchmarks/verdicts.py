@@ -49,7 +49,6 @@ class Verdict:
 
     @property
     def states_confidence(self) -> bool:
-        """Whether any view has one."""
         return bool(np.isfinite(self.confidence).any())
 
     def within(self, radius_m: float) -> NDArray[np.bool_]:

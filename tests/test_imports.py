@@ -26,7 +26,8 @@ import json, pathlib
 from orthonav.core.flight import open_flight
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.onboard.run import SingleViews, localize_flight
+from orthonav.ground.recordings.localize import localize_flight
+from orthonav.onboard.run import SingleViews
 from orthonav.core.flight.fixes import result_to_json
 
 map_path, flight_path = map(pathlib.Path, sys.argv[1:])

@@ -14,10 +14,9 @@ from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight import open_flight
 from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.camera import Camera
-from orthonav.core.grey import grey_levels
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Telemetry, View
+from orthonav.core.records import Telemetry, View, grey_levels
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 NADIR = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
@@ -243,14 +242,3 @@ def shape_of(west, south, east, north, shape):
     """The box, a little wider."""
     corners = [(west, south), (east, south), (east, north), (west, north), (west, south)]
     return shape({"type": "Polygon", "coordinates": [corners]}).buffer(1e-4)
-
-
-def test_without_a_command_the_help_is_shown(run):
-    done = run()
-    assert (done.code, done.err) == (0, "") and "orthonav localize area.onav" in done.out
-
-
-def test_abbreviations_are_refused_with_the_usage_of_the_command(run):
-    done = run("localize", "a.onav", "flight", "--out", "c", "--head", "unknown")
-    assert done.code == 2 and done.err.startswith("usage: orthonav localize")
-    assert "unrecognized arguments: --head" in done.err

@@ -54,16 +54,6 @@ def test_this_machine_gives_the_stored_fixes(kind):
     assert fixes.farthest_m(here, stored) <= fixes.LIMITS_M[kind]
 
 
-def test_a_fix_elsewhere_and_a_missing_one_are_differences():
-    there = {"a": [1.0, 2.0], "b": "no_evidence"}
-    assert fixes.farthest_m(there, there) == 0
-    assert fixes.farthest_m({**there, "a": [1.03, 2.04]}, there) == pytest.approx(0.05)
-    assert fixes.farthest_m({**there, "b": [1.0, 2.0]}, there) == float("inf")
-    assert fixes.farthest_m({"a": [1.0, 2.0]}, there) == float("inf")
-    assert fixes.digest({**there, "a": [1.001, 2.0]}) == fixes.digest(there)
-    assert fixes.digest({**there, "a": [1.01, 2.0]}) != fixes.digest(there)
-
-
 @pytest.mark.long
 def test_odd_folders_and_a_poor_environment(odd_folder):
     """Placed and reported, with nothing on stderr."""

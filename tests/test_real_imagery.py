@@ -18,8 +18,9 @@ from orthonav.ground.build.terrain import terrain_of_dem
 from orthonav.ground.evaluate.metrics import compare
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
+from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.onboard.run import SingleViews, localize_flight
+from orthonav.onboard.run import SingleViews
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 DATA = Path(os.environ.get("ORTHONAV_DATA", BESIDE))

@@ -107,7 +107,6 @@ class Filter:
         self._waiting.append((self._now, fuse))
 
     def output(self) -> Motion:
-        """The estimate of now."""
         motion = self.motion
         for measured in self._imu:
             motion = integrated(motion, self._unbiased(measured))

@@ -76,7 +76,6 @@ class Scenario:
     lasts_s: float = 0.0
 
     def faulty(self, time_s: float) -> bool:
-        """Whether the pictures are disturbed."""
         return self.fault_s <= time_s < self.fault_s + self.lasts_s
 
 
@@ -110,7 +109,6 @@ class Located:
 
     @property
     def sent(self) -> bool:
-        """Whether a message was sent."""
         return math.isfinite(self.sent_std_m)
 
 
@@ -160,7 +158,6 @@ class Sight:
 
     @property
     def frame(self) -> LocalFrame:
-        """The plane of the map."""
         return self._demo.frame
 
     def look(

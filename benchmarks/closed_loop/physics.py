@@ -289,7 +289,6 @@ class Instruments:
         self._place = np.zeros(2)
 
     def imu(self, felt: Increments) -> Increments:
-        """Increments as measured."""
         grade, kept = self.grade, math.exp(-STEP_S / self.grade.bias_s)
         fresh = math.sqrt(1 - kept**2)
         self.gyro_bias = kept * self.gyro_bias + fresh * grade.gyro_bias * self._rng.normal(size=3)
@@ -305,14 +304,12 @@ class Instruments:
         return float(-motion.position[2] + self._baro + self.grade.baro_m * self._rng.normal())
 
     def heading_rad(self, motion: Motion) -> float:
-        """Heading by the compass."""
         yaw, _, _ = euler_rad(motion.rotation)
         constant, sine, cosine = self._heading.tolist()
         off = constant + sine * math.sin(yaw) + cosine * math.cos(yaw)
         return float(yaw + off + self.grade.heading_noise * self._rng.normal())
 
     def airspeed_mps(self, motion: Motion, wind: Wind) -> float:
-        """True airspeed."""
         speed = float(np.linalg.norm(motion.velocity - wind.now_ned))
         return float(self._scale * speed + self.grade.airspeed_mps * self._rng.normal())
 

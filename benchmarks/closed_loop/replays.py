@@ -107,7 +107,6 @@ class Exposure:
 
     @property
     def time_ns(self) -> int:
-        """Time of the exposure, ns."""
         return round(self.time_s * 1e9)
 
 

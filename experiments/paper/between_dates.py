@@ -29,7 +29,7 @@ from experiments.paper.methods import BETWEEN_DATES
 from orthonav.core.extras import needed
 from orthonav.core.files import replacing, write_text
 from orthonav.core.tiles.represent import Canny
-from orthonav.research.means import Means, mixed_precision
+from orthonav.research.training import Means, mixed_precision
 
 AREAS = ((101, 1.0), (102, 1.0), (103, 1.5), (104, 2.0), (105, 3.0), (106, 5.0))
 """Seed and ground resolution of the landscapes; those of the experiments have other seeds."""

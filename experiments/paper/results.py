@@ -54,7 +54,6 @@ class Result:
 
     @property
     def stride_m(self) -> float:
-        """Distance between neighbouring tiles."""
         flown = self.plain["trajectory"]
         return float(max(1, round(256 * (1 - flown["overlap"]))) * flown["gsd_m"])
 
@@ -81,7 +80,6 @@ def read(folder: Path) -> list[Result]:
 
 
 def stored() -> list[Result]:
-    """All rows in the repository."""
     return [row for name in SETTINGS for row in read(ROWS / name)]
 
 
@@ -198,7 +196,6 @@ class Row(NamedTuple):
 
 
 def row_of(each: Result) -> Row:
-    """The row of a result."""
     order = (list(FAMILIES).index(each.family), each.registration, list(EDGES).index(each.edges))
     return Row(order, each.family, each.edges, each.registration)
 

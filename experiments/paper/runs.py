@@ -65,7 +65,6 @@ class Workplace:
 
     @property
     def results(self) -> Path:
-        """Folder of the result files."""
         return self.out / self.setting.folder
 
     def result(self, scene: Scene, key: str) -> Path:

@@ -376,7 +376,6 @@ class Placed:
 
     @classmethod
     def of(cls, rows: Sequence[Result], name: str) -> "Placed":
-        """All views of these scenes."""
         parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
         shapes = [each.plain["trajectory"] for each in rows if name in each.plain[FIELD]]
         views = [row for part in parts for row in part["views"]]
@@ -398,7 +397,6 @@ class Placed:
         return self.error_m <= self.far_m
 
     def within(self, radius_m: float = ACCURACY_M) -> float:
-        """Share of all views."""
         return float((self.error_m <= radius_m).mean())
 
     def trusted(self) -> float:

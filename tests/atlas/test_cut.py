@@ -21,7 +21,7 @@ from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.embed import embedder_of
-from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
 from orthonav.ground.atlas.cut import (

@@ -57,19 +57,6 @@ def test_cells_cover_the_extent_and_no_more(west, north, across, down, side_m):
     ).all()
 
 
-def test_covered_share_of_every_cell():
-    valid = np.random.default_rng(1).random((60, 80)) < 0.5
-    valid[:, 40:] = False
-    valid[30:, :20] = True
-    coverage = covering(0.0, 120.0, 2.0, valid)
-    grid = CellGrid.over((0.0, 0.0, 160.0, 120.0), 20.0)
-    expected = valid.reshape(6, 10, 8, 10).mean(axis=(1, 3))
-    np.testing.assert_allclose(coverage.cell_share(grid), expected, atol=0.12)
-    assert (coverage.cell_share(grid)[3:, :2] == 1).all()
-    beyond = CellGrid.over((-200.0, 0.0, -40.0, 120.0), 20.0)
-    assert (coverage.cell_share(beyond) == 0).all()
-
-
 @pytest.mark.parametrize(
     "points, bands, expected_m2",
     [

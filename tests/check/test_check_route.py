@@ -48,18 +48,6 @@ def test_drift_is_that_of_many_flights(views):
     np.testing.assert_allclose(found, truth, rtol=1e-6, atol=1e-6)
 
 
-def test_without_fixes_drift_grows_with_the_way():
-    distance = np.arange(0, 2001, 25.0)
-    found = expected_drift(distance, np.zeros(81), np.full(81, np.nan), 0.03, SIDE_M)
-    np.testing.assert_allclose(found, 0.03 * distance, atol=1e-6)
-
-
-def test_sure_fixes_leave_their_own_error():
-    distance = np.arange(0, 2001, 25.0)
-    found = expected_drift(distance, np.ones(81), np.full(81, 4.0), 0.03, SIDE_M)
-    np.testing.assert_allclose(found, 4.0)
-
-
 def predicted(probability, error_m):
     """A prediction of these values, with an interval of no width."""
     nothing = np.zeros_like(probability)
@@ -68,18 +56,6 @@ def predicted(probability, error_m):
 
 def even(points):
     return predicted(np.full(len(points), 0.8), np.full(len(points), 3.0))
-
-
-def test_along_a_route():
-    along = predicted_along(
-        area_of([[0, 0], [1000, 0], [1000, 500]]), [200.0] * 2, SIDE_M, CONDITIONS, even
-    )
-    assert along.distance_m[0] == 0 and np.diff(along.distance_m) == pytest.approx(SIDE_M / 4)
-    assert along.distance_m[-1] == pytest.approx(1500, abs=SIDE_M / 4)
-    np.testing.assert_allclose(along.points_en_m[0], [0, 0], atol=0.01)
-    at_corner = np.hypot(*(along.points_en_m - [1000, 0]).T).argmin()
-    assert along.distance_m[at_corner] == pytest.approx(1000, abs=SIDE_M / 4)
-    assert (along.across_low == 0.8).all() and (along.drift_m < 4.2).all()
 
 
 def test_the_worst_over_the_width_of_every_leg():

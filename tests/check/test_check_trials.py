@@ -17,9 +17,8 @@ from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid
 from orthonav.ground.check import trials
-from orthonav.ground.check.ageing import MARGIN_PX
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.check.trials import OrthoPyramid, TrialPlan, run_many
+from orthonav.ground.check.trials import TrialPlan, run_many
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 WEST = np.array([[-250.0, 60.0], [-180.0, -90.0], [-300.0, 120.0], [-220.0, 0.0], [-330.0, -60.0]])
@@ -30,11 +29,7 @@ EAST = np.array([[200.0, 60.0], [250.0, -90.0], [300.0, 120.0]])
 def plan(half_blank):
     """Views of 154 x 115 m, searched in a part of the map."""
     request = CheckRequest(
-        half_blank.map,
-        camera=CAMERA,
-        prior_std_m=40.0,
-        relief_m=0.0,
-        other_date=half_blank.present,
+        half_blank.map, camera=CAMERA, prior_std_m=40.0, relief_m=0.0, other_date=half_blank.present
     )
     return TrialPlan(request, 120.0)
 
@@ -102,15 +97,6 @@ def test_places_off_the_map_are_left_out(plan):
     assert [math.dist(trial.en_m, places[0]) < 1 for trial in found] == [True]
 
 
-def test_a_prior_far_from_the_map(plan):
-    """A prior that is off by far more than the map is wide is no error."""
-    wild = of_request(plan, prior_std_m=1e6)
-    (trial,) = run_trials(wild, WEST[:1])
-    assert 0 <= trial.confidence <= 1
-    none = of_request(plan, prior_std_m=0.0)
-    assert len(run_trials(none, WEST[:1])) == 1
-
-
 @pytest.mark.long
 def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
     """And of another date: what is beside a trial changes nothing."""
@@ -154,51 +140,3 @@ def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
     build_map(BuildRequest([half_blank.past], path, tile_px=128, overlap=0.5, registration=False))
     with pytest.raises(MapFileError, match="registration layer"):
         run_trials(TrialPlan(CheckRequest(path, camera=CAMERA), 120.0), WEST[:1])
-
-
-def test_pictures_know_where_their_middle_is(plan, registration):
-    layer = registration.pyramid
-    grid = registration.grid
-    for level in (0, 1):
-        grey, valid, middle = trials.crop_around(layer, grid, WEST[0], 60, level)
-        unit_m = grid.gsd_m * 2**level
-        assert grey.shape == valid.shape == (60 + 2 * MARGIN_PX,) * 2 and valid.all()
-        assert np.abs(middle - WEST[0]).max() <= unit_m / 2 + 1e-9
-        col = round((middle[0] - grid.west_m) / unit_m - 30)
-        row = round((grid.north_m - middle[1]) / unit_m - 30)
-        inner = grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
-        np.testing.assert_array_equal(inner, layer.read(level, row, col, 60, 60)[0])
-    assert trials.crop_around(layer, grid, np.array([1e6, 0.0]), 60, 0) is None
-
-
-def test_donors_are_mirrored_ground(registration):
-    layer = registration.pyramid
-    rng = np.random.default_rng(1)
-    found = trials.mirrored_donor(rng, layer, 200, 0)
-    rng = np.random.default_rng(1)
-    rows, cols = layer.shape(0)
-    row, col = int(rng.integers(0, rows - 200)), int(rng.integers(0, cols - 200))
-    grey, valid = layer.read(0, row, col, 200, 200)
-    assert not valid.all() or (found[:, ::-1] == grey).all()
-    whole = trials.mirrored_donor(rng, layer, 3000, 0)  # larger than the map
-    assert whole.shape == (3000, 3000) and whole[-1, -1] == 128
-
-
-def test_another_date_lies_on_the_map(half_blank, registration):
-    """The map's own orthophoto, read as another date, is the picture of the map."""
-    layer = registration.pyramid
-    pyramid = OrthoPyramid(half_blank.past, registration.sheet, layer.levels)
-    try:
-        for level in (0, 1, 2):
-            assert pyramid.shape(level) == layer.shape(level)
-            part = (level, 200 >> level, 160 >> level, 200 >> level, 160 >> level)
-            (one, valid), (other, _) = pyramid.read(*part), layer.read(*part)
-            assert valid.all()
-            same = np.corrcoef(one.ravel(), other.ravel())[0, 1]
-            for shift in (1, -1):
-                moved = np.roll(one, shift, axis=1)
-                assert same > 0.97 > np.corrcoef(moved.ravel(), other.ravel())[0, 1]
-        grey, valid = pyramid.read(0, -500, -500, 100, 100)
-        assert not valid.any() and not grey.any()
-    finally:
-        pyramid.close()

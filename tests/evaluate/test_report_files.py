@@ -2,17 +2,14 @@
 
 import itertools
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from orthonav.core.errors import OutputError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.metrics import compare, measure
-from orthonav.ground.evaluate.plots import fix_classes, map_picture
 from orthonav.ground.evaluate.report import write_report
 from orthonav.ground.evaluate.tables import FlightReport
 from orthonav.ground.report.page import LIST
@@ -96,15 +93,6 @@ def test_a_rerun_leaves_no_stale_figures_and_all_other_files(tmp_path: Path, no_
     ]
 
 
-def test_a_page_stays_as_it_is_where_figures_cannot_be_written(tmp_path: Path, no_plots) -> None:
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "map.png").write_bytes(b"mine")
-    (tmp_path / "index.html").write_text("before")
-    with pytest.raises(OutputError, match="not empty"):
-        write_report(tmp_path, [flown("one")])
-    assert (tmp_path / "index.html").read_text() == "before"
-
-
 def test_headings_are_in_order_and_tables_have_names(tmp_path: Path, no_plots) -> None:
     page = write_report(tmp_path, [flown("one"), flown("two")]).read_text("utf-8")
     levels = [int(level) for level in re.findall(r"<h(\d)", page)]
@@ -114,19 +102,3 @@ def test_headings_are_in_order_and_tables_have_names(tmp_path: Path, no_plots) -
         'aria-label="table"' not in page and page.count("<table>") == page.count("aria-label") - 1
     )
     assert "<header" in page and "Evaluation of 2 flights" in page
-
-
-def test_the_legend_names_only_visible_marks(coarse) -> None:
-    confident = flown("one").comparison
-    doubtful = replace(confident, confident=np.zeros(12, dtype=bool))
-    wrong = replace(confident, errors_m=confident.errors_m + 50.0)
-    for comparison, radius_m, there in (
-        (confident, 15.0, "confident"),
-        (confident, 0.5, "confident, off by more than 0.5 m"),
-        (wrong, 0.5, "false fix"),
-        (doubtful, 15.0, "low confidence"),
-        (doubtful, 0.5, "low confidence, off by more than 0.5 m"),
-    ):
-        svg = map_picture(comparison, radius_m).svg
-        names = [label for label, *_ in fix_classes(comparison, radius_m)]
-        assert [name for name in names if f">{name}<" in svg] == [there]

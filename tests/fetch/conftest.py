@@ -11,7 +11,6 @@ import servers
 import terrain
 from servers import QUICK
 
-from orthonav.ground.fetch.mosaic import Packing
 from orthonav.ground.fetch.options import ImageryOptions
 from orthonav.ground.fetch.presets import parse_source
 from orthonav.ground.fetch.run import FetchRequest, fetch
@@ -93,7 +92,7 @@ def take(tmp_path):
             area=rest.pop("area", None) or Area.from_bounds(terrain.bounds(half_m)),
             out=tmp_path / out,
             margin_m=rest.pop("margin_m", 0.0),
-            packing=rest.pop("packing", Packing("deflate")),
+            compress=rest.pop("compress", "deflate"),
             limits=limits,
             **rest,
         )

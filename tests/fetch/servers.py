@@ -40,7 +40,6 @@ class Answer:
     cut: int | None = None
     reset: bool = False
     slow_s: float = 0.0
-    drip_s: float = 0.0
 
 
 class Silent(ThreadingHTTPServer):
@@ -106,13 +105,7 @@ class Served:
             request.send_header("Content-Length", str(len(answer.body)))
         request.end_headers()
         body = answer.body if answer.cut is None else answer.body[: answer.cut]
-        if answer.drip_s:
-            for byte in body:
-                request.wfile.write(bytes([byte]))
-                request.wfile.flush()
-                time.sleep(answer.drip_s)
-        else:
-            request.wfile.write(body)
+        request.wfile.write(body)
         if answer.cut is not None:
             request.close_connection = True
 

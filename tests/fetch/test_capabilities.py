@@ -95,14 +95,6 @@ def test_ign_limits_of_zooms_and_styles(tmp_path):
     assert requested(tmp_path, "ign_wmts", options)[0].query["STYLE"] == "normal"
 
 
-def test_an_unknown_year_lists_the_available_ones(tmp_path):
-    words = "no layer ORTHOIMAGERY.ORTHOPHOTOS2020; available: .*ORTHOPHOTOS2021"
-    with pytest.raises(FetchError, match=words):
-        requested(tmp_path, "ign_wmts", of_preset("ign", "2020"))
-    with pytest.raises(FetchError, match=r"ign has no '1999'; available: .*1950-1965.*2021"):
-        presets()["ign"].layer("1999")
-
-
 def test_pdok_by_templates_in_both_grids(tmp_path):
     asked, _ = requested(tmp_path, "pdok_wmts", of_preset("pdok", "2022"))
     row, col = web_tile("pdok", 18)

@@ -143,19 +143,3 @@ sys.exit(main(["fetch", "--list"]))
 def test_services_are_listed_without_the_extra():
     found = subprocess.run([sys.executable, "-c", CORE], capture_output=True, text=True)
     assert found.returncode == 0 and "ign: IGN" in found.stdout, found.stderr
-
-
-HELP = """
-import sys
-from orthonav.cli import main
-try:
-    main(["fetch", "--help"])
-except SystemExit:
-    pass
-heavy = {"numpy", "rasterio", "requests", "pyproj"} & set(sys.modules)
-assert not heavy, heavy
-"""
-
-
-def test_help_loads_nothing_heavy():
-    subprocess.run([sys.executable, "-c", HELP], check=True, stdout=subprocess.DEVNULL)

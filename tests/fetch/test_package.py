@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from contextlib import contextmanager
 from xml.sax.saxutils import escape
 
 import pytest
@@ -67,77 +68,53 @@ def service(url, *, parts=None, changed=None):
     return answer
 
 
-@pytest.fixture
-def serving():
-    """Function that serves packages and gives the server."""
-
-    def made(**rest):
-        url = []
-        manager = servers.serving(service(url, **rest))
-        server = manager.__enter__()
+@contextmanager
+def served(**rest):
+    """A server of packages."""
+    url = []
+    with servers.serving(service(url, **rest)) as server:
         url.append(server.url)
-        managers.append(manager)
-        return server
-
-    managers = []
-    yield made
-    for manager in managers:
-        manager.__exit__(None, None, None)
+        yield server
 
 
-@pytest.mark.parametrize(
-    "text, expected",
-    [
-        ("D003:2013", ("D003", "2013", "RVB")),
-        ("3:2013", None),
-        ("03:2013:irc", ("D003", "2013", "IRC")),
-        ("2A:2021", ("D02A", "2021", "RVB")),
-        ("D02A:2021", ("D02A", "2021", "RVB")),
-        ("971:2022", ("D971", "2022", "RVB")),
-        ("D003", None),
-        ("D003:13", None),
-        ("../etc:2013", None),
-    ],
-)
-def test_package_names_are_parsed(text, expected):
-    if expected is None:
-        with pytest.raises(FetchError, match="such as D003:2013"):
-            parse_package(text)
-    else:
-        assert parse_package(text) == expected
+NAMED = {"D003:2013": ("D003", "2013", "RVB"), "03:2013:irc": ("D003", "2013", "IRC")}
+NAMED |= {"2A:2021": ("D02A", "2021", "RVB"), "971:2022": ("D971", "2022", "RVB")}
 
 
-def test_the_finest_package_of_a_year(serving):
-    server = serving()
-    with Web(LIMITS) as web:
+@pytest.mark.parametrize("text", [*NAMED, "3:2013", "D003", "D003:13", "../etc:2013"])
+def test_package_names_are_parsed(text):
+    if text in NAMED:
+        assert parse_package(text) == NAMED[text]
+        return
+    with pytest.raises(FetchError, match="such as D003:2013"):
+        parse_package(text)
+
+
+def test_the_finest_package_of_a_year():
+    with served() as server, Web(LIMITS) as web:
         assert find_package(web, "D003", "2022", service=server.url).name == NAMES[2][0]
         assert find_package(web, "D003", "2013", "IRC", server.url).name == NAMES[1][0]
-        with pytest.raises(
-            FetchError, match="no RVB package of D003 of 2019; available: 2013, 2022"
-        ):
+        words = "no RVB package of D003 of 2019; available: 2013, 2022"
+        with pytest.raises(FetchError, match=words):
             find_package(web, "D003", "2019", service=server.url)
     assert {asked.query["ZONE"] for asked in server.log} == {"D003"}
     assert all(int(asked.query["LIMIT"]) <= 50 for asked in server.log)
 
 
-def fetched(server, folder, **rest):
+def fetched(server, folder):
     with Web(LIMITS) as web:
-        found = find_package(web, "D003", "2013", service=server.url)
-        files = package_files(web, found)
-        assert [file.name for file in files] == list(PARTS)
-        return download_package(web, files, folder, lambda stage, share: None, **rest)
+        files = package_files(web, find_package(web, "D003", "2013", service=server.url))
+        return download_package(web, files, folder, lambda stage, share: None)
 
 
-def test_files_are_downloaded_once(serving, tmp_path):
-    server = serving()
+def test_files_are_downloaded_once(tmp_path):
     (tmp_path / "x.7z.002.part").write_bytes(PARTS["x.7z.002"][:4321])
-    paths = fetched(server, tmp_path)
-    assert {path.name: path.read_bytes() for path in paths} == PARTS
-    assert not list(tmp_path.glob("*.part"))
-    before = len([asked for asked in server.log if asked.path.startswith("/dl/")])
-    assert before == len(PARTS)
-    fetched(server, tmp_path)
-    assert len([asked for asked in server.log if asked.path.startswith("/dl/")]) == before
+    with served() as server:
+        for _ in range(2):
+            paths = fetched(server, tmp_path)
+            assert {path.name: path.read_bytes() for path in paths} == PARTS
+            asked = [asked for asked in server.log if asked.path.startswith("/dl/")]
+            assert len(asked) == len(PARTS) and not list(tmp_path.glob("*.part"))
 
 
 @pytest.mark.parametrize(
@@ -148,16 +125,21 @@ def test_files_are_downloaded_once(serving, tmp_path):
         (bytes(5001), "over 5000"),
     ],
 )
-def test_a_wrong_size_or_sum_is_rejected(serving, tmp_path, changed, words):
-    with pytest.raises(FetchError, match=words):
-        fetched(serving(changed=PARTS | {"x.7z.002": changed}), tmp_path)
+def test_a_wrong_size_or_sum_is_rejected(tmp_path, changed, words):
+    with (
+        served(changed=PARTS | {"x.7z.002": changed}) as server,
+        pytest.raises(FetchError, match=words),
+    ):
+        fetched(server, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["x.7z.001"]
 
 
-def test_names_that_leave_the_folder_are_rejected(serving):
-    server = serving(parts={"..%2F..%2Fevil.7z": b"x"})
-    with Web(LIMITS) as web, pytest.raises(FetchError, match="unsafe file"):
-        package_files(web, find_package(web, "D003", "2013", service=server.url))
+def test_names_that_leave_the_folder_are_rejected(tmp_path):
+    with (
+        served(parts={"..%2F..%2Fevil.7z": b"x"}) as server,
+        pytest.raises(FetchError, match="unsafe file"),
+    ):
+        fetched(server, tmp_path)
 
 
 def test_a_small_disk_is_reported_before_the_download(tmp_path):

@@ -13,7 +13,6 @@ from rasterio.transform import Affine
 
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.fetch.mosaic import Packing
 from orthonav.ground.fetch.options import ImageryOptions
 from orthonav.ground.fetch.presets import find_preset, parse_source
 from orthonav.ground.fetch.run import FetchRequest, fetch
@@ -41,6 +40,10 @@ def test_a_window_of_a_file_as_it_is(take, placed, cog_bytes):
     with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
         result, path = take(f"cog:{server.url}/a.tif", gsd_m=None, terms={"date": "2021-07-04"})
         assert all("bytes=" in asked.headers["Range"] for asked in server.log[1:])
+        before, outside = len(server.log), Area.from_bounds((3.5, 46.5, 3.501, 46.501))
+        with pytest.raises(FetchError, match="no imagery of this area"):
+            take(f"cog:{server.url}/a.tif", gsd_m=None, area=outside)
+        assert len(server.log) - before <= 2  # its head
     assert placed(path) > 0.4  # the file is smaller than the cell
     assert result.estimate.gsd_m == pytest.approx(1, rel=0.01)
     assert terrain.tags(path)["TIFFTAG_DATETIME"] == "2021:07:04 00:00:00"
@@ -89,21 +92,11 @@ def test_bands_are_chosen(take, tmp_path, bands, wanted, count):
         tmp_path / "b.tif", UTM, size=300, bands=bands, driver="COG"
     ).read_bytes()
     with servers.serving(servers.files({"/a.tif": body})) as server:
-        packing = Packing("jpeg")
-        _, path = take(f"cog:{server.url}/a.tif", gsd_m=None, bands=wanted, packing=packing)
+        _, path = take(f"cog:{server.url}/a.tif", gsd_m=None, bands=wanted, compress="jpeg")
         with pytest.raises(FetchError, match="different kinds"):
             take(f"cog:{server.url}/a.tif", gsd_m=None, bands=(9,))
     with rasterio.open(path) as data:
         assert data.count == count and data.compression.name.lower() == "jpeg"
-
-
-def test_an_area_outside_the_file(take, cog_bytes):
-    area = Area.from_bounds((3.5, 46.5, 3.501, 46.501))
-    words = "no imagery of this area"
-    with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
-        with pytest.raises(FetchError, match=words):
-            take(f"cog:{server.url}/a.tif", gsd_m=None, area=area)
-        assert len(server.log) <= 2  # its head
 
 
 FILE_FAULTS = {
@@ -250,26 +243,19 @@ def test_signed_files(catalogue, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options, words",
+    "body, options, words",
     [
-        ({"time": "1999"}, "no imagery of the area at 1999"),
-        ({"asset": "visual"}, "no asset visual; available: data"),
+        (None, {"time": "1999"}, "no imagery of the area at 1999"),
+        (None, {"asset": "visual"}, "no asset visual; available: data"),
+        (b"<html>", {}, "not JSON"),
+        (b"[1]", {}, "not a JSON object"),
+        (b"{}", {}, "no imagery of the area"),
     ],
 )
-def test_missing_catalogue_items_are_an_error(take, catalogue, options, words):
-    answer = servers.files(static(catalogue))
+def test_missing_items_and_invalid_catalogues_are_errors(take, catalogue, body, options, words):
+    answer = servers.files(static(catalogue) if body is None else {"/cat.json": body})
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
         take(f"stac:{server.url}/cat.json", gsd_m=None, **options)
-
-
-@pytest.mark.parametrize(
-    "body, words",
-    [(b"<html>", "not JSON"), (b"[1]", "not a JSON object"), (b"{}", "no imagery of the area")],
-)
-def test_invalid_catalogues_are_rejected(take, body, words):
-    answer = servers.files({"/c.json": body})
-    with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
-        take(f"stac:{server.url}/c.json", gsd_m=None)
 
 
 def heights(lat_deg, lon_deg):

@@ -12,7 +12,7 @@ from orthonav.core.errors import FetchError
 from orthonav.ground.fetch.urls import Secret
 from orthonav.ground.fetch.web import MAX_DOCUMENT_BYTES, Web
 
-SECRET = "s3cr3t-v4lue"
+SECRET = "s3cr3t/v4lue&#?"
 
 
 def get(answer, limits=QUICK):
@@ -37,7 +37,7 @@ def test_temporary_failures_are_repeated(first):
     assert log[0].headers["User-Agent"].startswith("orthonav/")
 
 
-@pytest.mark.parametrize("status, attempts", [(503, QUICK.attempts), (404, 1), (401, 1)])
+@pytest.mark.parametrize("status, attempts", [(503, QUICK.attempts), (404, 1)])
 def test_attempts_are_limited(status, attempts):
     asked = []
     with pytest.raises(FetchError, match=rf"HTTP {status} \(no such luck\): .*127.0.0.1"):
@@ -45,10 +45,12 @@ def test_attempts_are_limited(status, attempts):
     assert len(asked) == attempts
 
 
-def test_a_body_over_the_limit_is_an_error(monkeypatch):
+def test_large_bodies_and_redirects_to_files_are_errors():
     bomb = gzip.compress(b"\0" * (MAX_DOCUMENT_BYTES + 1))
     with pytest.raises(FetchError, match="body is over"):
         get(lambda _: servers.Answer(bomb, headers={"Content-Encoding": "gzip"}))
+    with pytest.raises(FetchError):
+        get(lambda _: servers.Answer(status=302, headers={"Location": "file:///etc/passwd"}))
 
 
 def test_failed_connections_are_named():
@@ -72,16 +74,16 @@ def test_a_proxy_of_the_environment_is_used(monkeypatch):
             assert web.get("http://service.example/one") == b"http://service.example/one"
 
 
-def keyed(server, value=SECRET):
-    return Web(QUICK, (Secret("{key}", server.url, value),))
+def keyed(server):
+    return Web(QUICK, (Secret("{key}", server.url, SECRET),))
 
 
 def test_a_key_is_sent_to_its_origin_and_never_shown(caplog):
     caplog.set_level(logging.DEBUG)
     with servers.serving(lambda a: servers.Answer(SECRET.encode(), 503)) as server:
         with keyed(server) as web, pytest.raises(FetchError) as raised:
-            web.get(f"{server.url}/one?token={{key}}")
-        assert server.log[0].query["TOKEN"] == SECRET
+            web.get(f"{server.url}/one?token={{key}}&x=1")
+        assert server.log[0].query == {"TOKEN": SECRET, "X": "1"}
         with keyed(server) as web, pytest.raises(FetchError, match="key is for another host"):
             web.get("http://127.0.0.1:1/one?token={key}")
     chain = raised.value
@@ -89,25 +91,6 @@ def test_a_key_is_sent_to_its_origin_and_never_shown(caplog):
         assert SECRET not in repr(chain)
         chain = None if chain.__suppress_context__ else chain.__context__
     assert SECRET not in caplog.text and SECRET not in repr(web.secrets)
-
-
-def test_a_key_is_escaped():
-    with servers.serving(lambda a: servers.Answer(b"")) as server:
-        with keyed(server, "a&b=c d/#?") as web:
-            web.get(f"{server.url}/one?token={{key}}&x=1")
-        assert server.log[0].query == {"TOKEN": "a&b=c d/#?", "X": "1"}
-
-
-@pytest.mark.parametrize("url", ["file:///etc/passwd", "ftp://host/a", "/etc/passwd", "http://"])
-def test_other_schemes_are_rejected(url):
-    with Web(QUICK) as web, pytest.raises(FetchError, match="only http"):
-        web.get(url)
-
-
-def test_a_redirect_to_a_file_is_an_error():
-    answer = servers.Answer(status=302, headers={"Location": "file:///etc/passwd"})
-    with pytest.raises(FetchError):
-        get(lambda _: answer)
 
 
 BOMB = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "bbbbbbbbbb"><!ENTITY c "&b;&b;&b;">]>

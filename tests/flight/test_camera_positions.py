@@ -12,7 +12,7 @@ import pytest
 
 from orthonav.core.errors import VariantError
 from orthonav.core.records import Fix, NoFix, ViewResult
-from orthonav.ground.recordings.export import CSV_COLUMNS, camera_positions, export, export_of
+from orthonav.ground.recordings.export import CSV_COLUMNS, camera_positions, export_all, export_of
 
 
 def result(frame, lat_deg, lon_deg, confidence=0.97, heading_deg=271.5):
@@ -33,10 +33,9 @@ RESULTS = [
 ]
 
 
-def written(tmp_path, name, terrain):
-    path = tmp_path / "out"
-    export(path, name, camera_positions(RESULTS, terrain))
-    return path.read_text(encoding="utf-8")
+def written(tmp_path, name, terrain, results=RESULTS):
+    export_all([export_of(f"{name}={tmp_path / 'out'}")], results, terrain)
+    return (tmp_path / "out").read_text(encoding="utf-8")
 
 
 def test_only_confident_positions_are_taken_with_heights_above_sea():
@@ -46,6 +45,9 @@ def test_only_confident_positions_are_taken_with_heights_above_sea():
     assert math.isnan(camera_positions(RESULTS, None)[0].height_m)
     tracked = replace(RESULTS[0], state="tracking")
     assert camera_positions([tracked], None)[0].std_m == 4.0
+    for text in ("csv", "csv=", "shp=a", ""):
+        with pytest.raises(VariantError, match="odm-geo"):
+            export_of(text)
 
 
 @pytest.mark.parametrize(("terrain", "height"), [(hill, "425.000"), (None, "")])
@@ -81,12 +83,6 @@ def test_exiftool_gets_references_of_both_hemispheres(tmp_path):
     assert other["GPSAltitudeRef"] == "Below Sea Level" and other["GPSImgDirection"] == ""
 
 
-@pytest.mark.parametrize("text", ["csv", "csv=", "shp=a", "=a", ""])
-def test_an_unknown_export_is_refused(text):
-    with pytest.raises(VariantError, match="odm-geo"):
-        export_of(text)
-
-
 def test_a_trajectory_for_evo(tmp_path):
     """Columns of TUM: seconds, position, and a quaternion that turns camera axes to east, north,
     up."""
@@ -116,7 +112,6 @@ def test_kml_and_gpx_are_xml(tmp_path, terrain):
     assert gpx.find(".//g:time", space) is None
     assert (gpx.find(".//g:ele", space) is not None) == (terrain is not None)
     dated = replace(RESULTS[0], frame="a & b.jpg", time_ns=1_700_000_000_250_000_000)
-    export(tmp_path / "a.gpx", "gpx", camera_positions([dated], terrain))
-    gpx = ElementTree.parse(tmp_path / "a.gpx")
+    gpx = ElementTree.fromstring(written(tmp_path, "gpx", terrain, [dated]))
     assert gpx.find(".//g:time", space).text == "2023-11-14T22:13:20.250Z"
     assert gpx.find(".//g:name", space).text == "a & b.jpg"

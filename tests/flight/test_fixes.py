@@ -154,54 +154,29 @@ def test_extra_keys_and_positions_without_a_fix_are_passed_over(tmp_path: Path) 
     lost = {**NO_FIX_LINE, "lat_deg": 48.0, "lon_deg": "?", "state": "lost"}
     path.write_text(f"{json.dumps(tracked)}\r\n\n{json.dumps(lost)}")
     fix, no_fix = (result.outcome for result in read_results(path))
-    assert isinstance(fix, Fix) and fix.lat_deg == 48.1
-    assert fix.cov_en_m2.tolist() == [[4, 1], [1, 9]] and not fix.cov_en_m2.flags.writeable
-    assert isinstance(no_fix, NoFix) and no_fix.reason == "blank" and no_fix.detail == ""
+    assert fix.lat_deg == 48.1 and fix.cov_en_m2.tolist() == [[4, 1], [1, 9]]
+    assert no_fix.reason == "blank" and no_fix.detail == ""
 
 
 @pytest.mark.parametrize(
-    "key", [key for key in KEYS if key not in ("confident", "reason", "detail")]
-)
-def test_a_missing_key_of_a_fix_is_named(key: str) -> None:
-    line = {name: value for name, value in FIX_LINE.items() if name != key}
-    with pytest.raises(FlightError, match=f"key {key} is missing"):
-        result_from_json(json.dumps(line))
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value"),
     [
-        ("frame", 7, "frame: expected text, got a number"),
-        ("time_s", None, "time_s"),
-        ("time_s", "12", "time_s: expected a number or null, got text"),
-        ("time_s", 1e12, "time_s"),
-        ("status", "maybe", "status: expected 'fix' or 'no_fix'"),
-        ("lat_deg", None, "lat_deg"),
-        ("lat_deg", 90.5, "lat_deg"),
-        ("lat_deg", True, "lat_deg: expected a number or null, got true or false"),
-        ("lon_deg", -181, "lon_deg"),
-        ("cov_en_m2", [1, 2, 3, 4], "cov_en_m2"),
-        ("cov_en_m2", [[1, 2], [3]], "cov_en_m2"),
-        ("cov_en_m2", [[1, 2], [3, "4"]], "cov_en_m2"),
-        ("ground_lat_deg", 91, "ground_lat_deg"),
-        ("ground_lat_deg", 48.0, "key ground_lon_deg is missing"),
-        ("ground_cov_en_m2", [[1, 2]], "ground_cov_en_m2: expected two rows of two numbers"),
-        ("pitch_deg", "2", "pitch_deg: expected a number or null, got text"),
-        ("pose_cov", [1.0] * 20, "pose_cov: expected null or 21 numbers"),
-        ("pose_cov", 1.0, "pose_cov: expected null or 21 numbers"),
-        ("pose_cov", [1.0] * 20 + [None], "pose_cov: expected 21 numbers, got null"),
-        ("pose_cov", [1.0] * 20 + ["1"], "pose_cov: expected a number or null, got text"),
-        ("confidence", 1.01, "confidence: expected 0 to 1"),
-        ("radius_m", [], "radius_m: expected a number or null, got a list"),
-        ("evidence", None, "evidence: expected an object, got null"),
-        ("evidence", {"a": "b"}, "evidence 'a'"),
-        ("latency_ms", 10**400, "latency_ms"),
+        *((key, None) for key in ("time_s", "lat_deg", "evidence")),
+        *(("frame", 7), ("time_s", "12"), ("time_s", 1e12), ("status", "maybe"), ("state", "")),
+        *(("lat_deg", 90.5), ("lat_deg", True), ("lon_deg", -181), ("confidence", 1.01)),
+        *(("cov_en_m2", bad) for bad in ([1, 2, 3, 4], [[1, 2], [3]], [[1, 2], [3, "4"]])),
+        *(("ground_lat_deg", 91), ("ground_cov_en_m2", [[1, 2]]), ("pitch_deg", "2")),
+        *(("pose_cov", bad) for bad in ([1.0] * 20, 1.0, [1.0] * 20 + [None], [1.0] * 20 + ["1"])),
+        *(("radius_m", []), ("evidence", {"a": "b"}), ("latency_ms", 10**400)),
     ],
 )
-def test_a_wrong_value_is_named(key: str, value: object, said: str) -> None:
-    with pytest.raises(FlightError) as caught:
+def test_a_wrong_or_missing_value_is_named(key: str, value: object) -> None:
+    with pytest.raises(FlightError, match=rf"^{key}( 'a')?: expected "):
         result_from_json(json.dumps({**FIX_LINE, key: value}))
-    assert said in str(caught.value)
+    if key in FIX_LINE:
+        line = {name: value for name, value in FIX_LINE.items() if name != key}
+        with pytest.raises(FlightError, match=f"^key {key} is missing"):
+            result_from_json(json.dumps(line))
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,9 @@ from orthonav.core.track.tracker import Tracker
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.terrain import DATUM_TAG, open_dem
 from orthonav.ground.planning.route import Route
+from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.onboard.run import SingleViews, localize_flight
+from orthonav.onboard.run import SingleViews
 
 FILE = Path(__file__).parent / "golden_views.json"
 OLDER, NEWER = "2016-07.tif", "2021-10.tif"

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from blots import CAMERA, GROUND, as_grey
 
-from orthonav.core.localize.rectify import (
-    Orientation,
-    hidden,
-    node_px,
-    orthorectified,
-)
+from orthonav.core.localize.rectify import Orientation, hidden, node_px, orthorectified
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
 

@@ -8,9 +8,8 @@ import torch
 from test_training import AUTO, TRIPLET, Killed, kill_at, losses, noisy, sheet
 
 from orthonav.core.tiles.network import TripletRecipe
-from orthonav.research import means, training
-from orthonav.research.means import Means
-from orthonav.research.training import learn_network
+from orthonav.research import training
+from orthonav.research.training import Means, learn_network
 
 pytestmark = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="needs a GPU that PyTorch sees"
@@ -63,9 +62,9 @@ def test_tiles_are_embedded_on_the_gpu_as_in_flight(recipe, similarity, tmp_path
 
 
 def test_batches_are_pinned_and_made_by_many_threads():
-    assert means.workers_of(GPU, torch.device("cuda")) >= 1
+    assert training.workers_of(GPU, torch.device("cuda")) >= 1
     task = training._task(AUTO, sheet(), binary=False, positive=None, seed=0, means=GPU)
-    device, world = torch.device("cuda"), means.World()
-    feed = training._Feed(task, 8, 0, len(sheet()), device, None, GPU, world)
+    device = torch.device("cuda")
+    feed = training._Feed(task, 8, 0, len(sheet()), device, None, GPU)
     assert all(each.is_pinned() for each in feed._made(0, np.arange(4)))
     assert all(each.is_cuda for batch in feed.batches(0) for each in batch)

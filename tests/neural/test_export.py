@@ -108,11 +108,3 @@ def test_an_export_that_differs_from_pytorch_is_an_error(monkeypatch):
 def test_unknown_layers_are_refused(unknown):
     with pytest.raises(TypeError, match="exported"):
         export.encoder_graph(unknown, (1, 32, 32))
-
-
-def test_least_cosine_between_embeddings():
-    first = np.array([[1, 0], [0, 0], [3, 3]], np.float32)
-    second = np.array([[2, 0], [0, 0], [0, 1]], np.float32)
-    assert least_cosine_between(first, second) == pytest.approx(np.sqrt(0.5))
-    assert least_cosine_between(first[:2], second[:2]) == 1
-    assert least_cosine_between(first[:2], second[1:]) == 0

@@ -18,9 +18,8 @@ import itertools, json, sys
 import numpy as np
 import torch
 from orthonav.core.tiles.network import TripletRecipe
-from orthonav.research.means import Means, World
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.training import train
+from orthonav.research.training import Means, train
 from orthonav.research.triplet import Triplets
 
 grey = np.random.default_rng(0).integers(0, 255, (128, 128), np.uint8)
@@ -42,7 +41,7 @@ def gradients(width):
     for module in task.model.modules():
         if isinstance(module, torch.nn.Conv2d):
             module.register_forward_pre_hook(note)
-    train(task, recipe, tiles, seed=1, work=None, report=print, means=means, world=World())
+    train(task, recipe, tiles, seed=1, work=None, report=print, means=means)
     return [values.grad for values in task.model.parameters()]
 
 

@@ -20,7 +20,7 @@ from orthonav.core.records import Telemetry, View
 from orthonav.core.variants import Variant, make_variant, variant_from_recipe, variant_recipe
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.research import sam, sam_weights
+from orthonav.research import sam
 from orthonav.research.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
 
 SIDE = 64
@@ -255,14 +255,6 @@ def test_empty_masks_are_dropped():
     assert list(automatic_masks(predict, (64, 64), 64, rules)) == []
 
 
-def test_suppression_keeps_the_best_of_near_duplicates():
-    corners = np.array([[0, 0, 10, 10], [0, 0, 10, 11], [0, 0, 10, 10], [30, 30, 40, 40]])
-    scores = np.array([0.8, 0.9, 0.95, 0.7])
-    assert suppressed(corners, scores, 0.7) == [2, 3]
-    assert suppressed(corners, scores, 0.95) == [2, 1, 3]
-    assert suppressed(corners, scores, 1.0) == [2, 1, 0, 3]
-
-
 def test_suppression_equals_that_of_opencv():
     rng = np.random.default_rng(1)
     first = rng.integers(0, 60, (200, 2))
@@ -363,13 +355,6 @@ def test_large_pictures_are_cut_into_windows(weights):
         expected[:, x : x + 32] = np.maximum(expected[:, x : x + 32], part)
     np.testing.assert_array_equal(whole, expected)
     assert not np.array_equal(whole, drawn(variant(weights, window=0), grey))
-
-
-def test_the_result_does_not_depend_on_the_chunk_size(weights, monkeypatch):
-    expected = drawn(variant(weights), picture())
-    for pixels in (1, 3 * SIDE * SIDE, 1 << 24):
-        monkeypatch.setattr(sam, "_CHUNK_PIXELS", {"cpu": pixels})
-        np.testing.assert_array_equal(drawn(variant(weights), picture()), expected)
 
 
 def test_a_batch_equals_single_calls(weights):
@@ -479,7 +464,7 @@ def test_original_checkpoints_are_read(weights, checkpoint):
         "prompt_encoder",
         "mask_decoder",
     }
-    model = sam_weights.original_model(checkpoint)
+    model = sam.original_model(checkpoint)
     expected = transformers.SamModel.from_pretrained(weights)
     assert model.state_dict().keys() == expected.state_dict().keys()
     for name, value in expected.state_dict().items():
@@ -495,7 +480,7 @@ def test_sizes_follow_from_the_shapes_of_the_weights(size):
     expected = transformers.SamConfig(vision_config=transformers.SamVisionConfig(**SIZES[size]))
     with torch.device("meta"):
         original = original_weights(transformers.SamModel(expected))
-    made = sam_weights._config(original)
+    made = sam._config(original)
     for part in ("vision_config", "prompt_encoder_config", "mask_decoder_config"):
         found, wanted = getattr(made, part).to_dict(), getattr(expected, part).to_dict()
         assert found.pop("global_attn_indexes", []) == list(wanted.pop("global_attn_indexes", []))
@@ -508,10 +493,10 @@ def test_incomplete_checkpoints_are_refused(checkpoint, tmp_path):
         path = tmp_path / "part.pth"
         torch.save({key: value for key, value in whole.items() if key != name}, path)
         with pytest.raises(VariantError, match="not Segment Anything"):
-            sam_weights.original_model(path)
+            sam.original_model(path)
     torch.save([1, 2], tmp_path / "list.pth")
     with pytest.raises(VariantError, match="not Segment Anything"):
-        sam_weights.original_model(tmp_path / "list.pth")
+        sam.original_model(tmp_path / "list.pth")
 
 
 class Evil:
@@ -552,12 +537,6 @@ def test_is_a_frozen_value():
         made.grid = 3
     recipe = json.loads(json.dumps(variant_recipe(TABLE, made)))
     assert variant_from_recipe(TABLE, recipe) == made
-
-
-def test_defaults_are_those_of_the_original_generator():
-    made = SamBoundaries("somewhere")
-    assert (made.grid, made.prompts, made.iou) == (32, 64, 0.88)
-    assert (made.stability, made.offset, made.overlap) == (0.95, 1.0, 0.7)
 
 
 @pytest.mark.parametrize(

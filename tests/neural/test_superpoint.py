@@ -1,7 +1,6 @@
 """SuperPoint: the true architecture with random weights, read by the real code."""
 
 import json
-import pickle
 import shutil
 
 import cv2
@@ -11,7 +10,7 @@ import torch
 import transformers
 
 from orthonav.core.errors import MissingFileError, VariantError
-from orthonav.research.superpoint import SuperPoint
+from orthonav.research.pretrained import SuperPoint
 
 BORDER_PX = 4
 
@@ -155,12 +154,6 @@ def test_damaged_weights_are_refused(weights, tmp_path):
     (tmp_path / "model.safetensors").write_bytes(b"not safetensors")
     with pytest.raises(VariantError, match="cannot read"):
         describe(tmp_path, picture())
-
-
-def test_is_a_frozen_value(weights):
-    variant = SuperPoint(str(weights), max_points=5)
-    assert pickle.loads(pickle.dumps(variant)) == variant
-    assert hash(variant) != hash(SuperPoint(str(weights)))
 
 
 @pytest.mark.parametrize("parameters", [{"max_points": -1}, {"device": "tpu"}])

@@ -1,11 +1,9 @@
-"""Learning: the loss falls, a kill changes nothing, several processes learn one network."""
+"""Learning: the loss falls, a kill changes nothing."""
 
 import dataclasses
 import functools
 import json
-import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,11 +17,9 @@ import torch
 
 from orthonav.core.errors import OutputError
 from orthonav.core.tiles.network import AutoEncoderRecipe, TripletRecipe
-from orthonav.research import checkpoints, means, training
-from orthonav.research.checkpoints import TrainingError, loss_picture
-from orthonav.research.means import Means
+from orthonav.research import training
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.training import learn_network
+from orthonav.research.training import Means, TrainingError, learn_network
 
 TILE_PX = 32
 AUTO = AutoEncoderRecipe(dims=16, width=16, epochs=3, batch=8, learning_rate=3e-3)
@@ -209,36 +205,6 @@ def test_epochs_can_be_added_to_a_finished_training_and_not_taken_away(tmp_path)
         learn(dataclasses.replace(AUTO, epochs=2), tmp_path)
 
 
-def test_the_time_left_is_that_of_the_present_speed(monkeypatch):
-    clock = iter(range(0, 10_000, 60))
-    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(clock)))
-    messages = []
-    state = SimpleNamespace(history=[0.5], losses=[])
-    pauses = training._Pauses(state, None, 4, 10, lambda *said: messages.append(said), None)
-    state.history = [0.5, 0.4]
-    pauses.after_epoch()
-    state.history = [0.5, 0.4, 0.3, 0.2]
-    pauses.after_epoch()
-    assert messages == [
-        ("epoch 2 of 4, loss 0.4, 2.0 min left", 0.5),
-        ("epoch 4 of 4, loss 0.2", 1),
-    ]
-
-
-def test_long_epochs_report_progress(monkeypatch):
-    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    messages = []
-    learn(AUTO, report=lambda text, share: messages.append((text, share)))
-    assert [text.partition(", loss")[0] for text, _ in messages[:5]] == [
-        "epoch 1 of 3, batch 1 of 4",
-        "epoch 1 of 3, batch 2 of 4",
-        "epoch 1 of 3, batch 3 of 4",
-        "epoch 1 of 3",
-        "epoch 2 of 3, batch 1 of 4",
-    ]
-    assert [share for _, share in messages[:12]] == pytest.approx(np.arange(1, 13) / 12)
-
-
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
     first, second, other = (learn(AUTO, seed=seed).onnx for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, second)
@@ -265,23 +231,6 @@ def test_pictures_show_the_progress(tmp_path):
         "loss.png",
         "tiles.png",
     }
-
-
-def test_pictures_do_not_wait_for_a_long_first_epoch(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoints, "SHOWN_AFTER_S", (0.0,))
-    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    with pytest.raises(Killed):
-        learn(AUTO, tmp_path, means=RARELY_SAVED, report=kill_at("epoch 1 of 3, batch 2"))
-    assert {path.name for path in tmp_path.iterdir()} == {"history.json", "loss.png", "tiles.png"}
-    assert losses(tmp_path) == []
-
-
-def test_the_curve_falls_where_the_loss_does():
-    dark = loss_picture([1.0, 0.1, 0.01])[40:].min(axis=2) < 128
-    rows = [np.flatnonzero(dark[:, col]).mean() for col in (22, 320, 618)]
-    assert rows[0] < rows[1] < rows[2]
-    assert loss_picture([0.5]).shape == loss_picture([0.0, 0.0]).shape
-    assert loss_picture([]).all() and loss_picture([0.5, np.nan]).all()
 
 
 @pytest.mark.parametrize("change", ["recipe", "seed", "tiles"])
@@ -349,18 +298,6 @@ def test_triplets_need_positives():
         learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
 
 
-@pytest.mark.slow  # an experiment
-def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
-    recipe = dataclasses.replace(AUTO, epochs=4)
-    plain = Means(bf16=False, fused=False, keep_memory=False, device="cpu")
-    fast = dataclasses.replace(QUICK, bf16=True)
-    learn(recipe, tmp_path / "plain", means=plain)
-    learn(recipe, tmp_path / "fast", means=fast)
-    exact, rounded = losses(tmp_path / "plain"), losses(tmp_path / "fast")
-    assert rounded != exact
-    np.testing.assert_allclose(rounded, exact, rtol=0.1)
-
-
 @pytest.mark.parametrize(
     "able, wanted",
     [({"avx512_bf16": True}, True), ({"amx_bf16": True}, True), ({"avx512_bf16": False}, False)],
@@ -369,16 +306,16 @@ def test_bfloat16_is_used_where_the_processor_has_it(able, wanted, monkeypatch):
     cpu = torch.device("cpu")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
     bf16 = torch.bfloat16
-    assert means.mixed_precision(Means(), cpu) is (bf16 if wanted else None)
-    assert means.mixed_precision(Means(bf16=not wanted), cpu) is (None if wanted else bf16)
+    assert training.mixed_precision(Means(), cpu) is (bf16 if wanted else None)
+    assert training.mixed_precision(Means(bf16=not wanted), cpu) is (None if wanted else bf16)
     monkeypatch.delattr(torch.cpu, "get_capabilities")
-    assert means.mixed_precision(Means(), cpu) is None
+    assert training.mixed_precision(Means(), cpu) is None
 
 
 @pytest.mark.parametrize("able, wanted", [(True, torch.bfloat16), (False, torch.float16)])
 def test_a_gpu_without_bfloat16_learns_in_float16(able, wanted, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: able)
-    assert means.mixed_precision(Means(), torch.device("cuda")) is wanted
+    assert training.mixed_precision(Means(), torch.device("cuda")) is wanted
 
 
 def test_scaled_gradients_give_the_same_result(tmp_path, monkeypatch):
@@ -390,52 +327,3 @@ def test_scaled_gradients_give_the_same_result(tmp_path, monkeypatch):
     learn(AUTO, tmp_path)
     monkeypatch.undo()
     np.testing.assert_allclose(losses(tmp_path), undisturbed(AUTO).losses, rtol=1e-3)
-
-
-SHARED = """
-import sys
-from pathlib import Path
-import numpy as np
-import torch
-torch.set_num_threads(1)
-sys.path.insert(0, sys.argv[1])
-import test_training as here
-
-means = here.dataclasses.replace(here.QUICK, chunk=4)
-rank = here.os.environ["RANK"]
-torch.distributed.init_process_group("gloo")
-for name in ("AUTO", "TRIPLET"):
-    folder = Path(sys.argv[2]) / name
-    made = here.learn(getattr(here, name), folder, means=means)
-    np.save(Path(sys.argv[2]) / f"{name}{rank}.npy", made.onnx)
-torch.distributed.destroy_process_group()
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_learn_one_network(tmp_path):
-    """Started as torchrun starts them; each writes its final network."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    command = [sys.executable, "-c", SHARED, str(Path(__file__).parent), str(tmp_path)]
-    running = [
-        subprocess.Popen(
-            command,
-            env={**os.environ, **shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for rank in range(2)
-    ]
-    for process in running:
-        _, said = process.communicate(timeout=60)
-        assert process.returncode == 0, said
-    for name, recipe in (("AUTO", AUTO), ("TRIPLET", TRIPLET)):
-        first, second = (np.load(tmp_path / f"{name}{rank}.npy") for rank in range(2))
-        np.testing.assert_array_equal(first, second)
-        alone = learn(recipe, tmp_path / "alone" / name)
-        assert not np.array_equal(first, alone.onnx), "each process must take its part only"
-    shared_losses, own_losses = losses(tmp_path / "AUTO"), losses(tmp_path / "alone" / "AUTO")
-    np.testing.assert_allclose(shared_losses, own_losses, rtol=0.3)

@@ -29,7 +29,7 @@ def pace_by(lines, is_held=lambda: False):
 
 if __name__ == "__main__":
     from orthonav.cli import main
-    from orthonav.onboard import cameras
+    from orthonav.onboard import cameras, fly
 
     lines, release = map(Path, sys.argv[1:3])
 
@@ -40,5 +40,5 @@ if __name__ == "__main__":
         whole = [json.loads(each) for each in found if each.endswith("\n")]
         return any("frame" in each and each["sent"] for each in whole)
 
-    cameras.own_pace = pace_by(lines, is_held)
+    cameras.own_pace, fly.TELEMETRY_WAIT_S = pace_by(lines, is_held), 10.0
     sys.exit(main(sys.argv[3:]))

@@ -5,9 +5,8 @@ Copied member by member from the .msg files of Jazzy (https://docs.ros.org/en/ja
 """
 
 import dataclasses
-from dataclasses import dataclass
 
-from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import (
     array,
     byte,
@@ -26,201 +25,118 @@ def name(package, message):
     return f"{package}.msg.dds_.{message}_"
 
 
-@dataclass
-class Time(IdlStruct, typename=name("builtin_interfaces", "Time")):
-    sec: int32
-    nanosec: uint32
+def struct(package, message, /, **members):
+    return make_idl_struct(message, name(package, message), members)
 
 
-@dataclass
-class Header(IdlStruct, typename=name("std_msgs", "Header")):
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-class Image(IdlStruct, typename=name("sensor_msgs", "Image")):
-    header: Header
-    height: uint32
-    width: uint32
-    encoding: str
-    is_bigendian: uint8
-    step: uint32
-    data: sequence[uint8]
-
-
-@dataclass
-class CompressedImage(IdlStruct, typename=name("sensor_msgs", "CompressedImage")):
-    header: Header
-    format: str
-    data: sequence[uint8]
-
-
-@dataclass
-class RegionOfInterest(IdlStruct, typename=name("sensor_msgs", "RegionOfInterest")):
-    x_offset: uint32
-    y_offset: uint32
-    height: uint32
-    width: uint32
-    do_rectify: bool
-
-
-@dataclass
-class CameraInfo(IdlStruct, typename=name("sensor_msgs", "CameraInfo")):
-    header: Header
-    height: uint32
-    width: uint32
-    distortion_model: str
-    d: sequence[float64]
-    k: array[float64, 9]
-    r: array[float64, 9]
-    p: array[float64, 12]
-    binning_x: uint32
-    binning_y: uint32
-    roi: RegionOfInterest
-
-
-@dataclass
-class Quaternion(IdlStruct, typename=name("geometry_msgs", "Quaternion")):
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-
-@dataclass
-class Vector3(IdlStruct, typename=name("geometry_msgs", "Vector3")):
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-class Imu(IdlStruct, typename=name("sensor_msgs", "Imu")):
-    header: Header
-    orientation: Quaternion
-    orientation_covariance: array[float64, 9]
-    angular_velocity: Vector3
-    angular_velocity_covariance: array[float64, 9]
-    linear_acceleration: Vector3
-    linear_acceleration_covariance: array[float64, 9]
-
-
-@dataclass
-class Range(IdlStruct, typename=name("sensor_msgs", "Range")):
-    header: Header
-    radiation_type: uint8
-    field_of_view: float32
-    min_range: float32
-    max_range: float32
-    range: float32
-    variance: float32
-
-
-@dataclass
-class Float64(IdlStruct, typename=name("std_msgs", "Float64")):
-    data: float64
-
-
-@dataclass
-class NavSatStatus(IdlStruct, typename=name("sensor_msgs", "NavSatStatus")):
-    status: int8
-    service: uint16
-
-
-@dataclass
-class NavSatFix(IdlStruct, typename=name("sensor_msgs", "NavSatFix")):
-    header: Header
-    status: NavSatStatus
-    latitude: float64
-    longitude: float64
-    altitude: float64
-    position_covariance: array[float64, 9]
-    position_covariance_type: uint8
-
-
-@dataclass
-class Clock(IdlStruct, typename=name("rosgraph_msgs", "Clock")):
-    clock: Time
-
-
-@dataclass
-class Point(IdlStruct, typename=name("geometry_msgs", "Point")):
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-class Pose(IdlStruct, typename=name("geometry_msgs", "Pose")):
-    position: Point
-    orientation: Quaternion
-
-
-@dataclass
-class PoseWithCovariance(IdlStruct, typename=name("geometry_msgs", "PoseWithCovariance")):
-    pose: Pose
-    covariance: array[float64, 36]
-
-
-@dataclass
-class PoseWithCovarianceStamped(
-    IdlStruct, typename=name("geometry_msgs", "PoseWithCovarianceStamped")
-):
-    header: Header
-    pose: PoseWithCovariance
-
-
-@dataclass
-class GeoPoint(IdlStruct, typename=name("geographic_msgs", "GeoPoint")):
-    latitude: float64
-    longitude: float64
-    altitude: float64
-
-
-@dataclass
-class GeoPointStamped(IdlStruct, typename=name("geographic_msgs", "GeoPointStamped")):
-    header: Header
-    position: GeoPoint
-
-
-@dataclass
-class KeyValue(IdlStruct, typename=name("diagnostic_msgs", "KeyValue")):
-    key: str
-    value: str
-
-
-@dataclass
-class DiagnosticStatus(IdlStruct, typename=name("diagnostic_msgs", "DiagnosticStatus")):
-    level: byte
-    name: str
-    message: str
-    hardware_id: str
-    values: sequence[KeyValue]
-
-
-@dataclass
-class DiagnosticArray(IdlStruct, typename=name("diagnostic_msgs", "DiagnosticArray")):
-    header: Header
-    status: sequence[DiagnosticStatus]
-
-
-@dataclass
-class Transform(IdlStruct, typename=name("geometry_msgs", "Transform")):
-    translation: Vector3
-    rotation: Quaternion
-
-
-@dataclass
-class TransformStamped(IdlStruct, typename=name("geometry_msgs", "TransformStamped")):
-    header: Header
-    child_frame_id: str
-    transform: Transform
-
-
-@dataclass
-class TFMessage(IdlStruct, typename=name("tf2_msgs", "TFMessage")):
-    transforms: sequence[TransformStamped]
+Time = struct("builtin_interfaces", "Time", sec=int32, nanosec=uint32)
+Header = struct("std_msgs", "Header", stamp=Time, frame_id=str)
+Image = struct(
+    "sensor_msgs",
+    "Image",
+    header=Header,
+    height=uint32,
+    width=uint32,
+    encoding=str,
+    is_bigendian=uint8,
+    step=uint32,
+    data=sequence[uint8],
+)
+CompressedImage = struct(
+    "sensor_msgs", "CompressedImage", header=Header, format=str, data=sequence[uint8]
+)
+RegionOfInterest = struct(
+    "sensor_msgs",
+    "RegionOfInterest",
+    x_offset=uint32,
+    y_offset=uint32,
+    height=uint32,
+    width=uint32,
+    do_rectify=bool,
+)
+CameraInfo = struct(
+    "sensor_msgs",
+    "CameraInfo",
+    header=Header,
+    height=uint32,
+    width=uint32,
+    distortion_model=str,
+    d=sequence[float64],
+    k=array[float64, 9],
+    r=array[float64, 9],
+    p=array[float64, 12],
+    binning_x=uint32,
+    binning_y=uint32,
+    roi=RegionOfInterest,
+)
+Quaternion = struct("geometry_msgs", "Quaternion", x=float64, y=float64, z=float64, w=float64)
+Vector3 = struct("geometry_msgs", "Vector3", x=float64, y=float64, z=float64)
+Imu = struct(
+    "sensor_msgs",
+    "Imu",
+    header=Header,
+    orientation=Quaternion,
+    orientation_covariance=array[float64, 9],
+    angular_velocity=Vector3,
+    angular_velocity_covariance=array[float64, 9],
+    linear_acceleration=Vector3,
+    linear_acceleration_covariance=array[float64, 9],
+)
+Range = struct(
+    "sensor_msgs",
+    "Range",
+    header=Header,
+    radiation_type=uint8,
+    field_of_view=float32,
+    min_range=float32,
+    max_range=float32,
+    range=float32,
+    variance=float32,
+)
+Float64 = struct("std_msgs", "Float64", data=float64)
+NavSatStatus = struct("sensor_msgs", "NavSatStatus", status=int8, service=uint16)
+NavSatFix = struct(
+    "sensor_msgs",
+    "NavSatFix",
+    header=Header,
+    status=NavSatStatus,
+    latitude=float64,
+    longitude=float64,
+    altitude=float64,
+    position_covariance=array[float64, 9],
+    position_covariance_type=uint8,
+)
+Clock = struct("rosgraph_msgs", "Clock", clock=Time)
+Point = struct("geometry_msgs", "Point", x=float64, y=float64, z=float64)
+Pose = struct("geometry_msgs", "Pose", position=Point, orientation=Quaternion)
+PoseWithCovariance = struct(
+    "geometry_msgs", "PoseWithCovariance", pose=Pose, covariance=array[float64, 36]
+)
+PoseWithCovarianceStamped = struct(
+    "geometry_msgs", "PoseWithCovarianceStamped", header=Header, pose=PoseWithCovariance
+)
+GeoPoint = struct(
+    "geographic_msgs", "GeoPoint", latitude=float64, longitude=float64, altitude=float64
+)
+GeoPointStamped = struct("geographic_msgs", "GeoPointStamped", header=Header, position=GeoPoint)
+KeyValue = struct("diagnostic_msgs", "KeyValue", key=str, value=str)
+DiagnosticStatus = struct(
+    "diagnostic_msgs",
+    "DiagnosticStatus",
+    level=byte,
+    name=str,
+    message=str,
+    hardware_id=str,
+    values=sequence[KeyValue],
+)
+DiagnosticArray = struct(
+    "diagnostic_msgs", "DiagnosticArray", header=Header, status=sequence[DiagnosticStatus]
+)
+Transform = struct("geometry_msgs", "Transform", translation=Vector3, rotation=Quaternion)
+TransformStamped = struct(
+    "geometry_msgs", "TransformStamped", header=Header, child_frame_id=str, transform=Transform
+)
+TFMessage = struct("tf2_msgs", "TFMessage", transforms=sequence[TransformStamped])
 
 
 def zeros(kind):

@@ -5,9 +5,6 @@ import pytest
 from computed_flights import FAR_M, ComputedFlight, sent, straight
 from flown import Flown
 
-from orthonav.onboard.latency import PositionCheck
-from orthonav.onboard.motion import StateHistory
-
 pytestmark = pytest.mark.long
 
 START_S = 6.0
@@ -32,14 +29,6 @@ def test_without_a_stated_latency_nothing_is_sent():
     assert {reason for _, reason, _ in flight.fly(30)} == {"latency_unknown"}
     plain = flight.monitor.plain()
     assert plain["latency_ms"] is None and "--camera-latency-ms" in plain["latency"]
-
-
-def test_a_false_motion_of_one_picture_withholds_nothing():
-    flight = ComputedFlight(straight(70), 0.12, lambda at_s: 0.12)
-    flight.wrong = lambda exposed_s: 0.08 if exposed_s % 10.0 < 0.2 else 0.0
-    flight.fly(START_S)
-    images = flight.fly(35)
-    assert len(sent(images)) == len(images)
 
 
 def test_false_motions_for_some_seconds_withhold_until_they_are_over():
@@ -98,22 +87,3 @@ def test_a_growing_latency_is_noticed_before_it_matters():
     flight = ComputedFlight(Flown(70, seed=3), 0.12, lambda at_s: 0.12 + 0.1 * max(0, at_s - 25))
     errors = [error_m for _, error_m in sent(flight.fly(40))]
     assert max(errors) < 13.0  # 15 m/s; without a comparison it would be 22 m
-
-
-def test_jumps_that_no_latency_explains_are_none():
-    """Noise with an error of the velocity, and a jump aside, on a circle of 300 m."""
-    history, rng = StateHistory(), np.random.default_rng(0)
-
-    def flown(at_s):
-        place = 300 * np.array([np.sin(at_s / 20), 1 - np.cos(at_s / 20)])
-        return place, 15 * np.array([np.cos(at_s / 20), np.sin(at_s / 20)])
-
-    for number in range(600):
-        history.add(number * 50_000_000, np.eye(3), (*flown(number * 0.05)[1], 0.0), 100.0)
-    noisy, aside = PositionCheck(), PositionCheck()
-    for at_s in np.arange(20.0, 26.0, 0.2):
-        place, (east, north) = flown(at_s)
-        seen = place + rng.normal(0, 3, 2) + at_s * np.array([0.8, -0.5])
-        assert noisy.jump_s(round(at_s * 1e9), seen, 3.0, history) is None
-        jump = 4.0 * np.array([-north, east]) * (at_s > 23)
-        assert aside.jump_s(round(at_s * 1e9), place + jump, 3.0, history) is None

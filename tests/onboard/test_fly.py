@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -44,9 +43,10 @@ from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
+from orthonav.onboard import fly as loop
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
-from orthonav.onboard.console import Inputs, Narrator
+from orthonav.onboard.console import Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
@@ -111,13 +111,16 @@ class Flight:
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
         messages = MessageOptions(kinds)
         self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
-        inputs = Inputs(self.newest, "images from 0", True, self.link, "udpin:1", True)
+        narrator = Narrator(
+            *(self.said, clocks, self.newest, "images from 0", self.link, "udpin:1"),
+            is_live=True,
+            sends=True,
+        )
         publisher = Publisher(
             self.gate,
             clocks,
-            messenger=Messenger(messages, self.gate, self.link.send, clocks),
-            link=self.link,
-            lines=[JsonOut(self.lines), Narrator(self.said, clocks, inputs)],
+            messenger=Messenger(messages, self.gate, self.link, clocks),
+            lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
         rest = {
@@ -167,6 +170,15 @@ class Flight:
         self.newest.put(
             CameraImage(self.number, f"{self.number:06d}", exposed, time_ns, grey, problem)
         )
+        return self.runner.step(0)
+
+    def recorded(self, telemetry, number=1):
+        """Process an image that comes with its telemetry."""
+        grey = self.rng.integers(0, 256, (240, 320), np.uint8)
+        image = CameraImage(
+            *(number, "a", self.time.now_ns, telemetry.time_ns, grey), telemetry=telemetry
+        )
+        self.newest.put(image)
         return self.runner.step(0)
 
     def views(self, count, **options):
@@ -319,11 +331,15 @@ def test_an_internal_error_is_one_no_fix(flight, caplog):
     assert (health.level, health.reasons) == (Level.DEGRADED, ("internal_error",))
 
 
-def test_internal_errors_of_every_view_are_a_failure(flight, caplog):
-    def failing(view):
-        raise ValueError("odd")
+def raising(error):
+    def outcome(view):
+        raise error
 
-    flight.locator.outcome = failing
+    return outcome
+
+
+def test_internal_errors_of_every_view_are_a_failure(flight, caplog):
+    flight.locator.outcome = raising(ValueError("odd"))
     flight.views(110)
     assert flight.health().level is Level.FAILED
 
@@ -367,23 +383,6 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
     assert first.outcome.evidence["vel_north_mps"] == pytest.approx(2.0 + (-10.0 - mean[1]))
     assert first.outcome.evidence["vel_east_mps"] == 1.0
     assert second.outcome.evidence == own
-
-
-def test_samples_after_the_last_view_count_in_its_displacement(begin):
-    """It came 1.1 s after a sample of 20 m/s; the next one, 0.8 s later, has -20 m/s."""
-    flight = begin()
-    for tenth in range(51):
-        if tenth <= 10 or tenth >= 29:
-            now = flight.time.now_ns + AHEAD_NS
-            speed = 20.0 if tenth <= 10 else -20.0
-            flight.hear(flight.autopilot.local(now, (speed, 0.0, 0.0)))
-        if tenth in (10, 21, 50):
-            flight.view(age_s=0.0, wait_s=0.0)
-        elif tenth % 10 == 9:
-            flight.talk()
-        flight.time.go(0.1)
-    moved_m = 0.8 * (-20 + 40 * 0.8 / 1.9 - 20) / 2 + 2.1 * -20
-    assert flight.locator.seen[-1].vel_en_mps == (0.0, pytest.approx(moved_m / 2.9))
 
 
 BAD = {
@@ -437,7 +436,7 @@ def test_without_telemetry_there_is_no_fix(flight):
 def test_a_link_that_failed_is_opened_again(flight):
     flight.port.broken = OSError("unplugged")
     flight.views(60)
-    assert "link_down" in flight.reasons() and not flight.link.status().is_open
+    assert "link_down" in flight.reasons() and not flight.link.is_open
     assert flight.runner.counter.total["no_telemetry"] > 0
     flight.port.broken = None
     flight.views(70)
@@ -593,14 +592,7 @@ def test_time_that_goes_back_begins_the_track_again(begin, caplog):
     start, second = Prior(48.0, 2.0, 5.0), FakeLocator()
     flight = begin(recorded=True, start=lambda: start, fresh=lambda: second)
     for number, time_s in enumerate((100, 101, 100.5, 50, 51)):
-        grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
-        telemetry = Telemetry(round(time_s * S), 1.0, 2.0, 3.0, 50.0)
-        flight.newest.put(
-            CameraImage(
-                number, "a", flight.time.now_ns, telemetry.time_ns, grey, telemetry=telemetry
-            )
-        )
-        flight.runner.step(0)
+        flight.recorded(Telemetry(round(time_s * S), 1.0, 2.0, 3.0, 50.0), number)
     first = flight.locator.seen
     assert [each.time_ns / S for each in first] == [100, 101, 100.5]
     assert [each.time_ns / S for each in second.seen] == [50, 51]
@@ -621,9 +613,7 @@ def test_a_map_with_terrain_gives_heights_above_ground(begin):
         heights = FlownHeights(terrain, (lat, lon))
         flight = begin(recorded=True, heights=heights, start=[prior].pop)
         telemetry = Telemetry(5, 1.0, 2.0, 3.0, math.nan, amsl_m=400.0)
-        grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
-        flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
-        assert reason_of(flight.runner.step(0)) == "fix"
+        assert reason_of(flight.recorded(telemetry)) == "fix"
         (seen,) = flight.locator.seen
         assert seen.agl_m == pytest.approx(agl_m, abs=0.1) and seen.amsl_m == 400.0
         (view,) = flight.log.named("view")
@@ -639,19 +629,6 @@ def test_gps_input_has_the_altitude_by_the_terrain_where_the_autopilot_knows_non
     flight.views(3)  # 100 m above the place of take-off
     (message,) = flight.port.sent("GPS_INPUT")
     assert message["alt"] == pytest.approx(400.0) and not message["ignore_flags"] & 1
-
-
-def test_the_altitude_by_a_measured_height_is_that_over_the_terrain_at_the_fix(begin, monkeypatch):
-    heights = FlownHeights(lambda lat, lon: 300.0 + 0 * lat, (np.zeros(2), np.zeros(2)))
-    flight, vehicles = begin(recorded=True, heights=heights), []
-    monkeypatch.setattr(
-        flight.runner._publisher, "publish", lambda *given, **_: vehicles.append(given[2])
-    )
-    telemetry = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
-    grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
-    flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
-    flight.runner.step(0)
-    assert [each.amsl_m for each in vehicles] == [350.0]
 
 
 @pytest.mark.parametrize(
@@ -708,10 +685,7 @@ def test_after_an_unexpected_error_the_next_view_is_processed(flight, monkeypatc
 
 
 def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
-    def wrong(view):
-        raise CameraError("another camera")
-
-    flight.locator.outcome = wrong
+    flight.locator.outcome = raising(CameraError("another camera"))
     assert reason_of(flight.view()) == "wrong_camera"
     assert flight.health().level is Level.FAILED
 
@@ -737,26 +711,6 @@ def test_inputs_that_are_missing_come_and_go_are_said(flight):
     assert len(flight.said.with_word("camera 320x240, 10.0 Hz")) == 2
 
 
-def test_before_the_first_heartbeat_it_is_waited_for(begin, monkeypatch):
-    monkeypatch.setattr(Flight, "hear", lambda *_: None)
-    flight = begin()
-    flight.talks = False
-    flight.views(50)  # a quarter of a second each, with the wait for telemetry
-    waiting = flight.said.with_word("waiting")
-    assert waiting == ["waiting for heartbeat on udpin:1, which cannot be opened"] * 2
-    assert len(flight.said.with_word("view 000001: no_telemetry: not reported")) == 1
-
-
-def test_a_second_autopilot_is_said_once(flight):
-    other = Autopilot(system=2)
-    for _ in range(30):
-        flight.hear(other.heartbeat())
-        flight.view()
-    said = "autopilot 2/1 heard on udpin:1, not used (see --system-id)"
-    assert flight.said.with_word("autopilot 2/1") == [said]
-    assert flight.said.lines.count("autopilot 1/1 PX4 heard on udpin:1") == 1
-
-
 def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flight):
     said = flight.said
     flight.locator.state_name = "coasting"
@@ -767,19 +721,12 @@ def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flig
     assert said.lines[-1].startswith("coasting -> tracking: 48.000000, 2.000000 +- 2.0 m")
     flight.locator.outcome = lambda view: fix(heading_deg=view.telemetry.yaw_deg + 35)
     flight.views(80)
-    assert said.with_word("heading_mismatch") == [
-        "DEGRADED: heading_mismatch (check the compass and --mount-deg, or use --heading unknown)"
-    ]
-    del flight.locator.outcome
+    assert len(said.with_word("DEGRADED: heading_mismatch (")) == 1
     flight.locator.outcome = FakeLocator().outcome
     flight.views(80)
     assert "health OK" in said.lines
     flight.runner._publisher.close()
-    summary = said.lines[-1]
-    assert summary.startswith(
-        "end: 200 views, 194 sent, 6 withheld: coasting 5, no_telemetry 1; latency median 50"
-    )
-    assert summary.endswith("first position 0.1 s after the first view")
+    assert said.lines[-1].startswith("end: 200 views, 194 sent, 6 withheld: coasting 5, ")
 
 
 def test_a_start_that_is_contradicted_degrades_for_a_while(begin):
@@ -890,8 +837,9 @@ def paced(monkeypatch):
     return lambda lines: monkeypatch.setattr(cameras, "own_pace", pace_by(lines))
 
 
-def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
+def test_a_flight_from_end_to_end(flown, autopilot, paced, monkeypatch, tmp_path):
     """Every image is located, however slow the machine is; only "stale" depends on its speed."""
+    monkeypatch.setattr(loop, "TELEMETRY_WAIT_S", 10.0)
     path, folder, frame, truth = flown
     lines, state = tmp_path / "lines.jsonl", tmp_path / "state.json"
     cv2.setNumThreads(1)
@@ -899,7 +847,7 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
     code = main(
         [
             *("fly", str(path), str(folder), "--autopilot", f"udpin:{autopilot.port}"),
-            *("--deadline-ms", "60000", "--telemetry-wait-ms", "10000"),
+            *("--deadline-ms", "60000"),
             *("--send", "global-position", "--send", "gps-input"),
             *("--jsonl", str(lines), "--state", str(state)),
         ]
@@ -976,7 +924,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     def start(lines):
         arguments = [
             *(lines, tmp_path / "release", "fly", path, folder),
-            *("--state", state, "--jsonl", lines, "--telemetry-wait-ms", "10000"),
+            *("--state", state, "--jsonl", lines),
             *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
         ]
         return subprocess.Popen([sys.executable, PACED, *map(str, arguments)])
@@ -1015,7 +963,6 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
     release = tmp_path / "release"
     arguments = [
         *(lines, release, "fly", area, folder, "--state", state, "--jsonl", lines),
-        *("--telemetry-wait-ms", "10000"),
         *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
     ]
     process = subprocess.Popen(
@@ -1045,31 +992,21 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
 
 
 @pytest.mark.parametrize(
-    "more, warned",
-    [(("--send", "odometry", "--send-rate-hz", "5"), True), (("--send", "odometry"), False)],
+    ("options", "code", "word"),
+    [
+        ((), 1, "--autopilot"),
+        (("--autopilot", "udpin:0", "--signing-key", "KEY"), 1, "32 bytes"),
+        (("--autopilot", "carrier-pigeon:1"), 1, "udpin"),
+        (("--autopilot", "udpin:0", "--nmea", "x:1"), 1, "tcp-listen"),
+        (("--autopilot", "udpin:0", "--start", "1,2"), 2, "LAT,LON,STD_M"),
+    ],
 )
-def test_a_rate_too_low_for_px4_is_a_warning(flown, run, more, warned):
+def test_invalid_options_are_refused(flown, run, tmp_path, options, code, word):
     path, folder, _, _ = flown
-    done = run("fly", path, folder, "--autopilot", "udpin:0", *more, "--nmea", "x:1")
-    assert done.code == 1 and ("PX4 fuses ODOMETRY only at more than 5 Hz" in done.err) == warned
-
-
-def test_invalid_options_end_with_one_line(flown, run, tmp_path):
-    path, folder, _, _ = flown
-    done = run("fly", path, folder)
-    assert (done.code, done.err.count("\n")) == (1, 1) and "--autopilot" in done.err
-    done = run("fly", path, "0", "--autopilot", "udpin:0")
-    assert done.code == 1 and "--camera FILE" in done.err
     key = tmp_path / "key"
     key.write_text("secret words")
-    done = run("fly", path, folder, "--autopilot", "udpin:0", "--signing-key", key)
-    assert done.code == 1 and "32 bytes" in done.err and "secret" not in done.err
-    done = run("fly", path, folder, "--autopilot", "carrier-pigeon:1")
-    assert done.code == 1 and "udpin" in done.err
-    done = run("fly", path, folder, "--autopilot", "udpin:0", "--nmea", "x:1")
-    assert done.code == 1 and "tcp-listen" in done.err
-    done = run("fly", path, folder, "--autopilot", "udpin:0", "--start", "1,2")
-    assert done.code == 2 and "LAT,LON,STD_M" in done.err
+    done = run("fly", path, folder, *(key if each == "KEY" else each for each in options))
+    assert done.code == code and word in done.err and "secret" not in done.err
 
 
 def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(flown, run, tmp_path):
@@ -1083,18 +1020,17 @@ def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(fl
 
     lat, lon = frame.lat_deg, frame.lon_deg
     for values, words in {
-        (lat + 0.05, lon, 50): "5.2 km from the map, more than 3 km and 3 times its deviation",
-        (lon, lat, 50): "; latitude and longitude seem to be swapped",
-        (120, 46, 50): "got 120,46,50; latitude and longitude seem to be swapped",
+        (lat + 0.05, lon, 50): "5.2 km from the map",
+        (lon, lat, 50): "seem to be swapped",
+        (120, 46, 50): "seem to be swapped",
         (lat, lon, 0): "above 0 m",
     }.items():
         done = start(*values)
         assert (done.code, done.err.count("\n")) == (2, 1) and words in done.err
         assert not lines.exists()
-    done = start(lat + 0.02, lon, 50)
-    assert done.code == 0 and "WARNING: --start is 2 km from the map; check" in done.err
-    done = start(lat + 0.05, lon, 2000)
-    assert done.code == 0 and "WARNING: --start is 5 km from the map; check" in done.err
+    for off_deg, std_m in ((0.02, 50), (0.05, 2000)):
+        done = start(lat + off_deg, lon, std_m)
+        assert done.code == 0 and "WARNING: --start is" in done.err
 
 
 def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_stdout(flown, run):
@@ -1104,23 +1040,14 @@ def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_st
     views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
     assert done.code == 0 and views
     texts = [line[12:] for line in done.err.splitlines()]
-    assert texts[:6] == [
-        f"map: {path}, 0.40 km2, 1 m per pixel, level ground",
-        f"autopilot: recorded telemetry of {folder}",
-        "sends: JSON lines to stdout; positions of confidence 0.9 or more",
-        "start: anywhere on the map",
-        "GNSS: not used",
-        f"camera: 320x240 px, 77 x 62 deg (flight.json); images from {folder}, played at 10 times "
-        "real time",
-    ]
+    plan = [text.partition(":")[0] for text in texts[:6]]
+    assert plan == ["map", "autopilot", "sends", "start", "GNSS", "camera"]
     assert any(text.startswith("searching -> tracking: 46.") for text in texts)
-    withheld = Counter(each["withheld"] for each in views)
-    found = withheld.pop(None)
-    begin = f"end: {len(views)} views, {found} with a position (none is sent)"
-    assert texts[-1].startswith(f"{begin}, {withheld.total()} withheld: ")
+    found = sum(each["withheld"] is None for each in views)
+    end = f"end: {len(views)} views, {found} with a position (none is sent)"
+    assert texts[-1].startswith(end)
     done = run(*command, "--quiet")
-    lines = done.err.splitlines()
-    assert done.code == 0 and all("WARNING: " in line for line in lines)
+    assert done.code == 0 and all("WARNING: " in line for line in done.err.splitlines())
     done = run(*command, "--jsonl", "-", "--gnss", "watch")
     assert (done.code, done.out) == (1, "") and "gnss.csv" in done.err.splitlines()[-1]
 

@@ -12,8 +12,7 @@ from test_fly import AHEAD_NS, Flight
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import NoFix
-from orthonav.onboard.gnss.biases import Biases, design, unknown
-from orthonav.onboard.gnss.learner import Resumed
+from orthonav.onboard.gnss.biases import Biases, Resumed, design, unknown
 from orthonav.onboard.gnss.records import Fault
 from orthonav.onboard.gnss.watch import GnssWatch, LiveSolutions
 from orthonav.onboard.state import SavedState, learnt_biases, save
@@ -143,7 +142,7 @@ def test_named_values_are_sent_once_a_second(begin):
 def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
     begin, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("orthonav.onboard.gnss.learner.QUARANTINE_S", 20.0)
+    monkeypatch.setattr("orthonav.onboard.gnss.biases.QUARANTINE_S", 20.0)
     state = tmp_path / "state.json"
     save(state, SavedState(), {"other": unknown("x").to_plain()})
     flight = begin(known=learnt_biases(state), state_path=state)

@@ -10,21 +10,20 @@ from benchmarks.gnss_watch import PITCH_DEG, recovered
 from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.onboard.gnss.biases import (
     LIMITS,
+    QUARANTINE_S,
+    SETTLED_S,
     Biases,
+    BiasLearner,
+    Difference,
+    DifferenceModel,
+    Resumed,
+    Rolling,
     at_start,
+    before_flight,
     biases_from_plain,
     design,
     unknown,
 )
-from orthonav.onboard.gnss.difference import Difference, DifferenceModel
-from orthonav.onboard.gnss.learner import (
-    QUARANTINE_S,
-    SETTLED_S,
-    BiasLearner,
-    Resumed,
-    before_flight,
-)
-from orthonav.onboard.gnss.rolling import Rolling
 
 MODEL = DifferenceModel()
 TRUE = np.array([20.0, -10.0, math.radians(1.0), math.radians(-0.5), 0.2])

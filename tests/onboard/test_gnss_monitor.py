@@ -12,11 +12,15 @@ from benchmarks.gnss_watch import FRAME, MAPS, delay, false_alarms, fed, lawnmow
 
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.ground.simulate.receiver import receiver_of, solutions
-from orthonav.onboard.gnss.biases import Biases, unknown
-from orthonav.onboard.gnss.difference import Difference, DifferenceModel, DifferenceWindow
-from orthonav.onboard.gnss.learner import _Filter
-from orthonav.onboard.gnss.monitor import RETURN_S, GnssMonitor
-from orthonav.onboard.gnss.receiver import SILENCE_S, Receiver
+from orthonav.onboard.gnss.biases import (
+    Biases,
+    Difference,
+    DifferenceModel,
+    DifferenceWindow,
+    _Filter,
+    unknown,
+)
+from orthonav.onboard.gnss.monitor import RETURN_S, SILENCE_S, GnssMonitor, Receiver
 from orthonav.onboard.gnss.records import Fault, GnssState, MapPosition
 
 S = 10**9

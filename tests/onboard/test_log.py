@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from orthonav.core.errors import OutputError
 from orthonav.core.geo.camera import Camera
-from orthonav.core.records import Fix, NoFix, Prior, Telemetry, ViewResult
+from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.onboard import log as log_module
 from orthonav.onboard import segment as segment_module
 from orthonav.onboard.log import FlightLog
@@ -346,14 +346,10 @@ def test_messages_that_cannot_be_encoded_are_counted(tmp_path):
 
 def test_the_camera_has_the_size_of_the_images(tmp_path):
     log = begun(tmp_path)
-    log.view(0, "0.png", picture(0, (24, 32)), replace_prior(telemetry(0)))
+    log.view(0, "0.png", picture(0, (24, 32)), telemetry(0))
     log.close()
     session = plain(read(tmp_path / "flight_0001.mcap")["/orthonav/session"])[-1]
     assert session["camera"]["width_px"] == 32 and session["camera"]["fx_px"] == 25.25
-
-
-def replace_prior(telemetry):
-    return Telemetry(telemetry.time_ns, 1.0, 2.0, 3.0, 4.0, prior=Prior(1.0, 2.0, 3.0))
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):

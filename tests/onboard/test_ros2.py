@@ -43,11 +43,10 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.lost import LostImages
-from orthonav.onboard.ros2.messages import Definitions
+from orthonav.onboard.ros2.graph import Definitions
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
-from orthonav.onboard.ros2.reader import Ros2Reader
+from orthonav.onboard.ros2.reader import LostImages, Ros2Reader
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
 
 S = 10**9
@@ -62,6 +61,7 @@ KINDS = {
     "/gps/fix": ros.NavSatFix,
     "/clock": ros.Clock,
 }
+SEEN = ("/cam/image_raw", "/imu/data", "/range")
 REMAPPED = [
     *("-r", "image:=/cam/image_raw", "-r", "imu:=/imu/data", "-r", "gnss:=/gps/fix"),
 ]
@@ -95,6 +95,12 @@ class Reading:
         self.reader = Ros2Reader(
             self.node, TelemetryBuffer(), Clocks(), lambda: time.monotonic() > self.deadline
         )
+
+    def problem(self, topic):
+        """What is wrong with a topic, None without a problem."""
+        self.node.spin(0.02)
+        self.node.check_graph()
+        return self.node.problems.get(topic)
 
     def read(self, seconds=60.0):
         """The next picture, None where none came in time."""
@@ -159,6 +165,14 @@ def matched(peer, reading):
     wait_for(lambda: reading.node.spin(0.01) >= 0 and peer.matched(), "discovery")
 
 
+def joined(peer, reading, *topics, words=""):
+    """A reader of these topics of the peer, which has found them."""
+    advertised(peer, *topics)
+    flying = reading(*words.split())
+    matched(peer, flying)
+    return flying
+
+
 def send_view(peer, now_ns, angles=(90.0, 0.0, 0.0), **changes):
     """An image among telemetry before and after it."""
     for offset_ms in (-40, -20, 0):
@@ -218,9 +232,7 @@ def test_the_distribution_chooses_the_definitions():
 
 
 def test_an_image_has_the_telemetry_of_its_exposure(peer, reading):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN)
     now_ns = time.time_ns()
     send_view(peer, now_ns, (60.0, 3.0, -2.0))
     seen = flying.read()
@@ -240,9 +252,7 @@ def test_an_image_has_the_telemetry_of_its_exposure(peer, reading):
 def test_a_live_view_equals_that_of_a_recorded_bag(peer, reading, tmp_path):
     """The same messages, once from a file and once over DDS: the same picture and telemetry."""
     messages = Messages()
-    advertised(peer, "/cam/image_raw", "/cam/camera_info", "/imu/data", "/rel_alt")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, "/cam/image_raw", "/cam/camera_info", "/imu/data", "/rel_alt")
     peer.write("/cam/camera_info", ros.native(messages.camera_info(), ros.CameraInfo))
     flying.deadline = time.monotonic() + 60
     camera = flying.reader.wait_for_camera()
@@ -280,9 +290,13 @@ def test_a_live_view_equals_that_of_a_recorded_bag(peer, reading, tmp_path):
 
 
 def test_compressed_images_by_parameter(peer, reading):
-    advertised(peer, "/cam/image_raw/compressed", "/imu/data", "/range")
-    flying = reading("-p", "image_transport:=compressed")
-    matched(peer, flying)
+    flying = joined(
+        peer,
+        reading,
+        "/cam/image_raw/compressed",
+        "/imu/data",
+        words="-p image_transport:=compressed",
+    )
     now_ns = time.time_ns()
     data = cv2.imencode(".png", picture(3))[1].ravel().tolist()
     peer.write("/imu/data", imu(now_ns))
@@ -301,9 +315,7 @@ def test_compressed_images_by_parameter(peer, reading):
     ],
 )
 def test_an_image_that_cannot_be_decoded_has_a_reason(peer, reading, changes, said):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN)
     send_view(peer, time.time_ns(), **changes)
     seen = flying.read()
     assert seen.grey is None and seen.problem.reason == "bad_image"
@@ -311,18 +323,14 @@ def test_an_image_that_cannot_be_decoded_has_a_reason(peer, reading, changes, sa
 
 
 def test_an_image_without_telemetry_is_delivered(peer, reading):
-    advertised(peer, "/cam/image_raw")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, "/cam/image_raw")
     peer.write("/cam/image_raw", image(time.time_ns()))
     telemetry = flying.read().telemetry
     assert set(telemetry.missing()) == {"yaw_deg", "pitch_deg", "roll_deg", "agl_m"}
 
 
 def test_an_imu_without_orientation_is_no_attitude(peer, reading):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN)
     now_ns = time.time_ns()
     raw = imu(now_ns)
     raw.orientation_covariance = [-1.0] + [0.0] * 8
@@ -336,9 +344,7 @@ def test_an_imu_without_orientation_is_no_attitude(peer, reading):
     [(0.0, 3.0), (0.1, 1.5), (5.0, 5.0), (57.3, 3.0), (math.nan, 3.0)],  # MAVROS: 1 rad
 )
 def test_the_covariance_of_an_imu_is_that_of_the_tilt(peer, reading, std_deg, expected):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN)
     now_ns = time.time_ns()
     message = imu(now_ns)
     variance = math.radians(std_deg) ** 2
@@ -387,9 +393,7 @@ def test_images_without_camera_info_are_not_lost():
 
 
 def test_stamps_that_go_back(peer, reading, caplog):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN)
     now_ns = time.time_ns()
     send_view(peer, now_ns)
     first = flying.read()
@@ -402,9 +406,7 @@ def test_stamps_that_go_back(peer, reading, caplog):
 
 
 def test_simulated_time_is_that_of_the_clock(peer, reading):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range", "/clock")
-    flying = reading("-p", "use_sim_time:=true")
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN, "/clock", words="-p use_sim_time:=true")
     then_ns = 1000 * S
     peer.write("/clock", ros.Clock(stamp(then_ns)))
     wait_for(lambda: flying.node.spin(0.02) >= 0 and flying.reader.now_ns() > 0)
@@ -417,18 +419,14 @@ def test_simulated_time_is_that_of_the_clock(peer, reading):
 
 @pytest.mark.long
 def test_a_missing_clock_is_logged_and_images_are_ignored(peer, reading, caplog):
-    advertised(peer, "/cam/image_raw", "/imu/data", "/range")
-    flying = reading("-p", "use_sim_time:=true")
-    matched(peer, flying)
+    flying = joined(peer, reading, *SEEN, words="-p use_sim_time:=true")
     send_view(peer, time.time_ns())
     assert flying.read(2.0) is None
     assert "/clock" in caplog.text and flying.reader.now_ns() == 0
 
 
 def test_a_camera_that_is_not_calibrated_is_refused(peer, reading):
-    advertised(peer, "/cam/camera_info")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, "/cam/camera_info")
     peer.write("/cam/camera_info", ros.zeros(ros.CameraInfo))
     flying.deadline = time.monotonic() + 60
     with pytest.raises(CameraError, match=r"calibrated.*/cam/camera_info"):
@@ -445,9 +443,7 @@ def test_the_wait_for_camera_info_is_logged(reading, caplog):
 
 
 def test_gnss_is_logged_only(peer, reading):
-    advertised(peer, "/gps/fix")
-    flying = reading()
-    matched(peer, flying)
+    flying = joined(peer, reading, "/gps/fix")
     logged = []
     flying.reader.log_gnss = lambda time_ns, cdr: logged.append((time_ns, cdr))
     message = ros.zeros(ros.NavSatFix)
@@ -463,13 +459,8 @@ def test_gnss_is_logged_only(peer, reading):
 def test_another_type_on_a_topic_is_named(peer, reading, caplog):
     peer.advertise("/cam/image_raw", ros.CompressedImage)
     flying = reading()
-
-    def found():
-        flying.node.spin(0.02)
-        flying.node.check_graph()
-        return flying.node.problems
-
-    assert "CompressedImage; expected sensor_msgs/msg/Image" in wait_for(found).popitem()[1]
+    said = wait_for(lambda: flying.problem("/cam/image_raw"))
+    assert "CompressedImage; expected sensor_msgs/msg/Image" in said
     assert caplog.text.count("expected sensor_msgs/msg/Image") == 1
 
 
@@ -477,13 +468,7 @@ def test_qos_that_does_not_match_is_named(peer, reading, caplog):
     """A reader of ours that wants every part of a picture, and a camera with best effort."""
     peer.advertise("/cam/image_raw", ros.Image, BEST_EFFORT)
     flying = reading("-p", "image_reliability:=reliable")
-
-    def found():
-        flying.node.spin(0.02)
-        flying.node.check_graph()
-        return flying.node.problems.get("/cam/image_raw")
-
-    assert "reliability" in wait_for(found)
+    assert "reliability" in wait_for(lambda: flying.problem("/cam/image_raw"))
     assert "QoS" in caplog.text
 
 
@@ -498,13 +483,8 @@ def test_definitions_of_another_distribution_are_named_and_can_be_chosen(
     )
     peer.advertise("/range", humble)
     flying = reading()
-
-    def found():
-        flying.node.spin(0.02)
-        flying.node.check_graph()
-        return flying.node.problems.get("/range")
-
-    assert "ROS_DISTRO" in wait_for(found) and "ROS_DISTRO" in caplog.text
+    assert "ROS_DISTRO" in wait_for(lambda: flying.problem("/range"))
+    assert "ROS_DISTRO" in caplog.text
     monkeypatch.setenv("ROS_DISTRO", "humble")
     flying = Reading(os.environ)
     matched(peer, flying)

@@ -11,7 +11,8 @@ from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.flight import open_flight
 from orthonav.core.localize import Localizer
 from orthonav.core.records import NoFix, Prior
-from orthonav.onboard.run import SingleViews, localize_flight
+from orthonav.ground.recordings.localize import localize_flight
+from orthonav.onboard.run import SingleViews
 
 VIEWS = 8
 

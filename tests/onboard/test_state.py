@@ -10,8 +10,7 @@ import pytest
 
 from orthonav.cli.flying import _learnt_before
 from orthonav.onboard import state
-from orthonav.onboard.gnss.biases import unknown
-from orthonav.onboard.gnss.learner import Resumed
+from orthonav.onboard.gnss.biases import Resumed, unknown
 from orthonav.onboard.state import (
     SavedState,
     before_the_flight,

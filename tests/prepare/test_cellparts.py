@@ -11,7 +11,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.layer import StoredCells, cell_parts

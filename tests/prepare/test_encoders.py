@@ -14,7 +14,8 @@ from orthonav.core.tiles.network import NetworkEmbedder
 from orthonav.core.tiles.words import WordsEmbedder
 from orthonav.ground.build import BuildRequest, build_map, encoders
 from orthonav.ground.build.encoders import usual_edges
-from orthonav.onboard.run import SingleViews, localize_flight
+from orthonav.ground.recordings.localize import localize_flight
+from orthonav.onboard.run import SingleViews
 
 SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
 METHODS = {

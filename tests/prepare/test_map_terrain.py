@@ -24,7 +24,7 @@ from orthonav.ground.build.terrain import terrain_of_dem
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
-from orthonav.onboard.run import localize_flight
+from orthonav.ground.recordings.localize import localize_flight
 
 FRAME = LocalFrame(46.5, 2.5)
 LOCAL_DEG = 46.4982, 3.0026

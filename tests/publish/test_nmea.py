@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
+from orthonav.onboard.messages.estimate import NavigationEstimate
 from orthonav.onboard.messages.nmea import MPS_PER_KNOT, Quality, gga, gst, rmc
 
 MAX_LENGTH = 82  # characters of a sentence with `$` and the line end, NMEA 0183
@@ -49,8 +49,8 @@ def read(sentence: bytes) -> pynmeagps.NMEAMessage:
             b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,6,00,,134.6,M,,,,*3E\r\n",
         ),
         (
-            gga(ESTIMATE, quality=Quality.AUTONOMOUS, hdop_m=2.0),
-            b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,1,00,2.07,134.6,M,,,,*22\r\n",
+            gga(ESTIMATE, quality=Quality.AUTONOMOUS),
+            b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,1,00,,134.6,M,,,,*39\r\n",
         ),
         (
             rmc(ESTIMATE),
@@ -131,10 +131,10 @@ def test_values_are_limited_to_their_fields(
         cov_en_m2=np.eye(2) * 1e10,
         utc_ns=utc_ns,
     )
-    fix = read(gga(estimate, hdop_m=0.1, quality=Quality.AUTONOMOUS))
+    fix = read(gga(estimate, quality=Quality.AUTONOMOUS))
     minimum, errors = read(rmc(estimate)), read(gst(estimate))
     assert fix.alt == "" or abs(fix.alt - altitude) <= 0.051
-    assert fix.HDOP == 99.99 and errors.stdMajor == 9999.99
+    assert errors.stdMajor == 9999.99
     assert minimum.spd == "" or 0 <= minimum.spd <= 999.99
     assert minimum.cog == "" or 0 <= minimum.cog < 360
 
@@ -159,9 +159,3 @@ def test_an_unknown_velocity_has_no_speed_and_a_still_one_no_course() -> None:
     still = read(rmc(replace(ESTIMATE, vel_en_mps=(0.0, 0.0))))
     assert (unknown.spd, unknown.cog) == ("", "")
     assert (still.spd, still.cog) == (0.0, "")
-
-
-@pytest.mark.parametrize("hdop_m", [0.0, -1.0, math.nan])
-def test_hdop_m_must_be_positive(hdop_m: float) -> None:
-    with pytest.raises(EstimateError, match="hdop_m"):
-        gga(ESTIMATE, hdop_m=hdop_m)

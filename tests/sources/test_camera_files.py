@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from recorders import camera_file
 
 from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import Camera
@@ -83,19 +82,22 @@ def test_opencv(tmp_path, name):
     assert read_camera_file(long) == expected(BROWN)
 
 
-def test_ros(tmp_path):
-    assert read_camera_file(ros(tmp_path / "a.yaml")) == expected(BROWN)
-    rational = ros(tmp_path / "b.yaml", "rational_polynomial", [*BROWN, 0, 0, 0])
-    assert read_camera_file(rational) == expected(BROWN)
-    fish = ros(tmp_path / "c.yaml", "equidistant", FISHEYE)
-    assert read_camera_file(fish) == expected(FISHEYE, "fisheye")
-
-
-def test_kalibr(tmp_path):
-    assert read_camera_file(kalibr(tmp_path / "a.yaml")) == expected(BROWN[:4])
-    fish = kalibr(tmp_path / "b.yaml", "equidistant", FISHEYE)
-    assert read_camera_file(fish) == expected(FISHEYE, "fisheye")
-    assert read_camera_file(kalibr(tmp_path / "c.yaml", "none", [])) == expected(())
+@pytest.mark.parametrize(
+    "write, model, given, expects",
+    [
+        (ros, "plumb_bob", BROWN, expected(BROWN)),
+        (ros, "rational_polynomial", [*BROWN, 0, 0, 0], expected(BROWN)),
+        (ros, "equidistant", FISHEYE, expected(FISHEYE, "fisheye")),
+        (kalibr, "radtan", BROWN[:4], expected(BROWN[:4])),
+        (kalibr, "equidistant", FISHEYE, expected(FISHEYE, "fisheye")),
+        (kalibr, "none", [], expected(())),
+    ],
+)
+def test_ros_and_kalibr(tmp_path, write, model, given, expects):
+    assert read_camera_file(write(tmp_path / "a.yaml", model, given)) == expects
+    if write is ros:
+        with pytest.raises(CameraError, match="not a Kalibr chain; give it without #cam1"):
+            read_camera_file(tmp_path / "a.yaml#cam1")
 
 
 def test_a_chain_of_kalibr_with_the_header_of_opencv(tmp_path):
@@ -110,13 +112,6 @@ def test_a_chain_of_kalibr_with_the_header_of_opencv(tmp_path):
         read_camera_file(path)
     with pytest.raises(CameraError, match="no camera 'cam7', it holds cam0, cam1"):
         read_camera_file(tmp_path / "a.yaml#cam7")
-
-
-@pytest.mark.parametrize("made", [ros, opencv, camera_file])
-def test_one_camera_of_a_file_that_is_no_chain(tmp_path, made):
-    made(tmp_path / "a.yaml")
-    with pytest.raises(CameraError, match="not a Kalibr chain; give it without #cam1"):
-        read_camera_file(tmp_path / "a.yaml#cam1")
 
 
 def written(text):

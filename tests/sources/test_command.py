@@ -152,32 +152,47 @@ def test_a_flight_may_be_given_another_camera_but_no_log(run, tmp_path):
     assert code == 1 and "its own telemetry" in err
 
 
-def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
+def test_a_flight_is_localized_whatever_its_truth(run, tmp_path, names_in):
     source = folder_of(tmp_path / "recorded")
     (source / "truth.csv").write_text("frame,lat_deg,lon_deg\n0.png,north,east\n")
     code, out, err = run("localize", MAP, source, "--out", tmp_path / "fixes.jsonl")
     assert code == 0 and "2 views: 2 confident" in out and "ground truth is ignored: line 2" in err
+    before = names_in(tmp_path)
+    code, _, err = run("import", source, "--out", source)  # what exists is not replaced
+    assert code == 1 and "not empty" in err and names_in(tmp_path) == before
 
 
-def truncated(path):
-    path.write_bytes(path.read_bytes()[:700])
-    return path
+def test_a_damaged_photograph_is_left_out_and_named(run, tmp_path):
+    source = tmp_path / "photos"
+    for index in range(3):
+        photo(source / f"{index}.jpg", f"2023:11:14 22:13:2{index}", seed=index)
+    cut(source / "1.jpg", -300)
+    code, out, err = run("import", source, "--out", tmp_path / "flight")
+    assert code == 0 and "2 views, 0 with heading" in out
+    assert "1 views left out, the first" in err and "1.jpg" in err
+    assert "2 of 2 views lack heading, pitch, roll or height" in err
+    fixes = tmp_path / "fixes.jsonl"
+    code, _, err = run("localize", MAP, source, "--out", fixes)
+    assert code == 1 and "1.jpg" in err and not fixes.exists()
+    assert run("localize", MAP, source, "--out", fixes, "--skip-bad-images")[0] == 0
+    reasons = [result.outcome.reason for result in read_results(fixes)]
+    assert reasons == ["missing_telemetry", "bad_image", "missing_telemetry"]
 
 
-def written(path, data):
-    path.write_bytes(data)
+def cut(path, length=700, data=None):
+    path.write_bytes((path.read_bytes() if data is None else data)[:length])
     return path
 
 
 BROKEN = {
     "nothing": (lambda folder: folder / "none", "does not exist"),
-    "empty file": (lambda folder: written(folder / "a.mp4", b""), "source is empty"),
+    "empty file": (lambda folder: cut(folder / "a.mp4", data=b""), "source is empty"),
     "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "flight log:"),
-    "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected photographs"),
+    "text": (lambda folder: cut(folder / "a.mp4", data=b"words " * 99), "expected photographs"),
     "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
-    "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
-    "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "recording was cut short"),
-    "bag cut": (lambda folder: truncated(bag(folder / "b", "bag")), "rosbag reindex"),
+    "video cut": (lambda folder: cut(video(folder / "a.mkv")), "a.mkv"),
+    "mcap cut": (lambda folder: cut(bag(folder / "b", "file")), "recording was cut short"),
+    "bag cut": (lambda folder: cut(bag(folder / "b", "bag")), "rosbag reindex"),
     "no flight": (lambda folder: folder_of(folder / "f") / "frames", "no time in EXIF"),
 }
 

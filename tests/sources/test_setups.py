@@ -1,14 +1,11 @@
 """Where few views are confident, the program finds which value of the configuration is wrong."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from orthonav.cli.setups import setup_text
-from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.headings import seem_radians
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
@@ -104,21 +101,6 @@ def test_a_map_of_another_area_is_not_explained(views):
     assert "the recorded positions lie on the map" in setup_text(found, on_map=True)[0]
 
 
-def test_a_mirrored_camera_sees_the_mirrored_image():
-    camera = Camera(64, 48, 50.0, 50.0, 30.0, 25.0, (0.1, -0.05, 0.01, -0.02, 0.003))
-    mirrored = mirrored_camera(camera)
-    assert mirrored.cx_px == 34.0 and mirrored.distortion == (0.1, -0.05, 0.01, 0.02, 0.003)
-    assert mirrored_camera(mirrored) == camera
-
-
-def test_headings_that_look_like_radians():
-    assert seem_radians([0.1, 3.0, 6.2, 1.5, math.nan])
-    assert not seem_radians([0.1, 3.0, 6.2])  # few
-    assert not seem_radians([0.1, 0.5, 1.2, 1.5])  # degrees that hardly vary
-    assert not seem_radians([0.1, 3.0, 6.2, 7.0])
-    assert not seem_radians([])
-
-
 def test_a_sample_of_the_doubted_views_is_kept(views):
     class Recorded:
         def __init__(self, number):
@@ -137,11 +119,13 @@ def test_a_sample_of_the_doubted_views_is_kept(views):
 
 def test_a_constant_and_a_varying_heading_read_differently():
     found = Tried(Setup("any heading", any_heading=True), 8, 7, 12.0, 60.0, 1.0)
-    assert "from view to view; check the heading column" in setup_text([found], on_map=True)[0]
-    equal = setup_text([replace(found, heading_off_deg=0.3, heading_std_deg=8.0)], on_map=True)[0]
-    assert "with any heading (standard deviation 8 deg); check" in equal
-    alone = replace(found, setup=Setup("as reported"))
-    assert "the configuration is right" in setup_text([alone], on_map=True)[0]
+    equal = replace(found, heading_off_deg=0.3, heading_std_deg=8.0)
+    for each, words in (
+        (found, "from view to view; check the heading column"),
+        (equal, "with any heading (standard deviation 8 deg); check"),
+        (replace(found, setup=Setup("as reported")), "the configuration is right"),
+    ):
+        assert words in setup_text([each], on_map=True)[0]
 
 
 def test_the_search_ends_when_it_is_told_to(registering, views):

@@ -16,7 +16,6 @@ from orthonav.core.flight.telemetry_track import (
     attitude_of_angles,
 )
 from orthonav.core.geo.attitude import (
-    ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
     GIMBAL_TILT_STD_DEG,
     enu_from_body_camera,
@@ -82,24 +81,15 @@ def test_outside_and_in_gaps_nothing_is_known():
 
 
 def test_samples_come_in_any_order_and_what_is_no_number_is_dropped():
-    samples = Samples(1)
+    samples, start = Samples(1), 1_700_000_000_123_456_789
     for time_ns, value in ((3, 30.0), (1, 10.0), (2, math.nan), (1, 99.0), (5, math.inf)):
-        samples.add(time_ns, value)
-    series = samples.series()
-    assert series.time_ns.tolist() == [1, 3] and series.values[:, 0].tolist() == [10, 30]
-    assert series.at(2) == 20.0
+        samples.add(start + time_ns, value)
     samples.add(2**70, 1.0)
-    samples.add(10**18, 1.0)  # decades off the others
-    assert samples.series().time_ns.tolist() == [1, 3]
+    samples.add(10**17, 1.0)  # decades off the others
+    series = samples.series()
+    assert (series.time_ns - start).tolist() == [1, 3]
+    assert series.values[:, 0].tolist() == [10, 30] and series.at(start + 2) == 20.0
     assert Samples(2).series() is None and Samples(3).positions() is None
-
-
-def test_nanoseconds_survive():
-    start = 1_700_000_000_123_456_789
-    samples = Samples(1)
-    samples.add(start, 0.0)
-    samples.add(start + 10, 1.0)
-    assert samples.series().at(start + 1) == pytest.approx(0.1)
 
 
 def test_positions_cross_the_180th_meridian():
@@ -113,27 +103,33 @@ def test_positions_cross_the_180th_meridian():
     assert track.latlon_deg(S + S // 2) is None
 
 
+def series(*timed):
+    samples = Samples(len(timed[0]) - 1)
+    for time_s, *values in timed:
+        samples.add(round(time_s * S), *values)
+    return samples.positions() if len(values) == 3 else samples.series()
+
+
 def test_the_better_height_counts_where_it_is_there():
-    good, other, place = Samples(1), Samples(1), Samples(3)
-    good.add(0, 50.0), good.add(S, 52.0)
-    other.add(0, 80.0), other.add(2 * S, 80.0)
-    place.add(0, 46.0, 2.0, 400.0), place.add(4 * S, 46.0, 2.0, 400.0)
-    place.add(2 * S, 46.0, 2.0, 400.0)
-    track = RecordedTrack(None, (good.series(), other.series()), position=place.positions())
+    place = series(*[(t, 46.0, 2.0, 400.0) for t in (0, 2, 4)])
+    heights = series((0, 50.0), (1, 52.0)), series((0, 80.0), (2, 80.0))
+    track = RecordedTrack(None, heights, position=place)
     heights = [track.telemetry(t).agl_m for t in (S // 2, 3 * S // 2, 3 * S)]
     assert heights[:2] == [51.0, 80.0] and math.isnan(heights[2])
     assert track.telemetry(3 * S, ground_alt_m=310.0).agl_m == 90.0
 
 
 def test_heights_of_different_references_are_not_taken_for_each_other():
-    home, amsl, hae, place = Samples(1), Samples(1), Samples(1), Samples(3)
-    home.add(0, 50.0), amsl.add(0, 400.0), hae.add(0, 450.0), place.add(0, 46.0, 2.0, 400.0)
-    altitudes = {"amsl": amsl.series(), "hae": hae.series(), "position": place.positions()}
-    reported = RecordedTrack(None, home=home.series(), **altitudes).telemetry(0)
+    altitudes = {"amsl": series((0, 400.0), (1, 400.0)), "hae": series((0, 450.0))}
+    reported = RecordedTrack(None, home=series((0, 50.0)), **altitudes).telemetry(0)
     assert (reported.home_m, reported.amsl_m, reported.hae_m) == (50.0, 400.0, 450.0)
     assert reported.agl_m == 50.0  # level ground assumed, and said
     only = RecordedTrack(None, **altitudes)
     assert math.isnan(only.telemetry(0).agl_m)
+    assert only.telemetry(0, ground_alt_m=290.0).agl_m == 110.0
+    both = RecordedTrack(None, position=series((0, 46.0, 2.0, 450.0)), **altitudes)
+    assert both.telemetry(0, ground_alt_m=290.0).agl_m == 160.0
+    assert math.isnan(both.telemetry(S, ground_alt_m=290.0).agl_m)
 
 
 @pytest.mark.parametrize(
@@ -147,36 +143,22 @@ def test_heights_of_different_references_are_not_taken_for_each_other():
     ],
 )
 def test_what_is_assumed_about_heights_is_said_once(names, options, expected):
-    series = Samples(1)
-    series.add(0, 50.0)
-    track = RecordedTrack(None, **dict.fromkeys(names, series.series()))
+    track = RecordedTrack(None, **dict.fromkeys(names, series((0, 50.0))))
     doubts = warnings_of(track, SourceOptions(**options))
     assert len(doubts) == (expected is not None)
     assert expected is None or expected in doubts[0]
 
 
-def test_the_height_above_a_given_ground_is_of_one_reference():
-    amsl, place = Samples(1), Samples(3)
-    amsl.add(0, 400.0), amsl.add(S, 400.0), place.add(0, 46.0, 2.0, 450.0)
-    only = RecordedTrack(None, amsl=amsl.series())
-    assert only.telemetry(0, ground_alt_m=290.0).agl_m == 110.0
-    both = RecordedTrack(None, amsl=amsl.series(), position=place.positions())
-    assert both.telemetry(0, ground_alt_m=290.0).agl_m == 160.0
-    assert math.isnan(both.telemetry(S, ground_alt_m=290.0).agl_m)
-
-
 def test_tilt_has_a_standard_deviation_by_the_kind_of_the_source():
     """Or as reported; never 0, and unknown where pitch and roll are."""
-    attitude, stated = attitudes((0, 10.0, 1.0, -2.0), (2, 10.0, 1.0, -2.0)), Samples(1)
+    attitude = attitudes((0, 10.0, 1.0, -2.0), (2, 10.0, 1.0, -2.0))
     assert RecordedTrack(attitude).telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
     gimbal = RecordedTrack(attitude, tilt_std_deg=GIMBAL_TILT_STD_DEG)
     assert gimbal.telemetry(S).tilt_std_deg == GIMBAL_TILT_STD_DEG
-    stated.add(0, 0.5), stated.add(S // 2, 0.7)
-    reported = RecordedTrack(attitude, tilt_std=stated.series())
+    reported = RecordedTrack(attitude, tilt_std=series((0, 0.5), (0.5, 0.7)))
     assert reported.telemetry(0).tilt_std_deg == 0.5
     assert reported.telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
     assert RecordedTrack(None).telemetry(0).tilt_std_deg is None
-    assert 0 < GIMBAL_TILT_STD_DEG < AUTOPILOT_TILT_STD_DEG < ASSUMED_TILT_STD_DEG
 
 
 @pytest.mark.parametrize(
@@ -194,34 +176,18 @@ def test_impossible_options_are_refused(change, message):
         SourceOptions(**change)
 
 
-def with_velocities(*samples):
-    collected = Samples(2)
-    for time_s, east, north in samples:
-        collected.add(round(time_s * S), east, north)
-    return RecordedTrack(None, velocity=collected.series())
-
-
-def seen_at(track, *times_s):
-    views = (
-        SourceView("", track.telemetry(round(each * S)), None, "", lambda: None) for each in times_s
-    )
+def seen_at(velocities, *times_s):
+    track = RecordedTrack(None, velocity=series(*velocities))
+    views = [SourceView("", track.telemetry(round(t * S)), None, "", lambda: None) for t in times_s]
     return [each.telemetry.vel_en_mps for each in with_mean_velocities(views, track)]
 
 
 def test_between_distant_views_the_velocity_is_the_mean():
     """An aircraft that turned round between two views ends where it began."""
-    track = with_velocities((0, 10, 0), (1, 10, 0), (2, 0, 0), (3, -10, 0), (4, -10, 0), (5, 0, 4))
-    assert seen_at(track, 0.5, 3.5) == [(10.0, 0.0), (0.0, 0.0)]
-    assert seen_at(track, 1, 4, 4.5, 5) == [
-        (10.0, 0.0),
-        pytest.approx((-10 / 3, 0.0)),
-        (-5.0, 2.0),
-        (0.0, 4.0),
-    ]
-
-
-def test_a_mean_over_a_gap_is_not_known():
-    track = with_velocities((0, 10, 0), (3, 10, 0), (4, 10, 0))
-    assert seen_at(track, 0, 4) == [(10.0, 0.0), None]
-    assert seen_at(track, 3, 4, 9) == [(10.0, 0.0), (10.0, 0.0), None]
-    assert RecordedTrack(None).mean_velocity_en_mps(0, S) is None
+    flown = [(0, 10, 0), (1, 10, 0), (2, 0, 0), (3, -10, 0), (4, -10, 0), (5, 0, 4)]
+    assert seen_at(flown, 0.5, 3.5) == [(10.0, 0.0), (0.0, 0.0)]
+    mean = pytest.approx((-10 / 3, 0.0))
+    assert seen_at(flown, 1, 4, 4.5, 5) == [(10.0, 0.0), mean, (-5.0, 2.0), (0.0, 4.0)]
+    gap = [(0, 10, 0), (3, 10, 0), (4, 10, 0)]  # over one it is not known
+    assert seen_at(gap, 0, 4) == [(10.0, 0.0), None]
+    assert seen_at(gap, 3, 4, 9) == [(10.0, 0.0), (10.0, 0.0), None]

@@ -41,6 +41,8 @@ def test_views_come_at_the_rate_asked_for(recorded):
         assert np.abs(view.grey().astype(int) - picture(number)).max() <= 1  # by way of colours
     assert len(list(open_source(recorded, options(recorded, rate_hz=100)).views)) == 30
     assert len(list(recording.views)) == 6  # again from the first
+    late = next(open_source(recorded, options(recorded, time_offset_s=0.9)).views)
+    assert (late.telemetry.time_ns, late.telemetry.yaw_deg) == (900_000_000, pytest.approx(4))
 
 
 @pytest.mark.parametrize("name, code", [("a.mp4", "mp4v"), ("a.avi", "MJPG"), ("a.mov", "mp4v")])
@@ -152,29 +154,17 @@ def test_dialects(tmp_path, dialect, encoding):
     assert telemetry == pytest.approx(expected, nan_ok=True)
 
 
-def test_the_order_is_that_of_the_whole_file(tmp_path):
-    """The first block by itself could begin with either."""
-    texts = ["GPS(50.5,2.5)", "GPS(50.5,2.5)", "GPS(50.5,102.5)"]
-    path = subtitles(tmp_path / "a.srt", texts)
-    assert [(block.lat_deg, block.lon_deg) for block in blocks(path.read_bytes())] == [
-        (50.5, 2.5),
-        (50.5, 2.5),
-        (50.5, 102.5),
-    ]
-
-
-def test_doubtful_positions_are_named(recorded, tmp_path):
+def test_doubtful_positions_are_named(recorded):
     srt = recorded.with_suffix(".SRT")
     subtitles(srt, ["GPS(2.5,42.5) G.PRY (-90.0, 0.0, 10.0)"] * 30)
     (warning,) = open_source(recorded, options(recorded)).warnings
     assert "begins with the latitude or the longitude: positions are left out" in warning
-    texts = [dji_subtitle(n).replace("46.5", "46.6" if n >= 20 else "46.5") for n in range(30)]
-    subtitles(srt, texts)
+    subtitles(srt, [dji_subtitle(n, lat=46.6 if n >= 20 else 46.5) for n in range(30)])
     _, warning = open_source(recorded, options(recorded)).warnings
     assert "jumps 1 times, the first by 11.1 km 2.0 s after the beginning" in warning
-
-
-def test_windows_lines_and_long_times(tmp_path):
+    subtitles(srt, ["GPS(50.5,2.5)"] * 29 + ["GPS(50.5,102.5)"])  # of the whole file
+    first = next(blocks(srt.read_bytes()))
+    assert (first.lat_deg, first.lon_deg) == (50.5, 2.5)
     text = "7\r\n01:02:03,5 --> 01:02:04,000\r\n[latitude: 1.5] [longitude: 2.5]\r\n\r\n"
     (block,) = blocks(text.encode())
     assert block.start_ns == 3_723_500_000_000 and block.lat_deg == 1.5
@@ -191,42 +181,28 @@ def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
     assert level.missing() == ["yaw_deg"] and level.tilt_std_deg == ASSUMED_TILT_STD_DEG
 
 
-def broken(recorded, how):
-    """Break the video or its subtitles; gives options that go with it."""
-    srt, data = recorded.with_suffix(".SRT"), recorded.read_bytes()
-    breaking = {
-        "no frames": lambda: recorded.write_bytes(data[:600]),
-        "cut": lambda: recorded.write_bytes(data[: len(data) * 2 // 3]),
-        "empty": lambda: recorded.write_bytes(b""),
-        "another kind": lambda: recorded.write_bytes(b"plain words, and no video\n" * 99),
-        "no blocks": lambda: srt.write_text("words\n\nand words\n"),
-        "empty subtitles": lambda: srt.write_bytes(b""),
-        "subtitles of a film": lambda: subtitles(srt, ["- Who goes there?", "- A friend."] * 15),
-        "no subtitles": srt.unlink,
-    }
-    breaking.get(how, lambda: None)()
-    return {"time_offset_s": 60.0} if how == "no overlap" else {}
-
-
 BROKEN = {
-    "no frames": "cannot be opened|has no frame",
-    "cut": r"cut short: \d+ of 30 frames",
-    "empty": "source is empty",
-    "another kind": "expected photographs",
-    "no blocks": "expected a PX4 log",
-    "empty subtitles": "telemetry log is empty",
-    "subtitles of a film": "neither position nor gimbal angles",
-    "no subtitles": "no telemetry beside the video",
-    "no overlap": "do not overlap",
+    "no frames": (
+        lambda path, srt: path.write_bytes(path.read_bytes()[:600]),
+        "no frame|opened",
+    ),
+    "cut": (lambda path, srt: path.write_bytes(path.read_bytes()[:-9000]), r"\d+ of 30 frames"),
+    "no blocks": (lambda path, srt: srt.write_text("words\n\nand words\n"), "expected a PX4 log"),
+    "empty subtitles": (lambda path, srt: srt.write_bytes(b""), "telemetry log is empty"),
+    "of a film": (lambda path, srt: subtitles(srt, ["- Who is it?"] * 30), "neither position nor"),
+    "no subtitles": (lambda path, srt: srt.unlink(), "no telemetry beside the video"),
+    "no overlap": (lambda path, srt: 60.0, "do not overlap"),
 }
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_damaged_video_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how, capfd):
-    more = broken(recorded, how)
+def test_damaged_video_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how):
+    damage, words = BROKEN[how]
+    offset = damage(recorded, recorded.with_suffix(".SRT"))
+    asked = options(recorded, time_offset_s=60.0 if offset == 60.0 else 0.0)
     before = names_in(tmp_path)
-    with pytest.raises(FlightError, match=BROKEN[how]) as caught:
-        import_flight(open_source(recorded, options(recorded, **more)), tmp_path / "flight")
+    with pytest.raises(FlightError, match=words) as caught:
+        import_flight(open_source(recorded, asked), tmp_path / "flight")
     assert "\n" not in str(caught.value) and names_in(tmp_path) == before
 
 

@@ -7,7 +7,6 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
 from browsing import LAPTOP, TABLET, Visit, painted
-from long_run import write_long_run
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
@@ -18,8 +17,6 @@ from orthonav.ground.view.run import ViewRequest, open_run
 pytestmark = pytest.mark.long
 
 COUNT = len(PLACES_EN_M)
-MANY = 10_000
-MOST_ELEMENTS = 1500
 MAIN_PARTS = ("header", "#map-part", "#chosen", "#list-part", "#health-part", "#time-part")
 
 
@@ -203,30 +200,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
 
 
-def test_keys_belong_to_what_has_the_focus(page):
-    """The slider of the overlay, the map, and where somebody types."""
-    page.locator("#opacity").focus()
-    page.keyboard.press("ArrowRight")
-    assert page.locator("#opacity").input_value() == "65"
-    page.locator("#map").focus()
-    before = page.on_screen((0, 0), CHUNK_PX)
-    page.keyboard.press("ArrowRight")
-    page.until(lambda: page.on_screen((0, 0), CHUNK_PX)[0] < before[0] - 20)
-    page.locator("#named").fill("view 0")
-    page.keyboard.press("ArrowLeft")
-    page.keyboard.press("b")
-    page.chosen(0, COUNT)
-    expect(page.locator("#shown-count")).to_have_text(f"0 of {COUNT} views")
-    page.locator("#named").fill("")
-    page.locator("#scrub").focus()
-    page.keyboard.press("ArrowRight")
-    page.chosen(1, COUNT)
-    page.locator("#list [aria-current]").focus()
-    page.keyboard.press("ArrowDown")
-    page.chosen(2, COUNT)
-    assert page.js("document.activeElement.dataset.view") == "2"
-
-
 def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
     box = page.locator("#chart").bounding_box()
     left, middle = box["x"] + 52, box["y"] + box["height"] / 2
@@ -244,27 +217,6 @@ def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
     page.click("#zoom-in")
     page.keyboard.press("End")  # brought into the part of the time that is seen
     page.chosen(COUNT - 1, COUNT)
-
-
-def test_everything_is_reached_by_tab_in_order(page):
-    """Once round: each control once, from top to bottom, and seen where it is."""
-    script = """() => { const is = document.activeElement; const style = getComputedStyle(is);
-      return [is.id || is.getAttribute("aria-label") || is.tagName.toLowerCase(),
-        style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2]; }"""
-    reached = []
-    for _ in range(60):
-        page.keyboard.press("Tab")
-        where, outlined = page.js(script)
-        if where == "body" or where in reached:
-            break
-        reached.append(where)
-        assert outlined, where
-    expected = ["help-open", "map", "Zoom in", "Zoom out", "copy", "opacity", "blink", "enlarge"]
-    expected += ["on-map", "summary"]
-    expected += ["which", "order", "named", "button", "first", "before", "play", "after", "last"]
-    expected += ["zoom-in", "zoom-out", "scrub"]
-    assert [each for each in reached if each in expected] == expected
-    assert set(reached) - set(expected) <= {"list-box"}
 
 
 def fits(page):
@@ -308,21 +260,6 @@ def test_on_a_tablet_by_touch(visit, server, columns):
     page.chosen(1, COUNT)
     page.locator("#after").tap()
     page.chosen(2, COUNT)
-
-
-@pytest.mark.slow  # a tablet is tried in every run
-def test_on_a_phone(visit, server):
-    """Nothing sticks out, and the legend and the buttons lie beside the map."""
-    page = visit(server, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
-    page.chosen(0, COUNT)
-    page.select_option("#order", "error")
-    page.chosen(WRONG, COUNT)
-    page.settled()
-    fits(page)
-    steps = page.locator("#steps button")
-    assert len({each.bounding_box()["y"] for each in steps.all()}) == 1
-    map_box, legend = (page.locator(each).bounding_box() for each in ("#map", "#legend"))
-    assert legend["y"] >= map_box["y"] + map_box["height"] - 1
 
 
 def test_by_the_rules_of_axe(page):
@@ -392,29 +329,3 @@ def test_a_run_is_followed_from_before_its_beginning(visit, small, tmp_path):
         expect(page.locator("#chosen-name")).to_have_text("No view yet")
         expect(page.locator("#compare")).to_be_hidden()
         assert page.locator("#sentence").inner_text() == ""
-
-
-@pytest.mark.slow
-def test_ten_thousand_views(visit, small, tmp_path):
-    """All are drawn; the page stays small and the list is a part of them."""
-    written = write_long_run(tmp_path, MANY, FRAME, (0.0, 0.0), 130.0)
-    run = open_run(ViewRequest(written.fixes, small.map_path, truth=written.truth))
-    wrong = [i for i, each in enumerate(run.news(0, 0, 0)["columns"]["wrong"]) if each]
-    with serving(run) as server:
-        page = visit(server)
-        page.chosen(0, MANY)
-        page.settled()
-        inked = painted(page.picture(), page.colour("confident"))
-        assert inked > 5000
-        for key, i in (("ArrowRight", 1), ("PageDown", 501), ("End", MANY - 1), ("PageUp", 9499)):
-            page.keyboard.press(key)
-            page.chosen(i, MANY)
-            expect(page.locator("#list [aria-current]")).to_have_attribute("data-view", str(i))
-        assert page.locator("#list li").count() < 100
-        page.locator("#list-after").click()
-        assert page.js("document.querySelectorAll('*').length") < MOST_ELEMENTS
-        page.select_option("#which", "wrong")
-        page.chosen(wrong[0], MANY)
-        expect(page.locator("#shown-count")).to_have_text(f"{len(wrong)} of {MANY} views")
-        page.keyboard.press("End")
-        page.chosen(wrong[-1], MANY)

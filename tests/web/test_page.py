@@ -4,15 +4,14 @@ import json
 import re
 import shutil
 import subprocess
-from html.parser import HTMLParser
 from importlib.resources import files
 from posixpath import dirname, join, normpath
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from small_run import FRAME, GSD_M, NORTH_M, WEST_M
 
+from html_page import Page
 from orthonav.ground.report.page import static_text
 from orthonav.ground.view.server import SHARED, load_assets
 
@@ -20,28 +19,8 @@ STATIC = files("orthonav.ground.view").joinpath("static")
 OURS = {entry.name: entry.read_text(encoding="utf-8") for entry in STATIC.iterdir()}
 OURS |= {name: static_text(name) for name in SHARED}
 SCRIPTS = {name: text for name, text in OURS.items() if name.endswith(".js")}
-VOID = {"meta", "link", "img", "input", "br", "hr"}
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(NODE is None, reason="node is not installed")
-
-
-class Page(HTMLParser):
-    """Elements with their attributes; fails where tags are not closed in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.elements, self._open = [], []
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag, attributes):
-        self.elements.append((tag, dict(attributes)))
-        if tag not in VOID:
-            self._open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self._open.pop() == tag, f"line {self.getpos()}"
 
 
 @pytest.fixture(scope="module")
@@ -86,16 +65,6 @@ def test_the_page_keeps_to_its_policy(page):
         assert tag != "style" and "style" not in attributes
         assert tag != "script" or "src" in attributes
         assert not [each for each in attributes if each.startswith("on")]
-
-
-def test_all_is_of_this_server(ask):
-    status, headers, body = ask("/")
-    assert status == 200 and headers["content-type"].startswith("text/html")
-    assert body.decode() == OURS["index.html"]
-    assert "default-src 'none'" in headers["content-security-policy"]
-    for path in ("/static/main.js", "/leaflet/leaflet-src.esm.js"):
-        assert ask(path)[1]["content-type"].startswith("text/javascript")
-    assert urlsplit(path).netloc == ""
 
 
 def node(script, cwd):

@@ -102,7 +102,8 @@ def located(run: str, views: int) -> int:
     from orthonav.core.mapfile import open_map
     from orthonav.core.records import Fix
     from orthonav.core.track.tracker import Tracker
-    from orthonav.onboard.run import Locator, SingleViews, localize_flight
+    from orthonav.ground.recordings.localize import localize_flight
+    from orthonav.onboard.run import Locator, SingleViews
 
     cv2.setNumThreads(1)
     localizer = Localizer(open_map(GOLDEN / "area.onav"))

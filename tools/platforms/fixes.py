@@ -31,7 +31,8 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.run import SingleViews, localize_flight, smoothed_track
+from orthonav.ground.recordings.localize import localize_flight, smoothed_track
+from orthonav.onboard.run import SingleViews
 
 STORED = Path(__file__).resolve().parents[2] / "tests" / "data" / "golden_flight"
 LIMITS_M = {"views": 0.01, "any_heading": 0.01, "track": 0.05, "smoothed": 0.05}

@@ -2,7 +2,6 @@
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -185,12 +184,9 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
 
 def _build(options: argparse.Namespace) -> int:
     """Build, print a summary; returns 1 where a sheet failed."""
-    from orthonav.core.errors import AtlasError
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
     from orthonav.ground.planning.route import read_route
 
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise AtlasError("torchrun trains one map: use --cluster to build an atlas in parallel")
     request = AtlasRequest(
         url=options.atlas,
         orthos=options.ortho,

@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     from orthonav.core.records import ViewResult
     from orthonav.ground.recordings.calibrate_mount import MountCalibration
 
+GNSS_STD_M = 5.0
+"""Standard deviation of measured positions, per axis."""
 EVERYDAY = (
-    *("--latency", "--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry"),
+    *("--latency", "--gnss-positions", "--heading", "--camera", "--telemetry"),
     "--json",
 )
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
     parser.add_argument(
         "flight", type=Path, metavar="SOURCE", help="flight to calibrate with, as for `localize`"
@@ -41,15 +42,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--gnss-positions",
         type=Path,
         metavar="positions.csv",
-        help="measured positions of some or all views (frame,lat_deg,lon_deg); they make pitch and "
-        "roll observable from positions, not from the perspective alone",
-    )
-    parser.add_argument(
-        "--gnss-std-m",
-        type=float,
-        default=5.0,
-        metavar="M",
-        help="standard deviation of --gnss-positions, per axis (default 5)",
+        help="measured positions of some or all views (frame,lat_deg,lon_deg), 5 m per axis; they "
+        "make pitch and roll observable from positions, not from the perspective alone",
     )
     parser.add_argument(
         "--heading",
@@ -62,7 +56,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Estimate the biases from the confident views of a flight, and write them."""
     from orthonav.core.errors import FlightError
     from orthonav.core.flight.mount import write_mount
 
@@ -71,8 +64,6 @@ def run(options: argparse.Namespace) -> None:
             raise FlightError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
-    if not 0 < options.gnss_std_m < 1e5:
-        raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
     found, by_track = _calibrated(options)
     write_mount(options.out, found.mount)
     with beside(options.out):
@@ -109,7 +100,8 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
         calibrate_mount_by_views,
         confident_views,
     )
-    from orthonav.onboard.run import Locator, localize_flight, smoothed_track
+    from orthonav.ground.recordings.localize import localize_flight, smoothed_track
+    from orthonav.onboard.run import Locator
 
     dem, opened = dem_of(options), open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
@@ -118,7 +110,7 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     if places:
         frame = opened.manifest.sheets[0].frame
         check_truth(places, (), (frame.lat_deg, frame.lon_deg), options.gnss_positions)
-    priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
+    priors = {frame: Prior(*place, GNSS_STD_M) for frame, place in places.items()}
     localizer, heading_known = Localizer(opened), options.heading == "known"
 
     def located(locator: Locator, stage: str) -> "list[ViewResult]":
@@ -152,7 +144,6 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
 
 
 def _run_latency(options: argparse.Namespace) -> None:
-    """Estimate the latency of the camera and write it."""
     from orthonav.core.flight.mount import write_latency
     from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 def add_report_changes(parser: argparse._ActionsContainer) -> None:
-    """Add `--report-changes FILE`."""
     parser.add_argument(
         "--report-changes",
         type=Path,
@@ -30,7 +29,6 @@ def add_report_changes(parser: argparse._ActionsContainer) -> None:
 def check_comparable(
     options: argparse.Namespace, found: "RegistrationLocalizer | None", opened: "MapFile"
 ) -> None:
-    """Raise `MapFileError` where changes are asked for of a map without registration."""
     if options.report_changes and found is None:
         raise MapFileError(
             "--report-changes needs a map with a registration layer, and not --registration off: "
@@ -78,7 +76,6 @@ def report_changes(
 
 
 def changes_text(options: argparse.Namespace, found: "ChangedGround | None") -> list[str]:
-    """What was found, in one line; none where it was not asked for."""
     if options.report_changes is None:
         return []
     if found is None:
@@ -89,7 +86,6 @@ def changes_text(options: argparse.Namespace, found: "ChangedGround | None") -> 
 def changes_to_plain(
     options: argparse.Namespace, found: "ChangedGround | None"
 ) -> dict[str, object]:
-    """The same for JSON: nothing, or `changes`, which is null where nothing was written."""
     if options.report_changes is None:
         return {}
     if found is None:

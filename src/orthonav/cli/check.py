@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.epilog = "exit status: 0 go, 3 marginal, 4 no-go; 1 error, 2 wrong usage"
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")
     parser.add_argument(
@@ -69,7 +68,6 @@ def _add_route(group: argparse._ActionsContainer) -> None:
 
 
 def _add_ground(group: argparse._ActionsContainer) -> None:
-    """Evidence about the ground besides the map."""
     group.add_argument(
         "--other-date",
         type=Path,
@@ -86,7 +84,6 @@ def _add_ground(group: argparse._ActionsContainer) -> None:
 
 
 def _add_errors(group: argparse._ActionsContainer) -> None:
-    """Camera, accuracy of telemetry and prior, and motion."""
     group.add_argument(
         "--camera",
         type=Path,
@@ -138,7 +135,6 @@ def _add_number(
 
 
 def _add_effort(group: argparse._ActionsContainer) -> None:
-    """The confidence that is required, and the number of trials."""
     group.add_argument(
         "--accept",
         metavar="NAME:MIN",
@@ -157,7 +153,6 @@ def _add_effort(group: argparse._ActionsContainer) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check, write, print the verdict; return its exit status."""
     import json
 
     from orthonav.ground.check.run import check_map
@@ -179,7 +174,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _accepted(text: str) -> float:
-    """The least confidence of `--accept`; raises `VariantError`."""
     from orthonav.core.errors import VariantError
     from orthonav.core.localize.confidence import Acceptance
 
@@ -229,7 +223,6 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
 
 
 def _changes(options: argparse.Namespace) -> "ChangedGround | None":
-    """Ground that changed, with a warning where it was seen with another map."""
     from orthonav.core.mapfile.signature import map_digest
     from orthonav.ground.changes.record import read_changes
 
@@ -285,7 +278,6 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
 
 def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProfile"], str]:
-    """Heights above ground along a route, and the terrain in words; none without a terrain."""
     from orthonav.cli.heights import dem_for_route
     from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map

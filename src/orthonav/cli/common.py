@@ -48,7 +48,6 @@ class Progress:
         self._bar.update(round(share * 1000) - self._bar.n)
 
     def close(self) -> None:
-        """Close the current bar."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -93,7 +92,6 @@ def add_area(
 
 
 def add_dem(parser: argparse._ActionsContainer, effect: str) -> None:
-    """Add `--dem` and `--dem-datum`."""
     parser.add_argument(
         "--dem",
         type=Path,
@@ -109,7 +107,6 @@ def add_dem(parser: argparse._ActionsContainer, effect: str) -> None:
 
 
 def add_search(parser: argparse._ActionsContainer) -> None:
-    """Add `--budget-ms` and `--threads`."""
     parser.add_argument(
         "--budget-ms",
         type=float,
@@ -155,7 +152,6 @@ def counted(number: int, noun: str) -> str:
 
 
 def print_json(plain: Any) -> None:
-    """Print one JSON document on stdout."""
     print(json.dumps(plain, indent=1, allow_nan=False))
 
 

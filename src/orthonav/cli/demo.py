@@ -42,7 +42,6 @@ WAYPOINTS_EN_M = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument(
         "--out",
         type=Path,
@@ -55,7 +54,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the demo and print its results."""
     from orthonav.core.files import replacing_folder
 
     start = time.perf_counter()
@@ -119,8 +117,9 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[d
     from orthonav.ground.evaluate.report import MadeFrom, write_report
     from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, table, verdict
     from orthonav.ground.planning.route import read_route
+    from orthonav.ground.recordings.localize import localize_flight
     from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-    from orthonav.onboard.run import SingleViews, localize_flight
+    from orthonav.onboard.run import SingleViews
 
     past, present = (Path(shutil.copy(path, folder)) for path in sorted(IMAGERY.glob("*.tif")))
     _say(options, f"1/4 building the map from {past.name}")

@@ -2,19 +2,13 @@
 
 import argparse
 import json
-import logging
 import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.changed import (
-    add_report_changes,
-    changes_text,
-    changes_to_plain,
-    report_changes,
-)
+from orthonav.cli.changed import add_report_changes, changes_text, changes_to_plain, report_changes
 from orthonav.cli.common import beside, print_json, progress
 from orthonav.cli.needs import require_extras
 
@@ -27,11 +21,8 @@ if TYPE_CHECKING:
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.report.drawing import Background
 
-log = logging.getLogger(__name__)
-
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument(
         "fixes",
         type=Path,
@@ -87,7 +78,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, print the table, write JSON and report."""
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
     from orthonav.ground.evaluate.tables import (
@@ -121,7 +111,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check_options(options: argparse.Namespace) -> None:
-    """Raise what is wrong with the options; fill in one flight and one truth per file of fixes."""
     from orthonav.core.errors import FlightError
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
@@ -144,7 +133,6 @@ def _check_options(options: argparse.Namespace) -> None:
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
-    """One path per file of fixes: a single one is for all; none stays none."""
     from orthonav.core.errors import FlightError
 
     if len(given) == 1:
@@ -158,7 +146,6 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
 
 
 def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
-    """Write `--report-changes` by the views of all flights; None where it was not asked for."""
     from orthonav.core.flight import open_flight
     from orthonav.core.flight.fixes import read_results
 
@@ -173,11 +160,10 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
 
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
-    """Metrics of every flight, with its worst views if their images are given."""
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
     from orthonav.ground.evaluate.contact_sheet import worst_rows
-    from orthonav.ground.evaluate.metrics import check_truth, compare, measure
+    from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.evaluate.track import measure_gnss, measure_track
     from orthonav.ground.report.imagery import SheetImagery
@@ -192,7 +178,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         known = read_truth(truth)
         comparison = compare(known, results, local)
         check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
-        _warn_of_another_run(fixes, truth, folders[i] if folders else None, opened)
+        warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
         worst: tuple[Row, ...] = ()
         if sheet and folders and options.report:
             worst = tuple(worst_rows(comparison, results, folders[i], sheet))
@@ -212,32 +198,18 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     return flights
 
 
-def _warn_of_another_run(
-    fixes: Path, truth: Path, flight: "FlightFolder | None", opened: "MapFile | None"
-) -> None:
-    """Log a warning where fixes were computed from another map or flight than the given ones.
-
-    Without a flight, it is the flight folder that holds the ground truth, if any.
-    """
+def _flight_of(truth: Path) -> "FlightFolder | None":
+    """The flight folder that holds the ground truth, if any."""
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity
 
-    if flight is None and (truth.parent / "telemetry.csv").is_file():
-        with suppress(OrthonavError):
-            flight = open_flight(truth.parent, images_needed=False)
-    given = Identity(
-        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
-    )
-    other = read_identity(fixes).differences(
-        given, opened.path if opened else None, flight.path if flight else None
-    )
-    if other:
-        log.warning("fixes are of %s: %s", other, fixes)
+    with suppress(OrthonavError):
+        if (truth.parent / "telemetry.csv").is_file():
+            return open_flight(truth.parent, images_needed=False)
+    return None
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """A name for each file: its stem, with its folder where stems are equal."""
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         names = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
@@ -265,7 +237,6 @@ def _write_report(
 
 
 def _view_command(options: argparse.Namespace, i: int) -> str:
-    """The command that shows the single views of the flight number `i`; empty without a map."""
     if options.map is None:
         return ""
     words = ["orthonav", "view", str(options.fixes[i]), "--map", str(options.map)]
@@ -279,7 +250,6 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
 
 
 def map_background(opened: "MapFile") -> "Background":
-    """The preview of a map as background; raises `MapFileError` where it is damaged."""
     from orthonav.core.mapfile.layer import preview
     from orthonav.ground.report.drawing import Background
 

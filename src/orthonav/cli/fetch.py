@@ -67,7 +67,10 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--matrix-set", help="tile matrix set of a WMTS")
     group.add_argument("--time", help="ISO 8601 time, or interval A/B of a STAC")
     group.add_argument(
-        "--wms-version", choices=("1.1.1", "1.3.0"), help="version of WMS (default 1.3.0)"
+        "--wms-version",
+        dest="version",
+        choices=("1.1.1", "1.3.0"),
+        help="version of WMS (default 1.3.0)",
     )
     group.add_argument(
         "--service-tile-px",
@@ -81,6 +84,7 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
     group.add_argument(
         "--nodata-colour",
+        dest="empty",
         choices=("black", "white"),
         help="colour of missing imagery: large patches of exactly this colour are masked",
     )
@@ -168,7 +172,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":
-    from orthonav.ground.fetch.mosaic import Packing
     from orthonav.ground.fetch.presets import parse_source
     from orthonav.ground.fetch.run import FetchRequest
     from orthonav.ground.fetch.web import RequestLimits
@@ -188,7 +191,8 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
         area=_area(options),
         out=options.out or Path("none.tif"),
         margin_m=options.margin_m,
-        packing=Packing(options.compress, options.quality),
+        compress=options.compress,
+        quality=options.quality,
         cache=options.cache,
         max_tiles=options.max_tiles,
         max_mb=options.max_mb,
@@ -202,32 +206,12 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
-    return ImageryOptions(
-        layer=options.layer,
-        style=options.style,
-        format=options.format,
-        crs=options.crs.upper() if options.crs else None,
-        matrix_set=options.matrix_set,
-        zoom=options.zoom,
-        gsd_m=options.gsd_m,
-        time=options.time,
-        tile_px=options.tile_px,
-        max_zoom=options.max_zoom,
-        empty=options.nodata_colour,
-        collection=options.collection,
-        asset=options.asset,
-        bands=_bands(options.bands),
-        version=options.wms_version,
-    )
-
-
-def _bands(text: str | None) -> tuple[int, ...] | None:
-    if text is None:
-        return None
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
-        raise FetchError(f"--bands are numbers from 1, such as 1,2,3, got '{text}'")
-    return tuple(int(part) for part in parts)
+    bands = options.bands and options.bands.split(",")
+    if bands and not all(part.strip().isdecimal() and int(part) > 0 for part in bands):
+        raise FetchError(f"--bands are numbers from 1, such as 1,2,3, got '{options.bands}'")
+    named = {name: getattr(options, name) for name in vars(ImageryOptions()) if name in options}
+    crs = options.crs.upper() if options.crs else None
+    return ImageryOptions(**named | {"crs": crs, "bands": bands and tuple(map(int, bands))})
 
 
 def _area(options: argparse.Namespace) -> "Area":

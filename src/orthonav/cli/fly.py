@@ -32,8 +32,6 @@ HEIGHTS = ("distance", "terrain", "amsl", "home", "relative")
 
 
 def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
-    """An argument type: `count` numbers, separated by commas."""
-
     def parse(text: str) -> tuple[float, ...]:
         try:
             values = tuple(float(part) for part in text.split(","))
@@ -46,23 +44,7 @@ def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
     return parse
 
 
-def _number(
-    group: argparse._ActionsContainer,
-    name: str,
-    unit: str,
-    meaning: str,
-    default: float | None = None,
-    *,
-    kind: type[float] = float,
-) -> None:
-    """Add an option that is a number."""
-    if default is not None:
-        meaning += f" (default {default:g})"
-    group.add_argument(name, type=kind, default=default, metavar=unit, help=meaning)
-
-
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
     parser.add_argument(
         "source",
@@ -71,270 +53,119 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="images: /dev/video0 or 0, an rtsp:// or http:// stream, a video, a folder of images "
         "or a flight folder; not with --ros2",
     )
-    _add_camera(parser.add_argument_group("camera"))
-    _add_recording(parser.add_argument_group("playback of recordings"))
-    _add_autopilot(parser.add_argument_group("autopilot"))
-    _add_ros2(parser.add_argument_group("ROS 2"))
-    _add_outputs(parser.add_argument_group("outputs"))
-    _add_messages(parser.add_argument_group("fields of messages"))
-    _add_flight(parser.add_argument_group("flight"))
-    _add_log(parser.add_argument_group("flight log"))
+    _add_inputs(parser)
+    _add_outputs(parser)
+    _add_flight(parser)
 
 
-def _add_camera(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: "
-        "flight.json of the flight folder",
-    )
-    group.add_argument(
-        "--camera-latency-ms",
-        metavar="MS|FILE",
-        help="live cameras: time from exposure to arrival, or the file of `orthonav calibrate "
-        "--latency`; without it nothing is sent",
-    )
-    group.add_argument(
-        "--mount-deg",
-        type=float,
-        nargs=3,
-        default=(0.0, 0.0, 0.0),
-        metavar=("YAW", "PITCH", "ROLL"),
-        help="orientation of the camera in the aircraft; 0 0 0 (default) looks straight down with "
-        "the top of the image forward",
-    )
-    group.add_argument(
-        "--mount",
-        type=Path,
-        metavar="mount.json",
-        help="correct heading, height and tilt with a calibration by `orthonav calibrate`",
-    )
+def _add_inputs(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("camera").add_argument
+    text = "camera file: flight.json, or of OpenCV, ROS or Kalibr (default: of the flight folder)"
+    add("--camera", type=Path, metavar="FILE", help=text)
+    text = "live cameras: time from exposure to arrival; without it nothing is sent"
+    add("--camera-latency-ms", metavar="MS|FILE", help=f"{text} (`orthonav calibrate --latency`)")
+    text = "camera in the aircraft; 0 0 0 (default): straight down, top of the image forward"
+    triple = ("YAW", "PITCH", "ROLL")
+    add("--mount-deg", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=triple, help=text)
+    text = "correct heading, height and tilt with a calibration by `orthonav calibrate`"
+    add("--mount", type=Path, metavar="mount.json", help=text)
+
+    add = parser.add_argument_group("playback of recordings").add_argument
+    text = "use the telemetry of the flight folder; no autopilot is needed"
+    add("--recorded-telemetry", action="store_true", help=text)
+    text = "playback speed (default 1: real time)"
+    add("--pace", type=float, default=1.0, metavar="FACTOR", help=text)
+    text = "whose times recorded ones are: playback starts at once (own, default), or autopilot"
+    add("--file-clock", choices=("own", "autopilot"), default="own", help=text)
+
+    add = parser.add_argument_group("autopilot").add_argument
+    text = "udpin:[HOST:]PORT (default HOST: loopback), udpout:HOST:PORT, tcp:HOST:PORT or "
+    add("--autopilot", metavar="URL", help=f"MAVLink connection: {text}/dev/DEVICE:BAUD")
+    text = "system id of the autopilot (default: the first one heard)"
+    add("--system-id", type=int, metavar="N", help=text)
+    text = "key of MAVLink signing (32 bytes or 64 hexadecimal digits); unsigned ones are ignored"
+    add("--signing-key", type=Path, metavar="FILE", help=text)
+    text = "source of the height above ground; repeat in order of preference (default: all, so)"
+    add("--height", action="append", choices=HEIGHTS, help=text)
+
+    add = parser.add_argument_group("ROS 2").add_argument
+    text = "images, telemetry and positions by ROS 2 topics, without SOURCE and --autopilot"
+    add("--ros2", action="store_true", help=f"{text} (docs/ros2.md)")
+    text = "must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE, "
+    text += "--params-file FILE, --log-level LEVEL"
+    add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARGS", help=text)
 
 
-def _add_recording(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--recorded-telemetry",
-        action="store_true",
-        help="use the telemetry of the flight folder; no autopilot is needed",
-    )
-    group.add_argument(
-        "--pace",
-        type=float,
-        default=1.0,
-        metavar="FACTOR",
-        help="playback speed (default 1: real time)",
-    )
-    group.add_argument(
-        "--file-clock",
-        choices=("own", "autopilot"),
-        default="own",
-        help="own: playback starts at once (default); autopilot: recorded times are those of the "
-        "autopilot's clock since boot",
-    )
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("outputs").add_argument
+    text = "message to send to the autopilot (default global-position); can be repeated"
+    add("--send", action="append", choices=SEND, help=text)
+    text = "NMEA to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD; can be repeated"
+    add("--nmea", action="append", default=[], metavar="URL", help=text)
+    text = "append one line of JSON per view to a file, or to stdout (-); can be repeated"
+    add("--jsonl", action="append", default=[], metavar="FILE|-", help=text)
+    text = "maximum rate of each message (default: one per view)"
+    add("--send-rate-hz", type=float, metavar="HZ", help=text)
+    text = "criterion of a confident fix and its threshold: confidence:0.9 (default), or "
+    text += "peak_ratio:1.3 in addition; other fixes are not sent"
+    add("--accept", default="confidence:0.9", metavar="NAME:MIN", help=text)
+    text = "largest standard deviation of a position that is sent (default 50)"
+    add("--max-std-m", type=float, default=50.0, metavar="M", help=text)
+    text = "also send dead-reckoned positions, as GLOBAL_POSITION_SENSOR with the flag UNHEALTHY"
+    add("--send-coasting", action="store_true", help=f"{text}, which PX4 ignores")
+    text = "lower bound of the standard deviation that messages state (default 0)"
+    add("--min-std-m", type=float, default=0.0, metavar="M", help=text)
+    add("--dry-run", action="store_true", help="send nothing to the autopilot")
+
+    add = parser.add_argument_group("fields of messages").add_argument
+    text = "clock of the timestamps: UTC (default), or the autopilot's time since boot"
+    add("--stamp", choices=("utc", "boot"), default="utc", help=text)
+    text = "origin of the local frame (degrees, m above sea level): for odometry and vision set "
+    text += "where the autopilot has none; with --ros2: of the map frame"
+    triple = "LAT,LON,ALT_M"
+    add("--origin", type=numbers(3, triple), metavar=triple, help=text)
+    text = "id of GLOBAL_POSITION_SENSOR, as EKF2_AGP0_ID (default 1)"
+    add("--sensor-id", type=int, default=1, metavar="N", help=text)
+    add("--gps-id", type=int, default=0, metavar="N", help="gps_id of GPS_INPUT (default 0)")
+    text = "satellites_visible of GPS_INPUT (default 0)"
+    add("--satellites", type=int, default=0, metavar="N", help=text)
+    text = "hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)"
+    add("--hdop-m", type=float, metavar="M", help=text)
+    text = "NMEA quality 1 (GPS fix) instead of 6 (estimated)"
+    add("--nmea-as-gps", action="store_true", help=text)
 
 
-def _add_autopilot(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--autopilot",
-        metavar="URL",
-        help="MAVLink connection: udpin:[HOST:]PORT (default HOST: loopback), udpout:HOST:PORT, "
-        "tcp:HOST:PORT or /dev/DEVICE:BAUD",
-    )
-    _number(
-        group,
-        "--system-id",
-        "N",
-        "system id of the autopilot (default: the first one heard)",
-        kind=int,
-    )
-    group.add_argument(
-        "--signing-key",
-        type=Path,
-        metavar="FILE",
-        help="file with the key of MAVLink signing, 32 bytes or 64 hexadecimal digits; messages "
-        "are then signed, and unsigned ones ignored",
-    )
-    group.add_argument(
-        "--height",
-        action="append",
-        choices=HEIGHTS,
-        help="source of the height above ground; can be repeated in order of preference (default: "
-        "all, in this order)",
-    )
-    _number(
-        group,
-        "--telemetry-wait-ms",
-        "MS",
-        "longest wait of a view for the attitude at its exposure",
-        150.0,
-    )
-
-
-def _add_ros2(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--ros2",
-        action="store_true",
-        help="read images and telemetry from ROS 2 topics and publish positions there, instead "
-        "of SOURCE and --autopilot (docs/ros2.md)",
-    )
-    group.add_argument(
-        "--ros-args",
-        nargs=argparse.REMAINDER,
-        default=[],
-        metavar="ARGS",
-        help="must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE, "
-        "--params-file FILE, --log-level LEVEL",
-    )
-
-
-def _add_outputs(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--send",
-        action="append",
-        choices=SEND,
-        help="message to send to the autopilot (default global-position); can be repeated",
-    )
-    group.add_argument(
-        "--nmea",
-        action="append",
-        default=[],
-        metavar="URL",
-        help="send NMEA sentences to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD; "
-        "can be repeated",
-    )
-    group.add_argument(
-        "--jsonl",
-        action="append",
-        default=[],
-        metavar="FILE|-",
-        help="append one line of JSON per view to a file, or write them to stdout (-); can be "
-        "repeated",
-    )
-    _number(group, "--send-rate-hz", "HZ", "maximum rate of each message (default: one per view)")
-    group.add_argument(
-        "--accept",
-        default="confidence:0.9",
-        metavar="NAME:MIN",
-        help="criterion of a confident fix and its threshold: confidence:0.9 (default), or "
-        "peak_ratio:1.3 in addition; other fixes are not sent",
-    )
-    _number(
-        group, "--max-std-m", "M", "largest standard deviation of a position that is sent", 50.0
-    )
-    group.add_argument(
-        "--send-coasting",
-        action="store_true",
-        help="also send dead-reckoned positions of views that do not show the map, only as "
-        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, which PX4 ignores",
-    )
-    _number(
-        group, "--min-std-m", "M", "lower bound of the standard deviation that messages state", 0.0
-    )
-    group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
-
-
-def _add_messages(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--stamp",
-        choices=("utc", "boot"),
-        default="utc",
-        help="clock of the timestamps: UTC of this computer (default), or the autopilot's time "
-        "since boot",
-    )
-    group.add_argument(
-        "--origin",
-        type=numbers(3, "LAT,LON,ALT_M"),
-        metavar="LAT,LON,ALT_M",
-        help="origin of the local frame (degrees, m above mean sea level), for odometry and "
-        "vision: set where the autopilot has none; with --ros2: origin of the map frame",
-    )
-    _number(group, "--sensor-id", "N", "id of GLOBAL_POSITION_SENSOR, as EKF2_AGP0_ID", 1, kind=int)
-    _number(group, "--gps-id", "N", "gps_id of GPS_INPUT", 0, kind=int)
-    _number(group, "--satellites", "N", "satellites_visible of GPS_INPUT", 0, kind=int)
-    _number(
-        group,
-        "--hdop-m",
-        "M",
-        "hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)",
-    )
-    group.add_argument(
-        "--nmea-as-gps",
-        action="store_true",
-        help="NMEA quality 1 (GPS fix) instead of 6 (estimated)",
-    )
-
-
-def _add_flight(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--heading",
-        choices=("known", "unknown"),
-        default="known",
-        help="known: from telemetry (default); unknown: all headings are tried",
-    )
-    group.add_argument(
-        "--start",
-        type=numbers(3, "LAT,LON,STD_M"),
-        metavar="LAT,LON,STD_M",
-        help="start position and its standard deviation per axis (degrees, m; default: anywhere "
-        "on the map); over a map with terrain also the take-off position",
-    )
-    group.add_argument(
-        "--state",
-        type=Path,
-        metavar="FILE",
-        help="save the last position to this file and start from it after a restart",
-    )
-    _number(
-        group,
-        "--state-max-age-s",
-        "S",
-        "largest age of a saved position that a flight starts from, and of a stop after which the "
-        "learning of --gnss continues",
-        300.0,
-    )
-    group.add_argument(
-        "--gnss",
-        choices=("off", "watch", "correct"),
-        default="off",
-        help="watch: compare GNSS with the map, report faults, learn the displacement of the map, "
-        "errors of the mount and the latency; correct: also correct positions by what earlier "
-        "flights stored in --state (default off)",
-    )
-    _number(
-        group,
-        "--deadline-ms",
-        "MS",
-        "largest age of a view when its processing starts; older views are dropped",
-        500.0,
-    )
-    _number(
-        group,
-        "--min-agl-m",
-        "M",
-        "height above ground from which views are located (default: where a view covers 60 "
-        "pixels of the map)",
-    )
+def _add_flight(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("flight")
+    add = group.add_argument
+    text = "known: from telemetry (default); unknown: all headings are tried"
+    add("--heading", choices=("known", "unknown"), default="known", help=text)
+    text = "start position and its standard deviation per axis (default: anywhere on the map); "
+    text += "over a map with terrain also the take-off position"
+    triple = "LAT,LON,STD_M"
+    add("--start", type=numbers(3, triple), metavar=triple, help=text)
+    text = "save the last position to this file and start from it after a restart"
+    add("--state", type=Path, metavar="FILE", help=text)
+    text = "largest age of a saved position that a flight starts from, and of a stop after which "
+    text += "the learning of --gnss continues (default 300)"
+    add("--state-max-age-s", type=float, default=300.0, metavar="S", help=text)
+    text = "watch: compare GNSS with the map, report faults and learn displacement, mount and "
+    text += "latency; correct: also correct by what --state has of earlier flights (default off)"
+    add("--gnss", choices=("off", "watch", "correct"), default="off", help=text)
+    text = "largest age of a view when its processing starts; older ones are dropped (default 500)"
+    add("--deadline-ms", type=float, default=500.0, metavar="MS", help=text)
+    text = "height above ground from which views are located (default: 60 pixels of the map across)"
+    add("--min-agl-m", type=float, metavar="M", help=text)
     add_search(group)
     add_signature(group)
 
-
-def _add_log(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--log", type=Path, metavar="FILE.mcap", help="write a flight log that can be replayed"
-    )
-    _number(
-        group,
-        "--log-max-mb",
-        "MB",
-        "maximum size of the log; its oldest files are deleted (default: no limit)",
-    )
-    group.add_argument(
-        "--log-views",
-        choices=("none", "thumbnails", "full"),
-        default="full",
-        help="images in the log; a replay needs full ones (default)",
-    )
+    add = parser.add_argument_group("flight log").add_argument
+    text = "write a flight log that can be replayed"
+    add("--log", type=Path, metavar="FILE.mcap", help=text)
+    text = "maximum size of the log; its oldest files are deleted (default: no limit)"
+    add("--log-max-mb", type=float, metavar="MB", help=text)
+    text = "images in the log; a replay needs full ones (default)"
+    add("--log-views", choices=("none", "thumbnails", "full"), default="full", help=text)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -370,7 +201,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Raise `VariantError` where images or telemetry have no source, or two."""
     from orthonav.core.errors import VariantError
 
     if options.ros2 and (options.source or options.autopilot):

@@ -34,18 +34,17 @@ from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras
-from orthonav.onboard.cameras import CameraThread, NewestImage
-from orthonav.onboard.console import Console, Inputs, Narrator
+from orthonav.onboard.cameras import NewestImage, read_in_thread
+from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.gnss.biases import Biases
-from orthonav.onboard.gnss.learner import Resumed
+from orthonav.onboard.gnss.biases import Biases, Resumed
 from orthonav.onboard.gnss.watch import (
     GnssSource,
     GnssWatch,
     LiveSolutions,
     RecordedSolutions,
 )
-from orthonav.onboard.health import Notifier, TelemetryDiagnosis
+from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
@@ -61,9 +60,7 @@ from orthonav.onboard.outputs import (
     MessageOptions,
     Messenger,
     NmeaOut,
-    PositionOutput,
     Publisher,
-    ViewOutput,
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
@@ -80,20 +77,20 @@ from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
 
 log = logging.getLogger(__name__)
 LEAST_VIEW_PX = 60.0
-"""Narrower views (pixels of the map across) are seldom confident and take the longest, which makes
-the next ones late. An aircraft climbs through them."""
+"""Narrower views (pixels of the map across) are seldom confident, and slow."""
 START_OFF_M, START_SIGMAS = 3000.0, 3.0
-"""A start farther off the map than this distance and so many of its deviations ends the program: a
-flight that comes from there gives the place where it reaches the map, or a larger deviation."""
+"""A start farther off the map than this distance and so many deviations ends the program."""
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
-    """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
-    console = opened_console(options, clocks, stack)
+    console = Console(sys.stderr, clocks, quiet=options.quiet)
+    stack.callback(console.close)
+    stack.enter_context(console.in_place_of_stderr())
     opened = _opened(options)
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
@@ -110,7 +107,12 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
 
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
-    source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
+    if options.ros2:
+        ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
+        frame = localizer.sheet.frame
+        source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
+    else:
+        source, graph = _source(options, clocks, link, camera, stopping), None
     console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
     for line in plan_lines(options, opened, least):
         console.say(line)
@@ -123,28 +125,28 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
         gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     newest = NewestImage()
-    sends = not options.dry_run and (link is not None or graph is not None)
-    is_live = options.ros2 or cameras.is_live(options.source)
-    inputs = Inputs(newest, awaited(options), is_live, link, options.autopilot, sends)
-    narrator = Narrator(console, clocks, inputs)
+    narrator = Narrator(
+        *(console, clocks, newest, _wanted(options), link, options.autopilot),
+        is_live=options.ros2 or cameras.is_live(options.source),
+        sends=not options.dry_run and (link is not None or graph is not None),
+    )
     publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera, digest)
-    if options.ros2 and sink is not None:
-        source.log_gnss = sink.gnss
-    if gnss is not None and sink is not None and not options.ros2:
-        gnss.log = sink.gnss  # with ROS 2 messages are logged as received
-    thread = CameraThread(source, stopping, newest)
-    stack.callback(thread.stop)
+    if sink is not None and options.ros2:
+        source.log_gnss = sink.gnss  # messages as received
+    elif sink is not None and gnss is not None:
+        gnss.log = sink.gnss
+    stack.callback(read_in_thread(newest, source, stopping))
+    least_agl_m = LEAST_VIEW_PX * localizer.grid.gsd_m / math.sqrt(math.prod(camera.extent))
     fly = FlyOptions(
         mount_deg=tuple(options.mount_deg),
         mount=mount,
         heights=heights,
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
-        min_agl_m=_min_agl_m(options, camera, localizer),
-        telemetry_wait_s=options.telemetry_wait_ms / 1e3,
+        min_agl_m=least_agl_m if options.min_agl_m is None else options.min_agl_m,
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
@@ -167,27 +169,35 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         ),
         start=start,
         fresh=locator,
-        notifier=Notifier(),
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
     )
 
 
-def _min_agl_m(options: argparse.Namespace, camera: Camera, localizer: Localizer) -> float:
-    """Height from which views are located: as given, else where they cover enough of the map."""
-    if options.min_agl_m is not None:
-        return float(options.min_agl_m)
-    across, along = camera.extent
-    return LEAST_VIEW_PX * localizer.grid.gsd_m / math.sqrt(across * along)
-
-
 def _opened(options: argparse.Namespace) -> MapFile:
-    """The map, its signature checked first where that is asked for."""
     signature = checked_signature(options)
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
     if signature is not None and options.state is not None:
         require_newest(options.state, signature, options.map)
     return opened
+
+
+def _wanted(options: argparse.Namespace) -> str | None:
+    """The images that are waited for; None for those of ROS 2, whose reader says so."""
+    if options.ros2:
+        return None
+    clock = " (times of the autopilot's clock)" if options.file_clock == "autopilot" else ""
+    return f"images from {options.source}{clock}"
+
+
+def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
+    if options.log is None:
+        return None
+    from orthonav.onboard.log import FlightLog  # only where it is asked for
+
+    info = {"name": options.map.name, "manifest_sha256": digest}
+    most = None if options.log_max_mb is None else round(options.log_max_mb * 1e6)
+    return FlightLog(options.log, camera, info, views=options.log_views, max_bytes=most)
 
 
 def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMonitor | None:
@@ -204,7 +214,6 @@ def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMoni
 
 
 def _stated(text: str | None) -> CameraLatency | None:
-    """Latency of `--camera-latency-ms`: a number or a file."""
     if text is None:
         return None
     try:
@@ -216,27 +225,7 @@ def _stated(text: str | None) -> CameraLatency | None:
     return stated
 
 
-def _inputs(
-    options: argparse.Namespace,
-    clocks: Clocks,
-    link: AutopilotLink | None,
-    camera: Camera | None,
-    stopping: threading.Event,
-    stack: ExitStack,
-    localizer: Localizer,
-    least: float,
-) -> tuple[Any, PositionOutput | None]:
-    """Source of images, and the output that belongs to it, if any."""
-    if camera is not None and not options.ros2:
-        return _source(options, clocks, link, camera, stopping), None
-    ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
-    frame = localizer.sheet.frame
-    source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
-    return source, graph
-
-
 def _camera(options: argparse.Namespace) -> Camera | None:
-    """Camera of a file; None for that of a ROS 2 topic."""
     if options.camera is not None:
         return read_camera_file(options.camera)
     if options.ros2:
@@ -251,15 +240,12 @@ def _source(
     options: argparse.Namespace,
     clocks: Clocks,
     link: AutopilotLink | None,
-    camera: Camera,
+    camera: Camera | None,
     stopping: threading.Event,
-) -> cameras.ImageSource:
+) -> Any:
     if cameras.is_live(options.source):
-        return cameras.LiveCamera(
-            cameras.live_name(options.source),
-            clocks,
-            size_px=(camera.width_px, camera.height_px),
-        )
+        size_px = None if camera is None else (camera.width_px, camera.height_px)
+        return cameras.LiveCamera(cameras.live_name(options.source), clocks, size_px=size_px)
     if not options.pace > 0:
         raise VariantError("--pace must be above 0")
     due_ns: Callable[[int], int | None] = cameras.own_pace(clocks, options.pace)
@@ -308,7 +294,7 @@ def _publisher(
     clocks: Clocks,
     link: AutopilotLink | None,
     least: float,
-    graph: PositionOutput | None,
+    graph: "Ros2Publisher | None",
     narrator: Narrator,
     digest: str,
 ) -> Publisher:
@@ -339,18 +325,17 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        lines: list[ViewOutput] = [
+        lines: list[Any] = [
             JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None if link is None else Messenger(chosen, gate, link.send, clocks)
+    messenger = None if link is None else Messenger(chosen, gate, link, clocks)
     return Publisher(
         gate,
         clocks,
         messenger=messenger,
-        link=link,
         nmea=nmea,
         lines=[*lines, narrator],
         graph=graph,
@@ -360,7 +345,6 @@ def _publisher(
 
 
 def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
-    """Warn of local messages at a rate at which PX4 does not fuse them."""
     local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
     if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
         log.warning(
@@ -372,21 +356,8 @@ def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
         )
 
 
-def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
-    if options.log is None:
-        return None
-    from orthonav.onboard.log import FlightLog  # only where it is asked for
-
-    info = {"name": options.map.name, "manifest_sha256": digest}
-    most = None if options.log_max_mb is None else round(options.log_max_mb * 1e6)
-    return FlightLog(options.log, camera, info, views=options.log_views, max_bytes=most)
-
-
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
-    """Options for a replay of the log, and the whole command line.
-
-    Files are logged by name: the contents of a key file are written nowhere.
-    """
+    """Options for a replay, and the command line; the contents of a key file are never logged."""
     line = {
         name: [str(each) for each in value] if isinstance(value, list | tuple) else str(value)
         for name, value in vars(options).items()
@@ -403,29 +374,32 @@ def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[st
     }
 
 
-def opened_console(options: argparse.Namespace, clocks: Clocks, stack: ExitStack) -> Console:
-    """Console on stderr, which `stack` closes; it takes the log records of stderr."""
-    console = Console(sys.stderr, clocks, quiet=options.quiet)
-    stack.callback(console.close)
-    stack.enter_context(console.in_place_of_stderr())
-    return console
-
-
-def awaited(options: argparse.Namespace) -> str | None:
-    """The images that are waited for; None for those of ROS 2, whose reader says so."""
-    if options.ros2:
-        return None
-    clock = " (times of the autopilot's clock)" if options.file_clock == "autopilot" else ""
-    return f"images from {options.source}{clock}"
-
-
 def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> list[str]:
-    """What the flight uses and sends, one line each. `least`: confidence from which it sends."""
+    sheet, area_km2 = opened.manifest.sheets[0], opened.manifest.area_km2
+    terrain, ground = sheet.terrain, "level ground"
+    if terrain is not None:
+        ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
+    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
+    telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
+    kinds = dict.fromkeys(options.send or ["global-position"])
+    sent = [KINDS[kind] for kind in kinds] if options.autopilot else []
+    sent += ["ROS 2 topics"] if options.ros2 else []
+    if options.dry_run and sent:
+        sent = ["nothing to the autopilot (--dry-run)"]
+    sent += [f"NMEA to {url}" for url in options.nmea]
+    sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
+    confident = f"; positions of confidence {least:g} or more"
+    start = "anywhere on the map"
+    if options.start:
+        lat_deg, lon_deg, std_m = options.start
+        start = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
+    if options.state is not None:
+        start = f"position saved in {options.state}, if it is recent, else {start}"
     lines = [
-        f"map: {_map_text(options.map, opened)}",
-        f"autopilot: {_telemetry_text(options)}",
-        f"sends: {_sends_text(options, least)}",
-        f"start: {_start_text(options)}",
+        f"map: {options.map}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}",
+        f"autopilot: {'telemetry from ROS 2' if options.ros2 else telemetry}",
+        f"sends: {', '.join(sent) + confident if sent else 'nothing'}",
+        f"start: {start}",
         f"GNSS: {'not used' if options.gnss == 'off' else options.gnss}",
     ]
     if options.log is not None:
@@ -434,8 +408,10 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
 
 
 def camera_line(options: argparse.Namespace, camera: Camera) -> str:
-    """Size and field of view of the camera, and where its images come from."""
-    width_deg, height_deg = (_view_deg(each, camera.model) for each in camera.extent)
+    """Size and field of view, without distortion, of the camera, and where its images come from."""
+    fisheye = camera.model == "fisheye"
+    angles = [each if fisheye else 2 * math.atan(each / 2) for each in camera.extent]
+    width_deg, height_deg = map(math.degrees, angles)
     given = options.camera or ("camera_info" if options.ros2 else "flight.json")
     source, pace = "ROS 2" if options.ros2 else str(options.source), ""
     if not options.ros2 and not cameras.is_live(source):
@@ -444,50 +420,6 @@ def camera_line(options: argparse.Namespace, camera: Camera) -> str:
         f"camera: {camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg "
         f"({given}); images from {source}{pace}"
     )
-
-
-def _view_deg(extent: float, model: str) -> float:
-    """Field of view along one side, without distortion."""
-    half = extent / 2
-    return math.degrees(2 * (half if model == "fisheye" else math.atan(half)))
-
-
-def _map_text(path: Path, opened: MapFile) -> str:
-    sheet = opened.manifest.sheets[0]
-    terrain = sheet.terrain
-    ground = "level ground"
-    if terrain is not None:
-        ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
-    return f"{path}, {opened.manifest.area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}"
-
-
-def _telemetry_text(options: argparse.Namespace) -> str:
-    if options.ros2:
-        return "telemetry from ROS 2"
-    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
-    return ", ".join(each for each in (options.autopilot, recorded) if each)
-
-
-def _sends_text(options: argparse.Namespace, least: float) -> str:
-    kinds = dict.fromkeys(options.send or ["global-position"])
-    messages = [KINDS[kind] for kind in kinds] if options.autopilot else []
-    messages += ["ROS 2 topics"] if options.ros2 else []
-    if options.dry_run and messages:
-        messages = ["nothing to the autopilot (--dry-run)"]
-    others = [f"NMEA to {url}" for url in options.nmea]
-    others += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
-    text = ", ".join([*messages, *others])
-    return f"{text}; positions of confidence {least:g} or more" if text else "nothing"
-
-
-def _start_text(options: argparse.Namespace) -> str:
-    given = "anywhere on the map"
-    if options.start:
-        lat_deg, lon_deg, std_m = options.start
-        given = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
-    if options.state is None:
-        return given
-    return f"position saved in {options.state}, if it is recent, else {given}"
 
 
 def gnss_watch(
@@ -499,12 +431,8 @@ def gnss_watch(
     min_confidence: float,
     clocks: Clocks,
 ) -> GnssWatch:
-    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder.
-
-    `digest`: of the map. `used`: camera, its mount and stated latency; after a change of them,
-    what they add to the difference is learnt again. Raises `VariantError` where GNSS has no source,
-    or `correct` no state.
-    """
+    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
+    change of what is `used` (camera, mount, latency), what that adds is learnt again."""
     if options.gnss == "correct" and options.state is None:
         raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
@@ -534,11 +462,8 @@ def gnss_watch(
 def _learnt_before(
     options: argparse.Namespace, digest: str, clocks: Clocks
 ) -> tuple[Mapping[str, Biases], Resumed | None]:
-    """What was learnt before this flight, and by it, where it was interrupted.
-
-    A state is that of this flight if the program that saved it stopped no longer than
-    `--state-max-age-s` ago, or at an unknown time because a clock was set back.
-    """
+    """What was learnt before this flight, and by it, where it was interrupted: the saving program
+    stopped at most `--state-max-age-s` ago, or at an unknown time."""
     if options.state is None:
         return {}, None
     saved = load(options.state)
@@ -552,10 +477,7 @@ def _learnt_before(
 def start_of(
     options: argparse.Namespace, clocks: Clocks, localizer: Localizer
 ) -> Callable[[], Prior | None]:
-    """Function that gives the prior of the first view.
-
-    It is the saved position if that is recent, but once only, else `--start`, else None.
-    """
+    """Gives the first prior: a recent saved position, but once only, else `--start`, else None."""
     given = given_start(options, localizer)
     saved = [load(options.state)] if options.state else []
 
@@ -570,8 +492,6 @@ def start_of(
 
 
 def given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
-    """The position of `--start`; a warning where it is off the map. Raises `UsageError` where it is
-    none, or where the aircraft cannot be over the map by it."""
     if not options.start:
         return None
     start = Prior(*options.start)

@@ -9,11 +9,10 @@ from contextlib import ExitStack
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.graph import Graph, Rosout
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.rcl import joined_graph
 from orthonav.onboard.ros2.reader import Ros2Reader
-from orthonav.onboard.ros2.rosout import Rosout
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 
@@ -25,11 +24,8 @@ def joined(
     frame: LocalFrame,
     min_confidence: float,
 ) -> tuple[Ros2Reader, Ros2Publisher]:
-    """Reader and publisher of a new node; `stack` closes the node.
-
-    `frame` is the local frame of the map; its centre is the origin of the ROS map frame unless
-    `--origin` is given.
-    """
+    """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
+    of the ROS map frame unless `--origin` is given."""
     node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
     stack.callback(node.close)
     _log_as_asked(node, stack)
@@ -39,7 +35,6 @@ def joined(
         clocks,
         stopping.is_set,
         mount_deg=tuple(options.mount_deg),
-        wait_s=options.telemetry_wait_ms / 1e3,
     )
     origin = LocalFrame(*options.origin[:2]) if options.origin else frame
     publisher = Ros2Publisher(
@@ -58,7 +53,6 @@ def joined(
 
 
 def _log_as_asked(node: Graph, stack: ExitStack) -> None:
-    """The log on `/rosout`, at the level of `--log-level` and where it is wanted, until the end."""
     own, arguments = logging.getLogger("orthonav"), node.arguments
     level, propagates = own.level, own.propagate
     handler = logging.NullHandler() if "rosout" in arguments.silenced else Rosout(node)

@@ -25,7 +25,6 @@ EVERYDAY = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument(
         "source",
         type=Path,
@@ -50,7 +49,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Import and print a summary."""
     from orthonav.core.geo.headings import RADIANS
     from orthonav.ground.recordings import OverTerrain, import_flight
 

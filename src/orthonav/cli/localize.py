@@ -1,8 +1,11 @@
 """`orthonav localize`: find the positions of the views of a flight."""
 
 import argparse
+import json
 import logging
+import math
 from collections.abc import Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,25 +16,34 @@ from orthonav.cli.changed import (
     check_comparable,
     report_changes,
 )
-from orthonav.cli.common import add_search, beside, counted, print_json, progress, search_plan
-from orthonav.cli.flown import compare_with_flight, take_flown
+from orthonav.cli.common import (
+    Progress,
+    add_search,
+    beside,
+    counted,
+    print_json,
+    progress,
+    search_plan,
+)
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
-from orthonav.cli.positions import (
-    check_destination,
-    positions_to_plain,
-    write_positions,
-)
 from orthonav.cli.setups import Counts, SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from orthonav.core.flight.fixes import Identity
+    from orthonav.core.flight.heights import FlownHeights
+    from orthonav.core.flight.mount import Mount
     from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import MapFile
-    from orthonav.core.records import ViewResult
+    from orthonav.core.records import Fix, ViewResult
     from orthonav.ground.changes.record import ChangedGround
+    from orthonav.ground.recordings import Recording, SourceView
+    from orthonav.onboard.run import Locator
 
 EVERYDAY = (
     "--heading",
@@ -50,9 +62,21 @@ EVERYDAY = (
 
 log = logging.getLogger(__name__)
 
+_CHOICES = {
+    "heading": ("known", "unknown"),
+    "prior": ("telemetry", "none"),
+    "registration": ("on", "off"),
+    "position": ("peak", "best", "neighbours", "weighted"),
+}
+_HINTS = (
+    ("yaw_deg", "give --heading unknown"),
+    ("agl_m", "give --agl-m"),
+    ("pitch_deg", "give --looks-down"),
+)
+"""What to do about a value that is missing."""
+
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.add_argument("map", metavar="MAP.onav", help="map, or with --atlas an atlas")
     parser.add_argument(
         "flight",
@@ -177,8 +201,7 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Localize and write one line per view."""
-    check_destination(options)
+    _check_destination(options)
     if options.atlas:
         _on_atlas(options)
     else:
@@ -195,14 +218,8 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.run import (
-        Locator,
-        MountCorrected,
-        SingleViews,
-        localize_flight,
-        model_of,
-        smoothed_track,
-    )
+    from orthonav.ground.recordings.localize import smoothed_track
+    from orthonav.onboard.run import Locator, MountCorrected, SingleViews, model_of
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
@@ -212,7 +229,7 @@ def _on_map(options: argparse.Namespace) -> None:
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
-    mount = take_flown(options, flight)
+    mount = _take_flown(options, flight)
     accept = Acceptance.parse(options.accept)
     localizer = _localizer(options, opened, accept)
     check_comparable(options, localizer.registration, opened)
@@ -231,31 +248,21 @@ def _on_map(options: argparse.Namespace) -> None:
     if mount:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
-    results, advisor = [], SetupAdvice(options, flight, localizer, mount, heights)
-    digest = FlightDigest()
+    advisor, digest = SetupAdvice(options, flight, localizer, mount, heights), FlightDigest()
     with progress(options) as shown:
-        for result in localize_flight(
-            locator,
-            flight,
-            skip_bad_images=options.skip_bad_images,
-            accept=accept,
-            heights=heights,
-            views=digest.watching(advisor.watching()),
-        ):
-            results.append(result)
-            advisor.take(result)
-            if flight.expected:
-                shown("localize", min(1.0, len(results) / flight.expected))
+        views = digest.watching(advisor.watching())
+        results = _located(options, locator, flight, accept, views, shown, heights, advisor.take)
         if tracker is not None and options.smooth:
             results = smoothed_track(tracker, results, accept)
         else:
-            compare_with_flight(flight, results)
-        write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
+            _compare_with_flight(flight, results)
+        _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
         changed = report_changes(options, opened, [(seen_by, results)], shown)
-    _print_summary(options, results, accept, advice, tried, changed)
+    with _beside_outputs(options):
+        _print_summary(options, results, accept, advice, tried, changed)
 
 
 def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":
@@ -287,7 +294,6 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.ground.atlas.locate import AtlasLocator
     from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
     from orthonav.ground.recordings.export import export_all, export_of
-    from orthonav.onboard.run import localize_flight
 
     asked = [
         name
@@ -307,7 +313,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     exports = [export_of(each) for each in options.export]
     flight = open_source(options.flight, options)
     say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
-    results, digest = [], FlightDigest()
+    digest = FlightDigest()
     search = TileSearch(Atlas.open(options.map))
     with progress(options) as shown:
         if search.unknown:
@@ -319,19 +325,50 @@ def _on_atlas(options: argparse.Namespace) -> None:
         locator = AtlasLocator(
             SheetRegistrar(search.atlas), search, heading_known=options.heading == "known"
         )
-        for result in localize_flight(
-            locator,
-            flight,
-            skip_bad_images=options.skip_bad_images,
-            accept=accept,
-            views=digest.watching(flight.views),
-        ):
-            results.append(result)
-            if flight.expected:
-                shown("localize", min(1.0, len(results) / flight.expected))
-    write_positions(options, results, Identity(flight_sha256=digest.sha256))
+        views = digest.watching(flight.views)
+        results = _located(options, locator, flight, accept, views, shown)
+    _write_positions(options, results, Identity(flight_sha256=digest.sha256))
     export_all(exports, results, None)
-    _print_summary(options, results, accept)
+    with _beside_outputs(options):
+        _print_summary(options, results, accept)
+
+
+def _located(
+    options: argparse.Namespace,
+    locator: "Locator",
+    flight: "Recording",
+    accept: "Acceptance",
+    views: "Iterable[SourceView]",
+    shown: Progress,
+    heights: "FlownHeights | None" = None,
+    take: "Callable[[ViewResult], None]" = lambda result: None,
+) -> "list[ViewResult]":
+    """Results of the views; `take` gets each."""
+    from orthonav.ground.recordings.localize import localize_flight
+
+    results = []
+    for result in localize_flight(
+        locator,
+        flight,
+        skip_bad_images=options.skip_bad_images,
+        accept=accept,
+        heights=heights,
+        views=views,
+    ):
+        results.append(result)
+        take(result)
+        if flight.expected:
+            shown("localize", min(1.0, len(results) / flight.expected))
+    return results
+
+
+@contextmanager
+def _beside_outputs(options: argparse.Namespace) -> "Iterator[None]":
+    """What is printed goes to stderr where an output is stdout."""
+    outputs = [options.out, options.report_changes]
+    outputs += [Path(each.partition("=")[2]) for each in options.export]
+    with beside(*outputs):
+        yield
 
 
 def _print_summary(
@@ -341,21 +378,6 @@ def _print_summary(
     advice: Sequence[str] = (),
     tried: Sequence[dict[str, Any]] = (),
     changed: "ChangedGround | None" = None,
-) -> None:
-    """Print the summary, on stderr where an output is stdout."""
-    outputs = [options.out, options.report_changes]
-    outputs += [Path(each.partition("=")[2]) for each in options.export]
-    with beside(*outputs):
-        _print_counts(options, results, accept, advice, tried, changed)
-
-
-def _print_counts(
-    options: argparse.Namespace,
-    results: "list[ViewResult]",
-    accept: "Acceptance",
-    advice: Sequence[str],
-    tried: Sequence[dict[str, Any]],
-    changed: "ChangedGround | None",
 ) -> None:
     import numpy as np
 
@@ -379,7 +401,7 @@ def _print_counts(
         **changes_to_plain(options, changed),
     }
     if options.json:
-        print_json(plain | positions_to_plain(options, results))
+        print_json(plain | _positions_to_plain(options, results))
         return
     least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
     named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
@@ -398,3 +420,164 @@ def _print_counts(
         print(f"written to {'stdout' if is_stdout(options.out) else options.out}{guesses}")
     for line in changes_text(options, changed):
         print(line)
+
+
+def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | None":
+    """Mount to use; with `--as-flown`, the logged options replace those of `options`.
+
+    Logs a warning where options or the map differ from those of the flight. Raises `FlightError`
+    for invalid logged options.
+    """
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight.mount import read_mount
+    from orthonav.ground.recordings import LoggedFlight
+
+    mount: Mount | None = read_mount(options.mount) if options.mount else None
+    if not isinstance(flight, LoggedFlight):
+        if options.as_flown:
+            raise FlightError(f"--as-flown needs a flight log: {flight.path}")
+        return mount
+    _check_map(options, flight.session.get("map"))
+    flown = _logged_options(flight.session.get("options"))
+    chosen: dict[str, Any] = {name: getattr(options, name) for name in (*_CHOICES, "accept")}
+    chosen["track"] = options.track or options.smooth
+    chosen["mount"] = mount
+    if flown.get("accept") is None:  # the runner logs every fix, so the default applies
+        flown.pop("accept", None)
+        chosen.pop("accept")
+    differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
+    if options.as_flown:
+        for name in (*_CHOICES, "accept", "track"):
+            setattr(options, name, flown.get(name, getattr(options, name)))
+        options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
+        return flown.get("mount", mount)
+    if differ:
+        log.warning(
+            "options differ from those of the flight (%s); --as-flown uses the logged ones",
+            ", ".join(differ),
+        )
+    return mount
+
+
+def _compare_with_flight(flight: "Recording", results: Sequence["ViewResult"]) -> None:
+    """Log how many results of a replay differ from those of the flight."""
+    from orthonav.ground.recordings import LoggedFlight
+
+    if not isinstance(flight, LoggedFlight):
+        return
+    logged = {result.frame: _comparable(result) for result in flight.results()}
+    both = [result for result in results if result.frame in logged]
+    other = [result.frame for result in both if logged[result.frame] != _comparable(result)]
+    if other:
+        counts = len(other), len(both), other[0]
+        log.warning("%d of %d results differ from those of the flight, first: %s", *counts)
+    else:
+        log.info("all %d results equal those of the flight", len(both))
+
+
+def _comparable(result: "ViewResult") -> str:
+    """A result as text, without its latency."""
+    from dataclasses import replace
+
+    from orthonav.core.flight.fixes import result_to_json
+
+    return result_to_json(replace(result, latency_ms=0.0))
+
+
+def _check_map(options: argparse.Namespace, logged: Any) -> None:
+    from orthonav.core.mapfile.signature import map_digest
+
+    flown = logged.get("manifest_sha256") if isinstance(logged, dict) else None
+    if flown is not None and flown != map_digest(options.map):
+        log.warning(
+            "the log was flown with another map (%.80s): %s", logged.get("name"), options.map
+        )
+
+
+def _logged_options(logged: Any) -> dict[str, Any]:
+    """Options of a log, validated: a log is untrusted input."""
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight.mount import logged_mount
+
+    if not isinstance(logged, dict):
+        return {}
+    found: dict[str, Any] = {}
+    for name, choices in _CHOICES.items():
+        if name in logged:
+            if logged[name] not in choices:
+                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
+            found[name] = logged[name]
+    for name, kinds in (("accept", str | None), ("track", bool)):
+        if name in logged:
+            if not isinstance(logged[name], kinds):
+                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
+            found[name] = logged[name]
+    if "mount" in logged:
+        found["mount"] = logged_mount(logged)
+    return found
+
+
+def _check_destination(options: argparse.Namespace) -> None:
+    """Raise `VariantError` where positions have no place to go, or share it with the summary."""
+    from orthonav.core.errors import VariantError
+    from orthonav.core.files import is_stdout
+    from orthonav.ground.recordings.photos import is_photo
+
+    if options.out is not None and is_stdout(options.out) and options.json:
+        raise VariantError("--out - and --json both write to stdout: give one of them")
+    if options.out is None:
+        named = [path for path in options.flight if not path.is_file() or not is_photo(path)]
+        if named and all(path.exists() for path in named):
+            raise VariantError("give --out FILE, or --out - for stdout")
+
+
+def _write_positions(
+    options: argparse.Namespace, results: "Sequence[ViewResult]", identity: "Identity"
+) -> None:
+    """Write one line of JSON per view to the file or to stdout, or print them for people."""
+    from orthonav.core.flight.fixes import write_results
+
+    if options.out is not None:
+        write_results(options.out, results, identity)
+    elif not options.json:
+        for result in results:
+            print(_position_text(result))
+
+
+def _positions_to_plain(
+    options: argparse.Namespace, results: "Sequence[ViewResult]"
+) -> dict[str, Any]:
+    """The positions as JSON values, where they are written nowhere else."""
+    from orthonav.core.flight.fixes import result_to_json
+
+    if options.out is not None:
+        return {}
+    return {"positions": [json.loads(result_to_json(result)) for result in results]}
+
+
+def _position_text(result: "ViewResult") -> str:
+    """The position of one view in words, over several lines."""
+    from orthonav.core.records import Fix
+
+    outcome = result.outcome
+    if isinstance(outcome, Fix):
+        lines = _lines(outcome, result.is_confident)
+    else:
+        hints = [f"; {hint}" for name, hint in _HINTS if name in outcome.detail]
+        lines = [("position", f"none: {outcome.detail} ({outcome.reason}){''.join(hints)}")]
+    return "\n".join([result.frame, *(f"  {name:<11}{text}" for name, text in lines)])
+
+
+def _lines(fix: "Fix", confident: bool) -> list[tuple[str, str]]:
+    east_m, north_m = (math.sqrt(float(fix.cov_en_m2[i, i])) for i in (0, 1))
+    judged = "confident" if confident else "low confidence: this is a best guess"
+    confidence = judged
+    if math.isfinite(fix.confidence):
+        confidence = f"{fix.confidence:.2f} that the error is below {fix.radius_m:.0f} m ({judged})"
+    return [
+        ("position", f"{fix.lat_deg:.7f}, {fix.lon_deg:.7f} (latitude, longitude, WGS 84)"),
+        ("deviation", f"{east_m:.1f} m east, {north_m:.1f} m north (1 sigma)"),
+        ("confidence", confidence),
+        ("heading", f"{fix.heading_deg:.1f} deg from true north, of the top of the image"),
+        ("height", f"{fix.agl_m:.1f} m above ground"),
+    ]

@@ -17,7 +17,6 @@ log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
     parser.epilog = (
         "The 95 % ellipse is conservative. It excludes errors of the terrain and the height of "
         "buildings and trees."
@@ -51,7 +50,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Locate and print."""
     from orthonav.core.errors import FlightError
     from orthonav.core.flight import open_flight
     from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results

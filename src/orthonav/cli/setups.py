@@ -46,7 +46,6 @@ class Counts:
 
     @classmethod
     def of(cls, results: "Sequence[ViewResult]") -> "Counts":
-        """The counts of these results."""
         from orthonav.core.records import Fix, NoFix
 
         reasons = Counter(
@@ -94,7 +93,6 @@ class SetupAdvice:
         self._yaw_deg: list[float] = []
 
     def watching(self) -> "Iterator[SourceView]":
-        """The views of the flight."""
         for view in self._low.watching(self._flight.views):
             found = far_from_map(view, self._localizer)
             if found is not None and (self._nearest is None or found < self._nearest):
@@ -103,7 +101,6 @@ class SetupAdvice:
             yield view
 
     def take(self, result: "ViewResult") -> None:
-        """The result of the newest view."""
         self._low.take(result)
 
     def advice(

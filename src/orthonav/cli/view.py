@@ -16,7 +16,6 @@ LOOPBACK = "127.0.0.1"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument(
         "run",
         type=Path,
@@ -75,7 +74,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Read the run and serve it until interrupted."""
     from orthonav.ground.view.run import ViewRequest, open_run
     from orthonav.ground.view.server import Pages, Server, load_assets
 
@@ -100,7 +98,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _announce(server: "Server", options: argparse.Namespace) -> None:
-    """Print the address, and open it if this terminal has a screen."""
     if not server.only_loopback:
         log.warning(
             "listening at %s: anyone who can reach this computer over the network can see this run",
@@ -108,19 +105,14 @@ def _announce(server: "Server", options: argparse.Namespace) -> None:
         )
     address = server.url()
     print(f"{address}  (Ctrl-C ends)", flush=True)
-    if not options.no_browser and sys.stdout.isatty() and _has_screen():
+    # Without a screen a text browser would cover the output.
+    screen = not sys.platform.startswith("linux") or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
+    if not options.no_browser and sys.stdout.isatty() and screen:
         import threading
         import webbrowser
 
         # Some browsers return only when closed.
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-
-
-def _has_screen() -> bool:
-    """Whether a window can be opened; a text browser would cover the output."""
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _port(text: str) -> int:

@@ -2,8 +2,7 @@
 
 All derive from `OrthonavError`, which the command line turns into one line and `exit_code`,
 and from the builtin that fits, so that callers who know nothing of orthonav can still catch them.
-A view that cannot be placed is not an error: see `orthonav.core.records.NoFix`.
-"""
+A view that cannot be placed is not an error: see `orthonav.core.records.NoFix`."""
 
 
 class OrthonavError(Exception):
@@ -83,8 +82,7 @@ class MissingExtraError(OrthonavError, ImportError):
 
 
 class AtlasError(OrthonavError, ValueError):
-    """An atlas cannot be used as asked: its catalogue and files disagree, its recipe is another,
-    a sheet is damaged or half there."""
+    """An atlas cannot be used: catalogue and files disagree, another recipe, or a damaged sheet."""
 
 
 class StorageError(OrthonavError, OSError):
@@ -105,10 +103,7 @@ def lfs_pointer(head: bytes) -> str | None:
 
 
 def described(error: BaseException) -> str:
-    """What went wrong, in words for a message, at most 120 characters.
-
-    A `KeyError` only holds the name that was sought, and some exceptions hold nothing.
-    """
+    """The error in at most 120 characters; a `KeyError` and some others do not say what it is."""
     if isinstance(error, KeyError) and len(error.args) == 1:
         return f"{str(error.args[0])[:120]} is missing"
     return " ".join(str(error).split())[:120] or type(error).__name__

@@ -1,8 +1,4 @@
-"""Optional dependencies: which extra brings what, what of it is installed, one error where not.
-
-Which packages an extra has is read from the metadata of the installed orthonav, so that it is
-written down once, in pyproject.toml.
-"""
+"""Optional dependencies, by the extras in the metadata of the installed orthonav."""
 
 import importlib
 import platform
@@ -18,7 +14,7 @@ NAME = "orthonav"
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?[^;]*(?:;(.*))?")
 _OF_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 _CONDITION = re.compile(r"""(python_version|platform_machine)\s*(==|<)\s*["']([^"']+)["']""")
-"""Of environment markers, what pyproject.toml uses: such comparisons, joined by `and`."""
+"""What pyproject.toml uses of environment markers, joined by `and`."""
 _MODULES = {
     "faiss-cpu": "faiss",
     "opencv-python-headless": "cv2",
@@ -27,17 +23,11 @@ _MODULES = {
     "scikit-image": "skimage",
     "xstatic-leaflet": "xstatic.pkg.leaflet",
 }
-"""Modules that are not named as the package that brings them."""
 
 
 @dataclass(frozen=True)
 class RequiredPackage:
-    """A package that orthonav or one of its extras asks for.
-
-    `name`: as pyproject.toml writes it. `version`: the one that is installed; empty where its
-    module cannot be found. `available`: whether its environment marker lets it be installed on this
-    machine with this Python.
-    """
+    """`version`: "" where its module is not found. `available`: its marker allows this machine."""
 
     name: str
     version: str
@@ -56,7 +46,6 @@ def _requirements() -> tuple[str, ...]:
 
 
 def _holds(marker: str) -> bool:
-    """Whether an environment marker, without its extra, holds on this machine."""
     here = {"python_version": platform.python_version(), "platform_machine": platform.machine()}
     for name, comparison, value in _CONDITION.findall(marker):
         if comparison == "==" and here[name] != value:
@@ -67,7 +56,6 @@ def _holds(marker: str) -> bool:
 
 
 def _numbers(version: str) -> list[int]:
-    """Major and minor number of a version."""
     return [int(part) for part in version.split(".")[:2]]
 
 
@@ -90,20 +78,15 @@ def packages(extra: str = "") -> tuple[RequiredPackage, ...]:
 
 
 def missing(extra: str) -> tuple[str, ...]:
-    """Names of the packages of an extra that are not installed."""
     return tuple(package.name for package in packages(extra) if not package.version)
 
 
 def pip_line(*names: str) -> str:
-    """What to type for these extras."""
     return f"pip install '{NAME}[{','.join(names)}]'"
 
 
 def require(what: str, *names: str) -> None:
-    """Raise `MissingExtraError` unless all packages of these extras are installed.
-
-    The message names every package that is missing, and one line that installs all of them.
-    """
+    """Raise `MissingExtraError` that names all missing packages and one line to install them."""
     absent = {name: missing(name) for name in names}
     wanted = [name for name, gone in absent.items() if gone]
     if wanted:
@@ -112,7 +95,6 @@ def require(what: str, *names: str) -> None:
 
 
 def needed(module: str, extra: str, what: str) -> Any:
-    """The module of that name. Raises `MissingExtraError` that names the extra which brings it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -120,7 +102,6 @@ def needed(module: str, extra: str, what: str) -> Any:
 
 
 def missing_extra(what: str, extra: str, module: str, error: Exception) -> MissingExtraError:
-    """The error to raise where importing `module` of an extra failed with `error`."""
     top = module.partition(".")[0]
     names = (package.name for package in packages(extra))
     package = next((name for name in names if module_of(name).partition(".")[0] == top), top)
@@ -128,13 +109,11 @@ def missing_extra(what: str, extra: str, module: str, error: Exception) -> Missi
 
 
 def module_of(package: str) -> str:
-    """The module that a package brings."""
     plain = re.sub(r"[-_.]+", "-", package).lower()
     return _MODULES.get(plain, plain.replace("-", "_"))
 
 
 def _version(package: str) -> str:
-    """Version of an installed package, "" where its module cannot be found."""
     from importlib import metadata
 
     try:

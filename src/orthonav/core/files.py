@@ -16,21 +16,16 @@ Progress = Callable[[str, float], None]
 
 
 def no_progress(stage: str, share: float) -> None:
-    """Progress that nobody watches."""
+    pass
 
 
-_ALMOST_NONE = 2**20
-"""With less free space, bytes, a failed write is that of a full disk."""
+_ALMOST_NONE = 2**20  # with less free space, bytes, a failed write is that of a full disk
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it is synced and renamed to `path`.
-
-    On any exception, an interrupt included, the temporary file and the folders made for it are
-    removed and `path` is untouched. Raises `OutputError` where the system refuses to write (disk
-    full, no permission).
-    """
+    """A temporary path, synced and renamed to `path` on success, else removed. Raises
+    `OutputError`."""
     path = Path(path).resolve()
     if path.exists() and not path.is_file():
         raise OutputError(f"cannot write over a folder or a device: {path}")
@@ -61,12 +56,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; on success it takes the place of `path`.
-
-    An existing empty folder is replaced; an existing folder with content is refused before any
-    work is done, unless `is_ours` says that it may go. On any exception the temporary folder is
-    removed and the old one stays. Raises `OutputError` where the system refuses to write into it.
-    """
+    """A temporary folder that replaces `path` on success. Raises `OutputError`, at once where it
+    has content, unless `is_ours` allows that."""
     path = Path(path)
     if not _may_be_replaced(path, is_ours):
         raise OutputError(
@@ -100,21 +91,19 @@ def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) 
 
 
 def _made_folders(folder: Path) -> list[Path]:
-    """Make a folder; the folders that did not exist before, the innermost first."""
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     return missing
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders that are empty, the innermost first."""
     with suppress(OSError):
         for each in folders:
             each.rmdir()
 
 
 def not_written(reason: object, path: Path) -> OutputError:
-    """The error of a library that gives no number of the system's error, as GDAL does."""
+    """The error of a library that gives no system error number, as GDAL does."""
     free = shutil.disk_usage(path.resolve().parent).free
     full = "disk full" if free < _ALMOST_NONE else "cannot write"
     said = " ".join(str(reason).split())[:200]
@@ -138,12 +127,10 @@ def _remove_folder(path: Path) -> None:
 
 
 def is_stdout(path: Path) -> bool:
-    """Whether the path of a text file is `-`, stdout."""
     return str(path) == "-"
 
 
 def write_text(path: Path, text: str) -> None:
-    """As `write_lines`."""
     write_lines(path, [text])
 
 
@@ -157,7 +144,7 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
 
 
 def with_paths(record: object, *names: str) -> None:
-    """Turn fields of a frozen record that are text, or hold texts, into paths; None stays."""
+    """Turn text fields of a frozen record into paths; None stays."""
     for name in names:
         value = getattr(record, name)
         if isinstance(value, str):
@@ -167,10 +154,7 @@ def with_paths(record: object, *names: str) -> None:
 
 
 def require_file(path: Path, what: str) -> Path:
-    """Return `path` if it is an existing file, else raise `MissingFileError` naming `what`.
-
-    A pointer of Git LFS is not the file.
-    """
+    """`path` if it is a file and no pointer of Git LFS, else `MissingFileError` naming `what`."""
     path = Path(path)
     if not path.is_file():
         kind = "is a folder, not a file" if path.is_dir() else "does not exist"

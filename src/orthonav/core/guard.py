@@ -12,16 +12,12 @@ from orthonav.core.errors import FlightError, OrthonavError
 
 
 def needed(module: str, what: str) -> Any:
-    """The module of that name. Raises `MissingExtraError` naming the extra that brings it."""
     return extras.needed(module, "flights", f"reading {what}")
 
 
 @contextlib.contextmanager
 def reading(what: str, path: Path, *, silent: bool = False) -> Iterator[None]:
-    """Turns any exception of a library into a `FlightError` with `what` and `path`.
-
-    With `silent`, output of the library is dropped (some print a line for every damaged record).
-    """
+    """Turns any exception of a library into a `FlightError`; `silent` drops its output."""
     try:
         with _silence() if silent else contextlib.nullcontext():
             yield
@@ -35,13 +31,13 @@ def reading(what: str, path: Path, *, silent: bool = False) -> Iterator[None]:
 
 
 def without_plea(message: str) -> str:
-    """A library's message without its request to report the error to its authors."""
+    """Without a library's request to report the error to its authors."""
     return message.partition("; please report")[0]
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Drop output of the whole process to stdout and stderr, including that of C code."""
+    """Drops stdout and stderr of the whole process, those of C code too."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = [os.dup(1), os.dup(2)]

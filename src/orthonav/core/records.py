@@ -1,4 +1,4 @@
-"""The records that packages exchange: telemetry, view, prior, fix, no fix."""
+"""Telemetry, view, prior, fix, no fix."""
 
 import math
 from collections.abc import Mapping
@@ -6,40 +6,28 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.ground import Ground
-from orthonav.core.grey import grey_levels
 
-CONFIDENT = 0.9
-"""A fix of at least this confidence counts as confident: the default of publishing and reports."""
+CONFIDENT = 0.9  # from this confidence on: the default of publishing and reports
 
-PRIOR_SIGMAS = 3.0
-"""A prior position limits the search to so many of its standard deviations: 1.1 % of a round
-Gaussian lies outside."""
+PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outside
 DEFAULT_YAW_STD_DEG = 7.0
-"""Standard deviation of a reported heading that comes without one: magnetic compasses of the
-recorded flights are off by several degrees (docs/tracking.md)."""
-MIN_YAW_STD_DEG = 2.0
-"""Least deviation of a reported heading that searches allow for."""
-TILE_YAW_STD_DEG = 5.0
-"""The same default where views are localized by their tiles alone. It differs on purpose: 5 deg
-make three headings 6 deg apart, as measured in docs/decisions/embedding.md; 7 deg would make five,
-and change every figure of the embedding alone."""
-DEFAULT_AGL_STD = 0.08
-"""Standard deviation of a reported height that comes without one, over the height."""
+"""Magnetic compasses of the recorded flights are off by several degrees (docs/tracking.md)."""
+MIN_YAW_STD_DEG = 2.0  # the least that searches allow for
+TILE_YAW_STD_DEG = 5.0  # of tiles alone: three headings 6 deg apart (docs/decisions/embedding.md)
+DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = 3.0
-"""Standard deviation of reported pitch and of roll that come without one, degrees: mounts lean by 1
-to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
-RADIUS_SHARE = 0.025
-"""Least radius of the confidence over the height above ground: what an error of 1.4 deg of tilt
-makes."""
+"""Mounts lean by 1 to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
+RADIUS_SHARE = 0.025  # least radius of the confidence over the height: an error of 1.4 deg of tilt
 
-MAP_STD_M = 3.0
-"""Standard deviation, per axis, of a displacement of the map as a whole: it never averages out."""
+MAP_STD_M = 3.0  # per axis, of a displacement of the map as a whole: it never averages out
 
 Evidence = Mapping[str, float]
 """Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
@@ -50,8 +38,7 @@ class Prior:
     """The position expected before a search: a round Gaussian.
 
     `lat_deg`, `lon_deg`: its mean, WGS 84. `std_m`: standard deviation per axis, m, 0 or more; the
-    search ends at `PRIOR_SIGMAS` of them.
-    """
+    search ends at `PRIOR_SIGMAS` of them."""
 
     lat_deg: float
     lon_deg: float
@@ -62,22 +49,16 @@ class Prior:
 class Telemetry:
     """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
 
-    time_ns: int
-    """Time of exposure, ns."""
-    yaw_deg: float
-    """Heading of the top of the picture, clockwise from true north."""
-    pitch_deg: float
-    """0 where the optical axis points straight down; positive looks ahead."""
-    roll_deg: float
-    """0 where the optical axis points straight down; positive looks left."""
-    agl_m: float
-    """Height above ground, above 0."""
+    time_ns: int  # time of exposure, ns
+    yaw_deg: float  # heading of the top of the picture, clockwise from true north
+    pitch_deg: float  # 0 where the optical axis points straight down; positive looks ahead
+    roll_deg: float  # 0 where the optical axis points straight down; positive looks left
+    agl_m: float  # height above ground, above 0
     yaw_std_deg: float | None = None
     """Standard deviation of the heading from view to view; `DEFAULT_YAW_STD_DEG` where None."""
     agl_std_m: float | None = None
     """The same of the height; `DEFAULT_AGL_STD` of the height where None."""
-    prior: Prior | None = None
-    """Expected position."""
+    prior: Prior | None = None  # expected position
     vel_en_mps: tuple[float, float] | None = None
     """Velocity over ground since the view before, true east and north."""
     tilt_std_deg: float | None = None
@@ -87,10 +68,8 @@ class Telemetry:
     """Standard deviation of the velocity per axis; see `orthonav.core.track.tracker`."""
     home_m: float | None = None
     """Height above the place of take-off, as recorded; it is not used in place of `agl_m`."""
-    amsl_m: float | None = None
-    """Height above mean sea level, as recorded."""
-    hae_m: float | None = None
-    """Height above the ellipsoid of WGS 84, as recorded."""
+    amsl_m: float | None = None  # height above mean sea level, as recorded
+    hae_m: float | None = None  # height above the ellipsoid of WGS 84, as recorded
     below: Ground | None = None
     """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
     Its deviation is part of `agl_std_m`."""
@@ -111,12 +90,11 @@ class View:
     """What the camera saw at one exposure, and the telemetry of that time.
 
     `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified. Images of other
-    kinds are converted by `orthonav.core.grey.grey_levels`.
+    kinds are converted by `orthonav.core.records.grey_levels`.
     `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
     `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
 
-    Raises `FlightError` for what is no image, `CameraError` where the aspect ratios differ.
-    """
+    Raises `FlightError` for what is no image, `CameraError` where the aspect ratios differ."""
 
     grey: NDArray[np.uint8]
     camera: Camera
@@ -145,12 +123,11 @@ class View:
         vel_en_mps: tuple[float, float] | None = None,
     ) -> "View":
         """A view of an image (H, W), (H, W, 3) BGR or (H, W, 4), see
-        `orthonav.core.grey.grey_levels`.
+        `orthonav.core.records.grey_levels`.
 
         `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
         north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
-        `time_s`: of the exposure. The standard deviations are those of `Telemetry`.
-        """
+        `time_s`: of the exposure. The standard deviations are those of `Telemetry`."""
         heading = math.nan if heading_deg is None else float(heading_deg)
         return cls(
             image,
@@ -184,8 +161,7 @@ class Fix:
     `lat_deg`, `lon_deg`: WGS 84. `cov_en_m2` (2, 2): covariance of east and north, m2, of a correct
     fix. `confidence`: probability that the error is below `radius_m`, 0..1, NaN where the map was
     not calibrated. `heading_deg` (0..360) and `agl_m`: estimated, or as reported where the method
-    does not estimate them. `evidence`: the numbers behind the confidence.
-    """
+    does not estimate them. `evidence`: the numbers behind the confidence."""
 
     lat_deg: float
     lon_deg: float
@@ -236,7 +212,6 @@ class Fix:
 
 
 def _finite(value: float | None) -> float:
-    """The value; 0 where it is unknown."""
     return value if value is not None and math.isfinite(value) else 0.0
 
 
@@ -245,8 +220,7 @@ class NoFix:
     """No position, and why. A value, not an exception.
 
     `reason` is a short stable word for programs (such as `blank`, `too_dark`, `outside_map`),
-    `detail` one sentence for people.
-    """
+    `detail` one sentence for people."""
 
     reason: str
     detail: str
@@ -265,8 +239,7 @@ class ViewResult:
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
     track (`searching`, `tracking`, `coasting`, `lost`), None where views are localized one by one.
-    `accepted`: whether a fix met the criterion of `--accept`, None where none was given.
-    """
+    `accepted`: whether a fix met the criterion of `--accept`, None where none was given."""
 
     frame: str
     time_ns: int
@@ -281,3 +254,44 @@ class ViewResult:
         if not isinstance(self.outcome, Fix):
             return False
         return self.outcome.is_confident if self.accepted is None else self.accepted
+
+
+EXPECTED = (
+    "expected (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA; uint8, uint16 (white is 65535) or "
+    "floating point (0 to 1, or 0 to 255)"
+)
+
+
+def grey_levels(image: Any) -> NDArray[np.uint8]:
+    """Grey levels (H, W) uint8 of a grey, BGR or BGRA image; uint8 grey is returned as it is.
+
+    uint16 counts to 65535, floating point to 1 where no value is above 1, else to 255. Raises
+    `FlightError`."""
+    if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 2 and image.size:
+        return image
+    if image is None:
+        raise FlightError(f"the image is None, as of a file that could not be read; {EXPECTED}")
+    array = np.asarray(image)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    colour = array.ndim == 3 and array.shape[2] in (3, 4)
+    if not (array.ndim == 2 or colour) or array.size == 0:
+        raise FlightError(f"the image has the shape {array.shape}; {EXPECTED}")
+    levels = _levels(array)
+    if not colour:
+        return levels
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(levels[:, :, :3]), cv2.COLOR_BGR2GRAY))
+
+
+def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
+    if array.dtype == np.uint8:
+        return array
+    if array.dtype == np.uint16:
+        return (array >> 8).astype(np.uint8)  # as OpenCV reads files of 16 bits
+    if array.dtype.kind not in "iuf":
+        raise FlightError(f"the image has values of type {array.dtype}; {EXPECTED}")
+    low, high = float(array.min()), float(array.max())
+    if not (low >= 0 and high <= 255):  # NaN too
+        raise FlightError(f"the image has values of {low:g} to {high:g}; {EXPECTED}")
+    scale = 255.0 if array.dtype.kind == "f" and high <= 1 else 1.0
+    return np.rint(array * scale).astype(np.uint8)

@@ -4,18 +4,16 @@ import csv
 from collections.abc import Iterator
 from typing import IO
 
-MAX_LINE_CHARS = 65_536
-"""Limit of a line of a table: a thousand columns of the longest numbers."""
-MAX_ROWS = 5_000_000
-"""Limit of rows that callers do not set: seven hours at 200 Hz."""
+MAX_LINE_CHARS = 65_536  # A thousand columns of the longest numbers
+MAX_ROWS = 5_000_000  # seven hours at 200 Hz
 
 
 class TableError(ValueError):
-    """A table has a line that is too long, too many lines, or is not text in UTF-8."""
+    pass
 
 
 def bounded_lines(stream: IO[str], most_chars: int = MAX_LINE_CHARS) -> Iterator[str]:
-    """The lines of a text; raises `TableError` at one longer than `most_chars`."""
+    """Raises `TableError` at a line longer than `most_chars`."""
     number = 0
     while line := stream.readline(most_chars + 1):
         number += 1
@@ -25,11 +23,7 @@ def bounded_lines(stream: IO[str], most_chars: int = MAX_LINE_CHARS) -> Iterator
 
 
 class TableRows:
-    """Rows of a CSV with a header, as `csv.DictReader` gives them; read as they are asked for.
-
-    `columns`: names in the header. `line`: number of the line last read. Raises `TableError`, at
-    the header too.
-    """
+    """Rows as of `csv.DictReader`, with `columns` of the header; raises `TableError`, there too."""
 
     def __init__(self, stream: IO[str], *, delimiter: str = ",", most_rows: int = MAX_ROWS) -> None:
         self._reader = csv.DictReader(
@@ -43,7 +37,6 @@ class TableRows:
 
     @property
     def line(self) -> int:
-        """Number of the line last read, from 1."""
         return self._reader.line_num
 
     def __iter__(self) -> Iterator[dict[str, str | None]]:

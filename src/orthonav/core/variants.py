@@ -1,8 +1,6 @@
 """Choosing a variant by name: `canny:low=100,high=200`.
 
-A variant is a small frozen dataclass whose fields are its parameters. A table maps each name to
-its class and what it needs; nothing is found by reflection over modules and nothing is evaluated.
-"""
+A frozen dataclass whose fields are its parameters, by a table of names; nothing is evaluated."""
 
 import dataclasses
 import importlib
@@ -16,7 +14,7 @@ from orthonav.core.errors import VariantError
 
 @dataclass(frozen=True)
 class Variant:
-    """Where a variant lives (`module:Class`), whether it may fly, and the extra it needs."""
+    """`module:Class`, whether it may fly, and the extra it needs."""
 
     path: str
     flies: bool = True
@@ -27,10 +25,7 @@ Table = Mapping[str, Variant]
 
 
 def make_variant(table: Table, text: str) -> Any:
-    """The variant that `name` or `name:field=value,...` describes.
-
-    Raises `VariantError` for an unknown name, an unknown field or a value of the wrong type.
-    """
+    """`name` or `name:field=value,...`; raises `VariantError`."""
     name, _, rest = text.partition(":")
     if name not in table:
         raise VariantError(f"unknown variant '{name}'; known are: {', '.join(sorted(table))}")
@@ -44,10 +39,9 @@ def make_variant(table: Table, text: str) -> Any:
 
 
 def variant_from_recipe(table: Table, recipe: Any, *, flying: bool = False) -> Any:
-    """The variant that `variant_recipe` wrote down; raises `VariantError` if it does not fit.
+    """The inverse of `variant_recipe`; raises `VariantError`.
 
-    With `flying`, variants that may not fly are refused before anything of theirs is loaded.
-    """
+    With `flying`, variants that may not fly are refused before anything of theirs is loaded."""
     if not isinstance(recipe, dict) or not isinstance(recipe.get("name"), str):
         raise VariantError(f"expected a variant with a name, got {recipe!r}")
     if recipe["name"] not in table:
@@ -59,7 +53,7 @@ def variant_from_recipe(table: Table, recipe: Any, *, flying: bool = False) -> A
 
 
 def variant_recipe(table: Table, variant: Any) -> dict[str, Any]:
-    """Name and parameters of a variant, as plain values for a manifest."""
+    """Plain values for a manifest."""
     path = f"{type(variant).__module__}:{type(variant).__qualname__}"
     for name, entry in table.items():
         if entry.path == path:

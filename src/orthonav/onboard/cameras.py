@@ -1,15 +1,14 @@
 """Images of live cameras (devices and streams) and of recordings played in real time.
 
-A thread reads; the consumer gets the newest image, and replaced images are counted. Every image
-carries its time of exposure by our monotonic clock.
+A thread reads; the consumer gets the newest image, and replaced images are counted.
 """
 
 import logging
 import threading
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Protocol
@@ -29,15 +28,12 @@ RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 GAP_S, GAP_INTERVALS = 0.5, 3.0
-"""A longer time without images, also in usual intervals, may change the latency. Shorter ones are
-usual on a busy computer."""
+"""A longer time without images, also in usual intervals, may change the latency."""
 FROZEN_LEVELS = 0.25
-"""Mean difference in grey levels below which two images are the same: noise alone is four times
-as large."""
+"""Mean difference in grey levels below which two images are the same; noise is four times that."""
 FROZEN_SIDE_PX = 64
 FOLDER_RATE_HZ = 2.0
 """Rate at which a folder of images without times is played."""
-_OPEN_MS, _READ_MS = 5000.0, 3000.0
 Grey = NDArray[np.uint8]
 
 
@@ -45,17 +41,11 @@ Grey = NDArray[np.uint8]
 class CameraImage:
     """One image with its time of exposure.
 
-    `number`: counts up from 1.
-    `frame`: name of the image in logs and results.
-    `exposed_ns`: time of exposure by our monotonic clock; of a live camera that of the arrival,
-    from which the flight loop subtracts the latency.
-    `time_ns`: time written to results: UTC of a live camera, else the time of the recording.
-    `grey`: grey levels (H, W), None where the image could not be decoded.
-    `problem`: reason why it could not be decoded.
-    `telemetry`: telemetry that came with the image, from a recording or from ROS.
-    `vehicle`: state of the aircraft that `telemetry` was made of, from ROS.
-    `interruptions`: of a live camera: how often images stopped for a while, or the camera was
-    opened again; the latency may have changed. None where the time of exposure is known.
+    `exposed_ns`: by our monotonic clock; of a live camera the arrival, from which the flight loop
+    subtracts the latency. `time_ns`: written to results: UTC of a live camera, else that of the
+    recording. `grey`: (H, W), None where the image could not be decoded. `telemetry`, `vehicle`:
+    that came with it, from a recording or ROS. `interruptions`: of a live camera: how often images
+    stopped for a while, or it was opened again; the latency may have changed.
     """
 
     number: int
@@ -74,16 +64,10 @@ class CameraGoneError(CameraError):
 
 
 class ImageSource(Protocol):
-    """A source of images."""
-
     def read(self) -> CameraImage | None:
-        """Wait for the next image; None at the end, or when stopped.
+        """The next image; None at the end. Raises `CameraGoneError`: call again later."""
 
-        Raises `CameraGoneError` where the camera is gone for now: call again later.
-        """
-
-    def close(self) -> None:
-        """Release the device."""
+    def close(self) -> None: ...
 
 
 class LiveCamera:
@@ -108,7 +92,6 @@ class LiveCamera:
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         if self._capture is None:  # first image, or after the camera was gone
             self._capture = self._open()
         if not self._capture.grab():
@@ -131,7 +114,6 @@ class LiveCamera:
         )
 
     def close(self) -> None:
-        """See `ImageSource.close`."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None
@@ -158,8 +140,6 @@ class LiveCamera:
 
 
 class Playback:
-    """Images of a recording, each at its time."""
-
     def __init__(
         self,
         images: Iterator["RecordedImage"],
@@ -167,13 +147,12 @@ class Playback:
         clocks: Clocks,
         stopped: Callable[[], bool],
     ) -> None:
-        """`due_ns` converts a time of the recording to our clock; None: not known yet."""
+        """`due_ns`: from times of the recording to our clock; None: not known yet."""
         self._images, self._due_ns = images, due_ns
         self._clocks, self._stopped = clocks, stopped
         self._number = 0
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         entry = next(self._images, None)
         if entry is None:
             return None
@@ -185,8 +164,7 @@ class Playback:
             self._clocks.sleep(min(left_s, 0.05))
         return None
 
-    def close(self) -> None:
-        """See `ImageSource.close`."""
+    def close(self) -> None: ...
 
     def _picture(self, entry: "RecordedImage", due_ns: int) -> CameraImage:
         self._number += 1
@@ -204,8 +182,6 @@ class Playback:
 
 @dataclass(frozen=True, eq=False)
 class RecordedImage:
-    """An image of a recording; `load` decodes it."""
-
     frame: str
     time_ns: int
     load: Callable[[], Grey]
@@ -227,10 +203,7 @@ def own_pace(clocks: Clocks, pace: float) -> Callable[[int], int]:
 def autopilot_pace(
     boot_ns: Callable[[int], int | None], clocks: Clocks, pace: float
 ) -> Callable[[int], int | None]:
-    """Playback of a recording whose times are those of the autopilot's clock, as in a simulation.
-
-    `boot_ns` converts our clock to the autopilot's; it returns None while the offset is unknown.
-    """
+    """Playback by the autopilot's clock, which `boot_ns` gives; None: not yet known."""
 
     def due_ns(time_ns: int) -> int | None:
         now_ns = clocks.mono_ns()
@@ -241,7 +214,6 @@ def autopilot_pace(
 
 
 def is_live(name: str) -> bool:
-    """Whether `name` is a device or a stream, not a recording."""
     return name.isdigit() or name.startswith(("/dev/", *STREAMS))
 
 
@@ -252,10 +224,7 @@ def live_name(name: str) -> int | str:
 
 
 def recorded_images(path: Path) -> Iterator[RecordedImage]:
-    """Images of a flight folder or a video at their times, or of a folder at `FOLDER_RATE_HZ`.
-
-    Raises `FlightError` or `MissingFileError` at once where `path` is none of these.
-    """
+    """Images of a flight folder, a video or a folder. Raises `FlightError`, `MissingFileError`."""
     if (path / "telemetry.csv").is_file():
         views = open_flight(path).views
         return iter(
@@ -277,11 +246,11 @@ def _images(folder: Path) -> Iterator[RecordedImage]:
     if not paths:
         raise FlightError(f"no images ({', '.join(SUFFIXES)}) in the folder: {folder}")
 
-    def loader(path: Path) -> Callable[[], Grey]:
-        return lambda: decode_image(path.read_bytes(), str(path))
+    def load(path: Path) -> Grey:
+        return decode_image(path.read_bytes(), str(path))
 
     return iter(
-        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), loader(path))
+        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), partial(load, path))
         for number, path in enumerate(paths)
     )
 
@@ -293,19 +262,16 @@ def _video(capture: Any) -> Iterator[RecordedImage]:
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             found, frame = capture.retrieve()
             grey = _grey(frame) if found else None
-            yield RecordedImage(f"{number:06d}", time_ns, _loaded(grey, number))
+            yield RecordedImage(f"{number:06d}", time_ns, partial(_loaded, grey, number))
             number += 1
     finally:
         capture.release()
 
 
-def _loaded(grey: Grey | None, number: int) -> Callable[[], Grey]:
-    def load() -> Grey:
-        if grey is None:
-            raise FlightError(f"frame {number} of the video cannot be decoded")
-        return grey
-
-    return load
+def _loaded(grey: Grey | None, number: int) -> Grey:
+    if grey is None:
+        raise FlightError(f"frame {number} of the video cannot be decoded")
+    return grey
 
 
 def _grey(frame: NDArray[Any]) -> Grey:
@@ -316,15 +282,13 @@ def _grey(frame: NDArray[Any]) -> Grey:
 def _capture(name: int | str) -> Any:
     if isinstance(name, int):
         return cv2.VideoCapture(name, cv2.CAP_V4L2)
-    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
-    capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, [int(number) for number in limits])
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 3000]
+    capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the camera describes the sensor
     return capture
 
 
 class NewestImage:
-    """Hands the newest image from the reading thread to the consumer."""
-
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._picture: CameraImage | None = None
@@ -333,7 +297,6 @@ class NewestImage:
         self.ended = False
 
     def put(self, image: CameraImage) -> None:
-        """Store a new image; one that was not taken is replaced and counted."""
         with self._condition:
             self.replaced += self._picture is not None
             self.taken += 1
@@ -343,7 +306,6 @@ class NewestImage:
             self._condition.notify()
 
     def end(self) -> None:
-        """Signal that no more images will come."""
         with self._condition:
             self.ended = True
             self._condition.notify()
@@ -358,7 +320,6 @@ class NewestImage:
 
     @property
     def is_over(self) -> bool:
-        """Whether the last image of a recording was taken."""
         with self._condition:
             return self.ended and self._picture is None
 
@@ -393,23 +354,19 @@ def read_into(
         newest.end()
 
 
-class CameraThread:
-    """Reads a source into a `NewestImage` until it is stopped."""
+def read_in_thread(
+    newest: NewestImage, source: ImageSource, stopping: threading.Event
+) -> Callable[[], None]:
+    """The function that stops it; it does not wait for a device that does not answer."""
+    arguments = newest, source, stopping.is_set, stopping.wait
+    thread = threading.Thread(target=read_into, args=arguments, name="camera", daemon=True)
+    thread.start()
 
-    def __init__(
-        self, source: ImageSource, stopping: threading.Event, newest: NewestImage | None = None
-    ) -> None:
-        self.newest, self._stopping = newest or NewestImage(), stopping
-        arguments = self.newest, source, stopping.is_set, stopping.wait
-        self._thread = threading.Thread(
-            target=read_into, args=arguments, name="camera", daemon=True
-        )
-        self._thread.start()
+    def stop() -> None:
+        stopping.set()
+        thread.join(2.0)
 
-    def stop(self) -> None:
-        """Stop; does not wait for a device that does not answer."""
-        self._stopping.set()
-        self._thread.join(2.0)
+    return stop
 
 
 class FrozenCheck:
@@ -417,19 +374,15 @@ class FrozenCheck:
 
     def __init__(self) -> None:
         self._before: Grey | None = None
-        self._sum = 0
         self.repeats = 0
 
     def is_repeat(self, grey: Grey) -> bool:
-        """Whether this image equals the previous one, exactly or nearly."""
         step = max(1, min(grey.shape) // FROZEN_SIDE_PX)
         sample = np.ascontiguousarray(grey[step // 2 :: step, step // 2 :: step])
-        total = zlib.crc32(sample.tobytes())
         before, self._before = self._before, sample
-        same = before is not None and before.shape == sample.shape and self._sum == total
-        if before is not None and before.shape == sample.shape and not same:
+        same = False
+        if before is not None and before.shape == sample.shape:
             off = np.abs(before.astype(np.int16) - sample)
-            same = float(off.mean()) < FROZEN_LEVELS and sample.std() > 0
-        self._sum = total
+            same = not off.any() or (off.mean() < FROZEN_LEVELS and sample.std() > 0)
         self.repeats = self.repeats + 1 if same else 0
         return bool(same)

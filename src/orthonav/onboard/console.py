@@ -1,8 +1,5 @@
-"""What `orthonav fly` says while it flies: inputs that come and go, states of the track with their
-reason, faults, a status line every few seconds, and a summary at the end.
-
-An output of `Publisher` like the lines of JSON: it takes every view, and the health once a second.
-"""
+"""What `orthonav fly` says while it flies: inputs, states of the track, faults, a status line every
+few seconds, a summary. It is an output of `Publisher`, like the lines of JSON."""
 
 import contextlib
 import logging
@@ -13,7 +10,6 @@ import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TextIO
 
 import numpy as np
@@ -31,8 +27,6 @@ REMIND_S = 10.0
 """Interval of lines about a missing input."""
 RATE_S = 2.0
 """The rate of a camera is counted over so much time."""
-LOST_S = IMAGE_AGE_S
-"""A camera without an image for so long is lost."""
 _MOST_AGES = 100_000
 _KINDS = {Autopilot.PX4: " PX4", Autopilot.ARDUPILOT: " ArduPilot", None: ""}
 _STATES = {
@@ -60,14 +54,9 @@ CLOSE_S = 1.0
 
 
 class Console:
-    """Takes lines and never blocks. Thread-safe.
-
-    `is_terminal`: whether a person may be reading. `is_open`: whether there is a stream at all.
-    `quiet`: warnings only.
-    """
+    """Takes lines and never blocks. Thread-safe. `quiet`: warnings only."""
 
     def __init__(self, stream: TextIO | None, clocks: Clocks, *, quiet: bool = False) -> None:
-        """`stream`: usually stderr; None where it is closed."""
         self._clocks, self.quiet = clocks, quiet
         self._begun_ns = clocks.mono_ns()
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_LINES)
@@ -80,22 +69,18 @@ class Console:
         self._thread.start()
 
     def say(self, text: str) -> None:
-        """Write a line, unless quiet."""
         if not self.quiet:
             self.put(text)
 
     def warn(self, text: str) -> None:
-        """Write a warning."""
         self.put(f"WARNING: {text}")
 
     def put(self, text: str) -> None:
-        """Write a line with the time since the start."""
         seconds = (self._clocks.mono_ns() - self._begun_ns) / 1e9
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(f"{seconds:8.1f} s  {text}\n")
 
     def close(self) -> None:
-        """Write the waiting lines, for at most `CLOSE_S`."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
         self._thread.join(CLOSE_S)
@@ -132,40 +117,32 @@ class Console:
 
 
 class _Records(logging.Handler):
-    """Passes log records on as text."""
-
     def __init__(self, put: Callable[[str], None]) -> None:
         super().__init__()
         self._put = put
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler.emit`."""
         self._put(self.format(record))
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """What a flight waits for.
-
-    `newest`: images of the camera. `images`: where they come from; None: their source says itself
-    what it waits for. `is_live`: whether they come from a camera, which can be lost.
-    `link`, `url`: connection to the autopilot, where there is one.
-    `sends`: whether positions are sent to an autopilot or to ROS 2.
-    """
-
-    newest: NewestImage
-    images: str | None
-    is_live: bool
-    link: AutopilotLink | None
-    url: str | None
-    sends: bool
-
-
 class Narrator:
-    """Turns views and health into lines on a console. Mutable; for one thread."""
-
-    def __init__(self, console: Console, clocks: Clocks, inputs: Inputs) -> None:
-        self._console, self._clocks, self._inputs = console, clocks, inputs
+    def __init__(
+        self,
+        console: Console,
+        clocks: Clocks,
+        newest: NewestImage,
+        images: str | None,
+        link: AutopilotLink | None,
+        url: str | None,
+        *,
+        is_live: bool,
+        sends: bool,
+    ) -> None:
+        """`images`: where they come from; None: their source says what it waits for. `is_live`:
+        from a camera, which can be lost. `sends`: positions, to an autopilot or to ROS 2."""
+        self._console, self._clocks, self._sends = console, clocks, sends
+        self._newest, self._images, self._is_live = newest, images, is_live
+        self._link, self._url = link, url
         self._interval_ns = round((TERMINAL_S if console.is_terminal else FILE_S) * 1e9)
         self._status_ns = clocks.mono_ns() + self._interval_ns
         self._reminded: dict[str, int] = {}
@@ -184,7 +161,6 @@ class Narrator:
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
     ) -> None:
-        """Note one view, and say where the state of the track changed."""
         now_ns = self._clocks.mono_ns()
         self._watch(now_ns)
         self._begun_ns = self._begun_ns or now_ns
@@ -201,7 +177,6 @@ class Narrator:
             self._say_state(None if before is None else before.state, result)
 
     def health(self, plain: Mapping[str, Any]) -> None:
-        """Say what changed since the last second, and the status where it is due."""
         now_ns = self._clocks.mono_ns()
         self._watch(now_ns)
         self._say_faults(plain, now_ns)
@@ -212,19 +187,16 @@ class Narrator:
             self._console.say(self._status(plain))
 
     def close(self) -> None:
-        """Say the summary of the flight."""
         self._console.say(self._summary())
 
     def _reason(self, result: ViewResult, sent: Sequence[str], withheld: str | None) -> str | None:
-        """Why a view gave no position; None where it gave one."""
         if sent:
             return None
         if isinstance(result.outcome, NoFix) and withheld in (None, "no_fix"):
             return result.outcome.reason
-        return withheld or ("not_sent" if self._inputs.sends else None)
+        return withheld or ("not_sent" if self._sends else None)
 
     def _explain(self, result: ViewResult) -> None:
-        """Say the reason of a view without a position in full, once for each reason."""
         outcome = result.outcome
         if isinstance(outcome, NoFix) and outcome.reason not in {*self._explained, "searching"}:
             self._explained.add(outcome.reason)
@@ -237,21 +209,19 @@ class Narrator:
         say(f"{change}: {text}")
 
     def _watch(self, now_ns: int) -> None:
-        """Say which inputs came or went, and which are missing."""
-        if self._inputs.link is not None:
-            self._remind(self._autopilot.waits(self._inputs.link, self._inputs.url), now_ns)
-        self._remind(self._camera.waits(self._inputs, now_ns), now_ns)
+        if self._link is not None:
+            self._remind(self._autopilot.waits(self._link, self._url), now_ns)
+        is_here = self._camera.delivers(self._newest, now_ns, is_live=self._is_live)
+        self._remind(None if is_here else self._images, now_ns)
 
     def _remind(self, waits: str | None, now_ns: int) -> None:
-        """Say what is missing, and again while it is."""
         if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
             self._reminded[waits] = now_ns + round(REMIND_S * 1e9)
             self._console.say(f"waiting for {waits}")
 
     def _say_faults(self, plain: Mapping[str, Any], now_ns: int) -> None:
-        """Say a change of the health, apart from what other lines say."""
         hidden = _SAID_BY_OTHERS
-        if self._inputs.link is not None and not self._autopilot.is_heard:
+        if self._link is not None and not self._autopilot.is_heard:
             hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
         shown = tuple(each for each in plain["reasons"] if each not in hidden)
         if self._is_faulty and plain["health"] == Level.OK.name:
@@ -279,13 +249,13 @@ class Narrator:
             return f"no view yet; health {plain['health']}"
         outcome, is_place = self._result.outcome, self._result.state in ("tracking", "coasting")
         place = f" {_place_text(outcome)}" if is_place and isinstance(outcome, Fix) else ""
-        parts = [f"{plain['state']}{place}", _counted(since, self._inputs.sends)]
+        parts = [f"{plain['state']}{place}", _counted(since, self._sends)]
         if plain["age_p50_ms"]:
             parts.append(f"latency {plain['age_p50_ms']:.0f} ms, p95 {plain['age_p95_ms']:.0f} ms")
         return "; ".join([*parts, f"health {plain['health']}"])
 
     def _summary(self) -> str:
-        parts = [_counted(self._counts, self._inputs.sends)]
+        parts = [_counted(self._counts, self._sends)]
         if self._dropped:
             parts.append(f"images dropped as too late: {self._dropped}")
         if self._ages_ms:
@@ -299,25 +269,21 @@ class Narrator:
 
 
 class _CameraWatch:
-    """Says when a camera comes and goes. Mutable."""
-
     def __init__(self, console: Console) -> None:
         self._console = console
         self._taken = self._outages = self._seen_ns = 0
         self._since: tuple[int, int] | None = None
         self._size: tuple[int, int] | None = None
 
-    def waits(self, inputs: Inputs, now_ns: int) -> str | None:
-        """Note the images so far; what is waited for, None where images come."""
-        newest = inputs.newest
+    def delivers(self, newest: NewestImage, now_ns: int, *, is_live: bool) -> bool:
         taken, outages, size = newest.taken, newest.outages, newest.size_px
-        is_gone = outages > self._outages or now_ns - self._seen_ns > LOST_S * 1e9
-        if self._since is not None and is_gone and inputs.is_live:
+        is_gone = outages > self._outages or now_ns - self._seen_ns > IMAGE_AGE_S * 1e9
+        if self._since is not None and is_gone and is_live:
             self._console.warn("camera lost: no image any more")
             self._since = self._size = None
         self._outages = outages
         if taken == self._taken:
-            return inputs.images if self._since is None else None
+            return self._since is not None
         self._taken, self._seen_ns = taken, now_ns
         if self._since is None:
             self._since = now_ns, taken
@@ -326,41 +292,38 @@ class _CameraWatch:
             rate_hz = (taken - self._since[1]) / seconds
             self._console.say(f"camera {size[0]}x{size[1]}, {rate_hz:.1f} Hz")
             self._size = size
-        return None
+        return True
 
 
 class _AutopilotWatch:
-    """Says when an autopilot comes and goes. Mutable."""
-
     def __init__(self, console: Console) -> None:
         self._console, self.is_heard, self._others = console, False, 0
 
     def waits(self, link: AutopilotLink, url: str | None) -> str | None:
         """Note the status of the link; what is waited for, None where telemetry comes."""
-        status = link.status()
-        for each in status.others[self._others :]:
+        others, target = list(link.others), link.target
+        for each in others[self._others :]:
             ids = f"{each.system_id}/{each.component_id}"
             self._console.say(f"autopilot {ids} heard on {url}, not used (see --system-id)")
-        self._others = len(status.others)
-        if status.target is None:
-            why = "" if status.is_open else ", which cannot be opened"
-            if status.damaged:
+        self._others = len(others)
+        if target is None:
+            why = "" if link.is_open else ", which cannot be opened"
+            if link.counts["damaged"]:
                 why += "; messages are damaged, or not signed with this key"
             return f"heartbeat on {url}{why}"
-        ids = f"{status.target.system_id}/{status.target.component_id}"
-        is_heard = status.heard_age_s <= LINK_AGE_S
+        ids = f"{target.system_id}/{target.component_id}"
+        is_heard = link.heard_age_s <= LINK_AGE_S
         if self.is_heard and not is_heard:
             self._console.warn(f"heartbeat lost: nothing heard from autopilot {ids} on {url}")
         elif is_heard and not self.is_heard:
-            self._console.say(f"autopilot {ids}{_KINDS[status.kind]} heard on {url}")
+            self._console.say(f"autopilot {ids}{_KINDS[link.kind]} heard on {url}")
         self.is_heard = is_heard
         if not is_heard:
             return f"autopilot {ids} on {url}"
-        return None if math.isfinite(status.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
+        return None if math.isfinite(link.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
 
 
 def _meaning(reason: str, plain: Mapping[str, Any]) -> str:
-    """What a reason of the health means; empty where its name says so."""
     if reason == "start_mismatch":
         return f"{_FAULTS[reason]}, {plain['start_off_m']:,.0f} m from the place found"
     of_camera = str(plain.get("latency"))
@@ -376,7 +339,6 @@ def _place_text(outcome: Fix | NoFix) -> str:
 
 
 def _counted(counts: Counter[str], sends: bool) -> str:
-    """Views, and what became of them."""
     reasons = {name[9:]: n for name, n in counts.most_common() if name.startswith("withheld ")}
     good = f"{counts['']} sent" if sends else f"{counts['']} with a position (none is sent)"
     text = f"{counts['views']} view{'' if counts['views'] == 1 else 's'}, {good}"
@@ -387,7 +349,6 @@ def _counted(counts: Counter[str], sends: bool) -> str:
 
 
 def _descriptor(stream: TextIO | None) -> int | None:
-    """Descriptor of a stream; None where it has none."""
     try:
         return None if stream is None else stream.fileno()
     except (OSError, ValueError):  # closed, or replaced by an object in memory

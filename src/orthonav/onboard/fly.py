@@ -1,7 +1,6 @@
 """The loop of `orthonav fly`: newest image, telemetry at its exposure, position, messages.
 
-It runs on one thread, fed by a camera thread and a link thread. Views are located by
-`orthonav.onboard.run.locate_view`, as those of a recorded flight are, so a log can be replayed.
+It runs on one thread, fed by a camera thread and a link thread.
 """
 
 import logging
@@ -32,12 +31,12 @@ from orthonav.onboard.health import (
     EventCounter,
     Health,
     HealthReporter,
-    Notifier,
     Snapshot,
     StartCheck,
     TelemetryDiagnosis,
     judge,
     mismatch,
+    notify,
 )
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
@@ -56,6 +55,8 @@ UTC_JUMP_NS = 200_000_000
 """UTC that moves by more than this against the monotonic clock within a tick has been set."""
 WITHHELD_NS = 80_000_000
 """Views that are withheld are logged at most so often, for `orthonav calibrate --latency`."""
+TELEMETRY_WAIT_S = 0.15
+"""Longest wait for telemetry after the exposure: three attitudes at 20 Hz, the least rate."""
 JUMP_NS = 10**9
 """Recorded images that are earlier than the one before by more belong to another run."""
 _POLL_S = 0.001
@@ -67,20 +68,11 @@ Velocity = tuple[float, float]
 class FlyOptions:
     """Options of the flight loop.
 
-    `mount_deg`: yaw, pitch, roll of the camera in the body, degrees.
-    `mount`: calibrated mount, for the health only (the locator applies it by itself).
-    `heights`: turns reported heights into heights above ground; None: the map has no terrain.
-    `heading_known`: whether the reported heading is used.
-    `deadline_s`: images older than this are dropped.
-    `min_agl_m`: height above ground below which views are not located.
-    `telemetry_wait_s`: longest wait for telemetry after the exposure.
-    `recorded`: telemetry comes with the image, from a recording or from ROS.
-    `accept`: criterion in addition to those of the gate.
-    `min_confidence`: confidence (0 to 1) from which a position is saved and counts as confident.
-    `map_path`: map file to watch for changes; None: none.
-    `map_change`: how the open map file was changed in place, None if it was not.
-    `state_path`: file for the last position; None: none.
-    `logged_options`: written to the flight log for a replay.
+    `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
+    only: the locator applies it. `heights`: None where the map has no terrain. `deadline_s`: older
+    images are dropped. `min_agl_m`: lower views are not located. `recorded`: telemetry comes with
+    the image, from a recording or ROS. `accept`: in addition to the gate. `map_change`: how the
+    open map file was changed in place. `logged_options`: for a replay of the log.
     """
 
     mount_deg: Angles = LOOKS_DOWN
@@ -89,7 +81,6 @@ class FlyOptions:
     heading_known: bool = True
     deadline_s: float = 0.5
     min_agl_m: float = 0.0
-    telemetry_wait_s: float = 0.15  # three attitudes at 20 Hz, the least rate asked for
     recorded: bool = False
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
@@ -116,13 +107,11 @@ class Runner:
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
-        notifier: Notifier | None = None,
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
-        """`start` gives the prior of the first view; it is called when that view is located.
-        `fresh` makes another locator when recorded time goes back, and a flight begins again.
-        `latency`: that of a live camera; None where images carry the time of their exposure."""
+        """`start` gives the prior of the first view; `fresh` makes a locator where time goes back.
+        `latency`: of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
         self._link, self._sink, self._diagnosis = link, sink, diagnosis
@@ -131,7 +120,6 @@ class Runner:
         self._start_check: StartCheck | None = None
         self._begin, self._fresh = start, fresh
         self._time_ns = 0
-        self._notifier = notifier or Notifier("")
         self._gnss = gnss
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
         self.health: Health | None = None
@@ -153,9 +141,8 @@ class Runner:
         self._boot_id = states.boot_id()
 
     def run(self, stopping: threading.Event) -> None:
-        """Fly until `stopping` is set, or until a recording ends."""
         self._log(lambda sink: sink.options(dict(self.options.logged_options)))
-        self._notifier.notify("READY=1", "STATUS=waiting for images")
+        notify("READY=1", "STATUS=waiting for images")
         try:
             is_over = False
             while not stopping.is_set() and not is_over:
@@ -166,13 +153,12 @@ class Runner:
                     log.exception("unexpected error in the flight loop")
                     self._count("internal_error")
         finally:
-            self._notifier.notify("STOPPING=1")
+            notify("STOPPING=1")
             self._save_state()
             self._publisher.close()
             self._log(lambda sink: sink.close())
 
     def step(self, timeout_s: float) -> ViewResult | None:
-        """Process the newest image, waiting `timeout_s` for it; None without a result."""
         image = self._newest.take(timeout_s)
         result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
@@ -182,7 +168,6 @@ class Runner:
         return result
 
     def _process(self, image: CameraImage) -> ViewResult | None:
-        """Result of one image; None where it is too old."""
         now_ns = self._image_taken_ns = self._clocks.mono_ns()
         self._count("taken")
         latency = None
@@ -223,7 +208,6 @@ class Runner:
             self._observe(image.grey, camera, latency)
 
     def _restart_after_jump(self, time_ns: int) -> None:
-        """Forget the track where time goes back: a bag or a simulation that begins again."""
         before_ns, self._time_ns = self._time_ns, time_ns
         if self._fresh is None or not self.options.recorded or time_ns > before_ns - JUMP_NS:
             return
@@ -234,7 +218,6 @@ class Runner:
             self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
 
     def _refused(self, image: CameraImage, reason: NoFix, vehicle: VehicleState) -> ViewResult:
-        """Log and publish an image that cannot be located."""
         result = self._result(image, reason, math.nan)
         self._log(lambda sink: sink.result(result))
         self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
@@ -243,7 +226,7 @@ class Runner:
     def _withheld(
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency
     ) -> ViewResult:
-        """Log and publish a view whose time of exposure is in doubt: the track must not get it."""
+        # Its time of exposure is in doubt: the track must not get it.
         reason = latency.reason or ""
         self._count(reason)
         result = self._result(image, NoFix(reason, latency.detail), math.nan)
@@ -257,7 +240,6 @@ class Runner:
         return result
 
     def _observe(self, grey: Grey, camera: Camera, latency: Latency | None) -> None:
-        """Compare an image of a live camera with the telemetry."""
         if latency is not None and self._latency is not None and self._link is not None:
             reported = self._link.state_at, self._link.covered_ns
             self._latency.observe(latency.arrived_ns, grey, camera, *reported)
@@ -276,7 +258,6 @@ class Runner:
     def _located(
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency | None
     ) -> ViewResult:
-        """Log, locate and publish a view."""
         view = self._from_start(view)
         self._say_heights(view.telemetry)
         known = self._above_ground(view.telemetry)
@@ -321,7 +302,6 @@ class Runner:
         return result
 
     def _from_start(self, view: View) -> View:
-        """The view, the first one with the start position as its prior."""
         telemetry = view.telemetry
         if self._start is not None:
             prior, self._start = self._start(), None
@@ -335,7 +315,6 @@ class Runner:
     def _with_altitude(
         self, vehicle: VehicleState, outcome: Fix | NoFix, telemetry: Telemetry
     ) -> VehicleState:
-        """The vehicle with the altitude by the terrain at a fix, where none was reported."""
         heights = self.options.heights
         if heights is None or not isinstance(outcome, Fix) or math.isfinite(vehicle.amsl_m):
             return vehicle
@@ -347,8 +326,7 @@ class Runner:
     def _over_gap(
         self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState
     ) -> Telemetry:
-        """Telemetry whose velocity is, after a long time without a located view, the mean since
-        that view; None where it is not known."""
+        """Telemetry whose velocity is the mean since the view before, where that is long ago."""
         before_ns, link = self._tracked_ns, self._link
         if before_ns is None or telemetry.vel_en_mps is None or vehicle.travelled is None:
             return telemetry
@@ -362,8 +340,6 @@ class Runner:
         return replace(telemetry, vel_en_mps=mean)
 
     def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:
-        """The position of a view, and the time that it took, ms. `reported`: its telemetry with the
-        velocity at the exposure."""
         try:
             outcome, latency_ms = locate_view(self._locator, view)
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
@@ -373,7 +349,6 @@ class Runner:
         return outcome, latency_ms
 
     def _doubt(self, result: ViewResult, latency: Latency | None) -> str | None:
-        """Reason to doubt the time of exposure by the position of a view; None without one."""
         fix = self._confident_fix(result)
         if self._latency is None or latency is None or fix is None:
             return None
@@ -386,7 +361,6 @@ class Runner:
         return fix if result.state in (None, "tracking") else None
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
-        """Keep a confident position, and its difference from the reported heading and height."""
         fix = self._confident_fix(result)
         if fix is None:
             return
@@ -399,37 +373,25 @@ class Runner:
         if not self.options.heading_known:
             self._mismatch = 0.0, self._mismatch[1]
         utc_ns = exposed_ns + self._clocks.utc_ns() - self._clocks.mono_ns()
-        std_m = fix.std_m
         self._last = states.SavedState(
-            fix.lat_deg, fix.lon_deg, std_m, utc_ns, exposed_ns, self._boot_id
+            fix.lat_deg, fix.lon_deg, fix.std_m, utc_ns, exposed_ns, self._boot_id
         )
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
+        accept, accepted = self.options.accept, None
+        if isinstance(outcome, Fix):
+            accepted = outcome.confidence >= self.options.min_confidence
+            accepted = accepted and (accept is None or accept.accepts(outcome))
         state = self._locator.state_name
-        accepted = self._accepts(outcome) if isinstance(outcome, Fix) else None
         result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted)
-        if self._gnss is None:
-            return result
-        return self._gnss.view(result, image.exposed_ns)
-
-    def _accepts(self, fix: Fix) -> bool:
-        """Whether a fix meets the criterion of this flight."""
-        accept = self.options.accept
-        return fix.confidence >= self.options.min_confidence and (
-            accept is None or accept.accepts(fix)
-        )
+        return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
 
     def _map_changed(self) -> NoFix | None:
-        """Reason to give no position where the map file was changed in place; None if it was not.
-
-        Parts of the map that are in memory would still give positions; they stop all the same, so
-        that the fault shows at once and not where the aircraft leaves these parts.
-        """
+        # Parts in memory would still give positions; stopping shows the fault at once.
         change = self.options.map_change()
         return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
     def _bad_image(self, image: CameraImage) -> NoFix | None:
-        """Reason why an image cannot be used; None if it can."""
         if image.grey is None:
             self._count("bad_image")
             return image.problem or NoFix("bad_image", "image could not be decoded")
@@ -444,19 +406,16 @@ class Runner:
         return None
 
     def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
-        """Telemetry at the exposure; waits a little for the samples that follow it."""
         if self.options.recorded or self._link is None:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
             return image.vehicle or VehicleState(None), image.telemetry or nothing
-        until_ns = self._clocks.mono_ns() + round(self.options.telemetry_wait_s * 1e9)
+        until_ns = self._clocks.mono_ns() + round(TELEMETRY_WAIT_S * 1e9)
         while not self._link.covers(image.exposed_ns) and self._clocks.mono_ns() < until_ns:
             self._clocks.sleep(_POLL_S)
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
     def _above_ground(self, telemetry: Telemetry) -> Telemetry | NoFix:
-        """The telemetry with its height above ground by the terrain of the map, if it has one;
-        `NoFix` where the terrain cannot be read."""
         heights = self.options.heights
         try:
             return telemetry if heights is None else heights.corrected(telemetry)
@@ -466,7 +425,6 @@ class Runner:
             return self._refusal("internal_error", MAP_DAMAGED, str(error))
 
     def _say_heights(self, telemetry: Telemetry) -> None:
-        """Log once what is assumed about heights."""
         if self._heights_said:
             return
         self._heights_said = True
@@ -476,7 +434,6 @@ class Runner:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
     def _unusable(self, telemetry: Telemetry) -> NoFix | None:
-        """Reason not to locate a view by its telemetry."""
         known = self._above_ground(telemetry)
         if isinstance(known, NoFix):
             return known
@@ -500,7 +457,6 @@ class Runner:
         self.counter.add(self._clocks.mono_ns(), name)
 
     def _log(self, call: "Callable[[FlightLog], None]") -> None:
-        """Write to the log; a failure is counted for the health."""
         if self._sink is None:
             return
         try:
@@ -511,7 +467,6 @@ class Runner:
             self._count("log_failed")
 
     def _tick(self, now_ns: int) -> None:
-        """Once a second: judge and publish the health, and save the state."""
         self._count_changes()
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
@@ -520,7 +475,7 @@ class Runner:
         plain = self._plain(health, seen.start_off_m)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
-        self._notifier.notify("WATCHDOG=1", f"STATUS={health.text()}")
+        notify("WATCHDOG=1", f"STATUS={health.text()}")
         if self._link is None:
             return
         self._link.system_status = health.level.value
@@ -532,8 +487,7 @@ class Runner:
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
-            link = self._link
-            self._publisher.messenger.find_origin(link.origin, link.target, armed=link.armed)
+            self._publisher.messenger.find_origin()
 
     def _send_text(self, severity: int, text: str) -> None:
         self._texts += 1
@@ -542,7 +496,6 @@ class Runner:
                 self._link.send(each)
 
     def _count_changes(self) -> None:
-        """Count what the link, the camera, the outputs and the log counted since the last call."""
         messenger = self._publisher.messenger
         now = {
             "clock_jump": 0 if self._link is None else self._link.sync.jumps,
@@ -565,15 +518,16 @@ class Runner:
         counts = self.counter.counts(now_ns)
         link, has_origin = None, True
         if self._link is not None:
-            link, messenger = self._link.status(), self._publisher.messenger
+            link, messenger = self._link, self._publisher.messenger
             needed = messenger is not None and messenger.needs_origin
             has_origin = not needed or self._link.origin is not None
         uses_link = link is not None and not self.options.recorded
-        image_ns = self._begun_ns if self._image_taken_ns is None else self._image_taken_ns
+        taken_ns = self._image_taken_ns
+        image_ns = self._begun_ns if taken_ns is None else taken_ns
         found = (0.0, 0.0) if self._diagnosis is None else self._diagnosis.mismatch(now_ns)
         heading_deg, log_scale = found if any(found) else self._mismatch
         state = self._locator.state_name
-        if state is None and self._image_taken_ns is None:
+        if state is None and taken_ns is None:
             state = "searching"
         return Snapshot(
             running_s=(now_ns - self._begun_ns) / 1e9,
@@ -584,7 +538,7 @@ class Runner:
             low_confidence_s=(now_ns - self._confident_ns) / 1e9,
             latency_s=self.counter.latency_s(0.95),
             state=state,
-            synced=link.synced if link else True,
+            synced=link is None or link.sync.is_exact,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
@@ -592,11 +546,10 @@ class Runner:
             start_off_m=self._start_off_m(now_ns),
             gnss=() if self._gnss is None else self._gnss.reasons,
             has_origin=has_origin,
-            latency=self._latency_reason(),
+            latency=None if self._latency is None or taken_ns is None else self._latency.reason,
         )
 
     def _start_off_m(self, now_ns: int) -> float:
-        """Distance by which the track, or before it the diagnosis, contradicts the start."""
         check = self._start_check
         if check is None:
             return 0.0
@@ -604,12 +557,6 @@ class Runner:
         if place is not None:
             check.diagnosed(*place, now_ns)
         return check.off_m(now_ns)
-
-    def _latency_reason(self) -> str | None:
-        """Reason why the latency of the camera cannot be used."""
-        if self._latency is None or self._image_taken_ns is None:
-            return None
-        return self._latency.reason
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
         total = self.counter.total
@@ -656,10 +603,7 @@ class Runner:
 
 
 def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> Fix:
-    """The fix of a track with its velocity at the exposure, where it was estimated with a mean.
-
-    A reported velocity and its mean have the same error.
-    """
+    """The fix with the velocity at the exposure instead of the mean, which has the same error."""
     if mean is None or reported is None or mean == reported:
         return fix
     own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")
@@ -679,14 +623,12 @@ def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
 
 
 def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
-    """Send fault code and difference as NAMED_VALUE_FLOAT, for scripts and ground stations."""
     boot_ms = ((link.boot_ns(now_ns) or 0) // 1_000_000) % 2**32
     for name, value in ((b"gnss_fault", float(gnss.code)), (b"gnss_diff", gnss.difference_m)):
         link.send(dialect().MAVLink_named_value_float_message(boot_ms, name, value))
 
 
 def _file_id(path: Path | None) -> tuple[int, int] | None:
-    """Device and inode of the file of that name; None where there is none."""
     try:
         found = path.stat() if path is not None else None
     except OSError:

@@ -1,8 +1,4 @@
-"""Health of a flight: OK, DEGRADED or FAILED, with reasons; diagnosis of telemetry and start.
-
-`judge` is a pure function of counts over the last seconds. docs/onboard.md lists the reasons and
-their causes.
-"""
+"""Health of a flight with reasons (docs/onboard.md); diagnosis of telemetry and start."""
 
 import logging
 import math
@@ -33,8 +29,7 @@ IMAGE_AGE_S, TELEMETRY_AGE_S, LINK_AGE_S = 3.0, 3.0, 5.0
 LOW_CONFIDENCE_S, COASTING_S = 10.0, 2.0
 """Longest time without a confident position, in general and by views that do not show the map."""
 LATENCY_S, SHARE = 0.5, 0.2
-"""95th percentile of the time from exposure to message; share of the images in the window that are
-unusable, late or lack telemetry."""
+"""Of the 95th percentile from exposure to message; of images unusable, late, without telemetry."""
 HEADING_DEG, LOG_SCALE = 20.0, 0.2
 """Difference of estimated and reported heading, and of the logarithm of the height."""
 GRACE_S = 5.0
@@ -58,19 +53,15 @@ class Level(Enum):
 
     @property
     def severity(self) -> int:
-        """MAV_SEVERITY of the STATUSTEXT."""
         return {Level.OK: 6, Level.DEGRADED: 4, Level.FAILED: 3}[self]
 
 
 @dataclass(frozen=True)
 class Health:
-    """Level and reasons, those of FAILED first."""
-
     level: Level
     reasons: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """Text for a ground station."""
         text = f"orthonav {self.level.name}"
         return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
 
@@ -79,23 +70,12 @@ class Health:
 class Snapshot:
     """Input of `judge`. Ages are in seconds, infinite for "never".
 
-    `running_s`: time since the start.
-    `counts`: events within the window by name: `taken` (by the runner), `processed`, `late`,
-    `frozen`, `bad_image`, `no_telemetry`, `internal_error`, `wrong_camera`, `camera_lost`,
-    `clock_jump`, `output_failed`, `log_failed`, `state_failed`; seconds in which a local message
-    came too late for PX4 (`slow_vision`) or a message could not be built (`incomplete`).
-    `image_age_s`, `telemetry_age_s`, `link_age_s`: time since the last image, attitude, message.
-    `low_confidence_s`: time since the last confident position.
-    `latency_s`: 95th percentile of the time from exposure to message.
-    `state`: state of the track; None for views that are located one by one.
-    `synced`: whether TIMESYNC is answered.
-    `map_unchanged`: whether the file of the map's name is still the one that was opened.
-    `map_intact`: whether the open map file was neither truncated nor rewritten.
-    `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
-    `start_off_m`: distance by which the ground contradicts the start position, 0 if it does not.
-    `gnss`: reasons of the GNSS monitor.
-    `has_origin`: whether the origin of the local frame is known, where messages need it.
-    `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
+    `counts`: events within the window by name; `slow_vision` and `incomplete` are seconds in which
+    a local message came too late for PX4 or a message could not be built. `latency_s`: 95th
+    percentile from exposure to message. `map_unchanged`: the file of the map's name is the one that
+    was opened; `map_intact`: the open file was not changed. `start_off_m`: distance by which the
+    ground contradicts the start. `gnss`, `latency`: reasons of the monitors. `has_origin`: of the
+    local frame, where messages need it.
     """
 
     running_s: float
@@ -118,7 +98,6 @@ class Snapshot:
 
 
 def judge(seen: Snapshot) -> Health:
-    """Level and reasons."""
     count = Counter(seen.counts)
     many = SHARE * max(count["taken"], 1)
     settled = seen.running_s > GRACE_S
@@ -165,33 +144,25 @@ def judge(seen: Snapshot) -> Health:
 
 
 class EventCounter:
-    """Counts of events, and latencies, within the last `window_s` seconds. Mutable."""
-
-    def __init__(self, window_s: float = WINDOW_S) -> None:
-        self._window_ns = round(window_s * 1e9)
+    def __init__(self) -> None:
         self._events: deque[tuple[int, str]] = deque()
         self._latencies: deque[tuple[int, float]] = deque()
-        self._counts: Counter[str] = Counter()
         self.total: Counter[str] = Counter()
 
     def add(self, now_ns: int, name: str) -> None:
-        """Count an event."""
         self._events.append((now_ns, name))
-        self._counts[name] += 1
         self.total[name] += 1
 
     def add_latency(self, now_ns: int, seconds: float) -> None:
-        """Add the time of one view from exposure to the last message."""
         self._latencies.append((now_ns, seconds))
 
     def counts(self, now_ns: int) -> Counter[str]:
-        """Counts within the window, by name."""
-        begin = now_ns - self._window_ns
+        begin = now_ns - round(WINDOW_S * 1e9)
         while self._events and self._events[0][0] < begin:
-            self._counts[self._events.popleft()[1]] -= 1
+            self._events.popleft()
         while self._latencies and self._latencies[0][0] < begin:
             self._latencies.popleft()
-        return Counter(+self._counts)
+        return Counter(name for _, name in self._events)
 
     def latency_s(self, quantile: float) -> float:
         """Quantile (0 to 1) of the latencies within the window; 0 where there are none."""
@@ -200,14 +171,13 @@ class EventCounter:
 
 
 class HealthReporter:
-    """Decides when a change of health is sent as text: at most once in five seconds. Mutable."""
+    """Decides when a change of health is sent as text. Mutable."""
 
     def __init__(self) -> None:
         self._reported: Health | None = None
         self._reported_ns: int | None = None
 
     def due(self, health: Health, now_ns: int) -> bool:
-        """Whether to send `health` now."""
         if health == self._reported:
             return False
         if self._reported_ns is not None and now_ns - self._reported_ns < STATUSTEXT_INTERVAL_NS:
@@ -216,25 +186,19 @@ class HealthReporter:
         return True
 
 
-class Notifier:
-    """Notifies systemd: datagrams to the socket that it names, as `sd_notify(3)` sends them."""
-
-    def __init__(self, address: str | None = None) -> None:
-        """`address`: by default `NOTIFY_SOCKET` of the environment; empty: send nothing."""
-        address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
-        self._address = "\0" + address[1:] if address.startswith("@") else address
-
-    def notify(self, *lines: str) -> bool:
-        """Send lines such as `READY=1`, `WATCHDOG=1`, `STATUS=..`; whether they were sent."""
-        if not self._address:
-            return False
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
-                out.setblocking(False)
-                out.sendto("\n".join(lines).encode(), self._address)
-        except OSError:
-            return False
-        return True
+def notify(*lines: str) -> bool:
+    """Send `READY=1`, `WATCHDOG=1`, `STATUS=..` to systemd as `sd_notify(3)` does."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    address = "\0" + address[1:] if address.startswith("@") else address
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+            out.setblocking(False)
+            out.sendto("\n".join(lines).encode(), address)
+    except OSError:
+        return False
+    return True
 
 
 def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:
@@ -246,12 +210,11 @@ def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:
 
 
 class TelemetryDiagnosis:
-    """Finds out whether a wrong heading, height or start is the reason that no position is found.
+    """Finds out whether a wrong heading, height or start is why no position is found.
 
-    While a track finds nothing, a view is located again on the whole map: with any heading, with
-    half the height and with twice the height, one hypothesis at a time. A confident fix shows which
-    value is wrong; it is never used as a position. It takes seconds on a large map, so it runs in a
-    thread. Mutable.
+    While a track finds nothing, a view is located again on the whole map with any heading and half
+    and twice the height. A confident fix shows which value is wrong; it is never used as a
+    position. It takes seconds, so it runs in a thread. Mutable.
     """
 
     HYPOTHESES = ((False, 1.0), (True, 0.5), (True, 2.0))  # heading known, factor of the height
@@ -275,14 +238,13 @@ class TelemetryDiagnosis:
         self._found: tuple[int, Fix, Telemetry] | None = None
 
     def observe(self, view: View, found: bool, now_ns: int) -> None:
-        """Pass every view and whether the track has a position; some views are tried again."""
         if found or self._since_ns is None:
             self._since_ns = now_ns
             self._found = None if found else self._found
             return
         if self._busy or now_ns - self._since_ns < DIAGNOSIS_INTERVAL_S * 1e9:
             return
-        self._since_ns = now_ns
+        self._since_ns, self._busy = now_ns, True
         heading_known, factor = self._hypotheses[self._number % len(self._hypotheses)]
         self._number += 1
         telemetry = view.telemetry
@@ -300,18 +262,15 @@ class TelemetryDiagnosis:
             finally:
                 self._busy = False
 
-        self._busy = True
         self._start(locate)
 
     def mismatch(self, now_ns: int) -> tuple[float, float]:
-        """Recent finding as `mismatch` gives it; zeros where there is none."""
         if self._found is None or now_ns - self._found[0] > DIAGNOSIS_VALID_S * 1e9:
             return 0.0, 0.0
         return mismatch(*self._found[1:])
 
     @property
     def place(self) -> tuple[Fix, int] | None:
-        """The last position found and the time of its view, for comparison with the start only."""
         return None if self._found is None else (self._found[1], self._found[0])
 
 
@@ -320,17 +279,13 @@ def _in_a_thread(work: Callable[[], None]) -> None:
 
 
 class StartCheck:
-    """Compares the places where a flight was recognized with its start. Mutable."""
-
     def __init__(self, start: Prior, time_ns: int) -> None:
-        """`time_ns`: time of the first view, for which the start holds."""
         self._start, self._time_ns = start, time_ns
         self._moved_en_m, self._free_m = np.zeros(2), 0.0
         self._diagnosed: _Place | None = None
         self._confirmed: _Place | None = None
 
     def moved(self, telemetry: Telemetry) -> None:
-        """Pass the telemetry of every view."""
         seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
         self._time_ns = max(telemetry.time_ns, self._time_ns)
         velocity = telemetry.vel_en_mps
@@ -342,18 +297,16 @@ class StartCheck:
         self._free_m += SIGMAS * std_mps * seconds
 
     def diagnosed(self, fix: Fix, seen_ns: int, now_ns: int) -> None:
-        """Pass the last place that the diagnosis found, in a view taken at `seen_ns`."""
         if self._diagnosed is None or self._diagnosed.fix is not fix:
             self._diagnosed = self._place(fix, seen_ns, now_ns)
 
     def confirmed(self, fix: Fix, now_ns: int) -> None:
-        """Pass the confident fixes of the track; the first one decides."""
+        # The first one decides.
         if self._confirmed is None:
             self._confirmed = self._place(fix, now_ns, now_ns)
 
     def off_m(self, now_ns: int) -> float:
-        """Distance of the start from that which the last place implies, metres; 0 where it is
-        within the deviations, and `SHOWN_S` after that place."""
+        """Distance by which the last place contradicts the start, m; 0 within the deviations."""
         last = self._confirmed or self._diagnosed
         return last.off_m if last is not None and now_ns - last.seen_ns < SHOWN_S * 1e9 else 0.0
 
@@ -378,7 +331,6 @@ class _Place:
     off_m: float
 
     def reaches(self, fix: Fix, seen_ns: int) -> bool:
-        """Whether the aircraft can have flown from here to a later fix."""
         free_m = SPEED_MPS * (seen_ns - self.seen_ns) / 1e9
         return float(np.hypot(*_from(fix, self.fix))) <= free_m + self.fix.radius_m + fix.radius_m
 

@@ -32,18 +32,16 @@ UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mis
 STATED_STD_S = 0.03
 """Least standard deviation of a stated latency: one image at 30 Hz."""
 FIRST_NS = 5 * 10**9
-"""A latency is used after images agreed with it, or after this time without enough motion to
-tell."""
+"""A latency is used after images agreed with it, or after this time without enough motion."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
-"""Interval at which reported states are stored, and how far back, at the start and after a time
-without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_S`)."""
+"""Interval at which reported states are stored, and how far back after a time without images;
+telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_NS`)."""
 GAP_S = 0.5
 """A latency is compared again after an image was frozen for longer."""
 SETTLED_NS = 8 * 10**9
 """After images or positions contradicted the latency, nothing may contradict it for so long."""
 EXPLAINED, UNEXPLAINED = 0.6, 0.3
-"""Share of the motion that is common to images and report from which they agree, and below which
-they contradict each other."""
+"""Shares of the motion common to images and report from which they agree, below which not."""
 SECONDS, LEAST_PAIRS = 4.0, 12
 """Images of so many seconds are compared, at least so many pairs."""
 LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
@@ -52,8 +50,7 @@ the seen over the reported one: height and heading may be off."""
 SUMMED, STANDS_OUT = 4, 3.0
 """Successive pairs that are summed; their motion counts from so many least standard deviations."""
 OUTLIER, OUTLIER_SHARE, MAD_TO_STD = 6.0, 0.1, 1.4826
-"""Pairs that differ by more than so many standard deviations are left out, the worst ones, up to
-this share: one false motion of the picture is in four sums."""
+"""The worst pairs, beyond so many standard deviations, are left out, up to this share."""
 KEEP_S, LONGEST_GAP_S = 5.0, 30.0
 """Earlier positions with which one is compared: a track moves to a new place within seconds. The
 last one counts for longer: a track may have been coasting or lost since."""
@@ -66,9 +63,8 @@ LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 class Latency:
     """The latency to use for one image.
 
-    `arrived_ns`: its arrival by our clock. `delay_s`, `std_s`: exposure to arrival and its standard
-    deviation; 0 and NaN where not stated. `reason`: why the latency must not be used; None if it
-    can be used. `detail`: one sentence about it.
+    `arrived_ns`: by our clock. `delay_s`, `std_s`: exposure to arrival; 0 and NaN where not stated.
+    `reason`: why the latency must not be used. `detail`: one sentence about it.
     """
 
     arrived_ns: int
@@ -89,8 +85,7 @@ class LatencyMonitor:
         mount_deg: Angles = LOOKS_DOWN,
         heading_known: bool = True,
     ) -> None:
-        """`stated_s`: latency as stated by the user, None: not stated. `heading_known`: whether the
-        reported heading gives the direction of the velocity."""
+        """`stated_s`: None: not stated. `heading_known`: the heading gives that of the velocity."""
         self._is_stated, self._delay_s = stated_s is not None, stated_s or 0.0
         self._std_s = stated_std_s if self._is_stated else math.nan
         self._mount_deg = mount_deg
@@ -107,10 +102,8 @@ class LatencyMonitor:
         self._jump_s: float | None = None
 
     def latency(self, arrived_ns: int, interruptions: int = 0) -> Latency:
-        """The latency to use for an image. Pass every image, in the order of arrival.
-
-        `interruptions`: how often images stopped for a while. The latency is then compared again,
-        as at the start; positions from before show whether it grew."""
+        """The latency of an image; pass all in the order of arrival. After `interruptions` it is
+        compared again, as at the start; positions from before show whether it grew."""
         frozen_ns = arrived_ns if self._frozen_ns is None else self._frozen_ns
         if interruptions != self._interruptions or arrived_ns - frozen_ns > GAP_S * 1e9:
             self._interruptions = interruptions
@@ -143,10 +136,7 @@ class LatencyMonitor:
         state_at: Callable[[int], VehicleState],
         covered_ns: int | None,
     ) -> None:
-        """Compare an image with the one before, and with the states that the autopilot reported.
-
-        `state_at` gives the state at a time of our clock, known up to `covered_ns`.
-        """
+        """Compare an image with the one before and the states reported, known to `covered_ns`."""
         if not self._is_stated:
             return
         self._frozen_ns = None  # this image is not frozen
@@ -169,8 +159,7 @@ class LatencyMonitor:
         return self._doubt()[0]
 
     def plain(self) -> dict[str, float | str | None]:
-        """What is known, for logs: `latency_ms`, `latency_std_ms`, and `latency`, "stated" or why
-        it is not used."""
+        """What is known, for logs; `latency` is "stated" or why it is not used."""
         reason, detail = self._doubt()
         return {
             "latency_ms": round(self._delay_s * 1e3, 1) if self._is_stated else None,
@@ -179,7 +168,6 @@ class LatencyMonitor:
         }
 
     def _doubt(self) -> tuple[str | None, str]:
-        """Reason why the latency cannot be used, and one sentence about it; None where it can."""
         if not self._is_stated:
             advice = "give --camera-latency-ms, as `orthonav calibrate --latency` measures it"
             return UNKNOWN, f"camera latency not known: {advice}"
@@ -194,7 +182,6 @@ class LatencyMonitor:
         return None, ""
 
     def _sample(self, state_at: Callable[[int], VehicleState], covered_ns: int | None) -> None:
-        """Store the reported states up to a time."""
         if covered_ns is None:
             return
         if self._sampled_ns is None or covered_ns - self._sampled_ns > REACH_NS:
@@ -209,7 +196,6 @@ class LatencyMonitor:
             self._history.add(self._sampled_ns, attitude, known, state.height_m)
 
     def _compare_again(self) -> None:
-        """Forget the images so far."""
         self._compared, self._first_ns = False, None
         self._odometry.reset()
         self._check.clear()
@@ -219,19 +205,16 @@ class MotionCheck:
     """Whether the images of the last seconds move as the autopilot reports. Mutable."""
 
     def __init__(self, delay_s: float, *, heading_known: bool = True) -> None:
-        """`delay_s`: exposure to arrival of the images."""
         self._delay_ns = round(delay_s * 1e9)
         self._heading_known = heading_known
         self._waiting: deque[ImageMotion] = deque(maxlen=100)
         self._rows: deque[tuple[int, Array]] = deque(maxlen=100)
 
     def clear(self) -> None:
-        """Forget all images."""
         self._waiting.clear()
         self._rows.clear()
 
     def add(self, motion: ImageMotion | None, history: StateHistory) -> None:
-        """Add the motion of a pair of images; it counts once the report reaches beyond it."""
         if motion is not None:
             self._waiting.append(motion)
         while self._waiting and self._waiting[0].end_ns - self._delay_ns <= history.newest_ns:
@@ -245,8 +228,7 @@ class MotionCheck:
                 self._rows.append((one.end_ns, row))
 
     def share(self) -> float:
-        """Share of the seen and the reported motion of the last seconds that is common to both; NaN
-        where little moved."""
+        """Share of the last motion that is seen and reported; NaN where little moved."""
         while self._rows and self._rows[0][0] < self._rows[-1][0] - SECONDS * 1e9:
             self._rows.popleft()
         if not self.is_filled:
@@ -272,7 +254,6 @@ class MotionCheck:
 
     @property
     def is_filled(self) -> bool:
-        """Whether there are enough pairs to compare."""
         return len(self._rows) >= LEAST_PAIRS
 
     def _contradicts(self, seen: Array, reported: Array) -> bool:
@@ -286,7 +267,6 @@ class MotionCheck:
 
 
 def _sound(pairs: Array) -> Array:
-    """The rows (N, 9) without outliers."""
     off = np.concatenate([pairs[:, 1:2] - pairs[:, 4:5], pairs[:, 2:4] - pairs[:, 5:7]], axis=1)
     off[:, 1:] -= pairs[:, 7:9]
     off = np.abs(off - np.median(off, axis=0))
@@ -307,20 +287,15 @@ class _Place:
 
 
 class PositionCheck:
-    """Whether the position jumped along the path of the aircraft. Mutable."""
-
     def __init__(self) -> None:
         self._places: deque[_Place] = deque(maxlen=100)
 
     def jump_s(
         self, exposed_ns: int, en_m: Array, std_m: float, history: StateHistory
     ) -> float | None:
-        """Growth of the latency (s) by which the position jumped; None where it did not jump, or to
-        a place that no change of the latency explains. One that jumped does not count later.
-
-        `exposed_ns`: time of exposure by the latency in use. `en_m` (2,): metres east and north,
-        `std_m` their standard deviation.
-        """
+        """Growth of the latency (s) by which the position jumped; None without a jump or where no
+        latency explains it. One that jumped does not count later. `exposed_ns`: by the latency in
+        use; `en_m` (2,): metres east and north."""
         now = _Place(exposed_ns, en_m, std_m)
         while len(self._places) > 1 and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
             self._places.popleft()

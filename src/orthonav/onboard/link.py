@@ -1,8 +1,4 @@
-"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages.
-
-pymavlink (extra `autopilot`) decodes incoming messages; `orthonav.onboard.messages.mavlink` packs
-outgoing ones.
-"""
+"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages."""
 
 import logging
 import math
@@ -10,12 +6,12 @@ import select
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
-from orthonav.onboard.gnss.mavlink import gnss_sample
+from orthonav.onboard.gnss.records import gnss_sample
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
     Message,
@@ -51,34 +47,7 @@ _DOWNWARD = 25
 _FAR_NS = 60 * 10**9
 _ARMED = 128
 _SAME_M = 0.05
-"""Heights above home and above sea level that are the same within this are one height, twice: home
-is not within this of sea level."""
-
-
-@dataclass(frozen=True)
-class LinkStatus:
-    """Status of a link. Ages are in seconds, infinite for "never".
-
-    `is_open`: whether the port is open.
-    `heard_age_s`, `attitude_age_s`: time since the last message and the last attitude.
-    `synced`: whether TIMESYNC is answered.
-    `jumps`: number of clock jumps since the start.
-    `errors`: number of failures of the port since the start.
-    `target`, `kind`: ids and type of the autopilot; None until its first heartbeat.
-    `others`: autopilots that were heard and are not used.
-    `damaged`: number of messages that could not be decoded, or were not signed as asked.
-    """
-
-    is_open: bool
-    heard_age_s: float
-    attitude_age_s: float
-    synced: bool
-    jumps: int
-    errors: int
-    target: Target | None
-    kind: Autopilot | None
-    others: tuple[Target, ...]
-    damaged: int
+"""Heights above home and above sea level that are the same within this are one height, twice."""
 
 
 class AutopilotLink:
@@ -96,12 +65,10 @@ class AutopilotLink:
         stamp: Clock = Clock.UTC,
         own_receiver: int | None = None,
     ) -> None:
-        """`system_id`: that of the autopilot, by default of the first one heard. `signing`: sign
-        outgoing messages and require incoming ones to be signed with the same key. `silent`: send
-        nothing. `stamp`: clock of the timestamps of messages, with which TIMESYNC is answered.
-        `own_receiver`: number of the GNSS receiver that orthonav stands for, if any.
-
-        Raises `MissingExtraError` where pymavlink is missing or too old.
+        """`system_id`: by default that of the first autopilot heard. `signing`: sign outgoing
+        messages and require incoming ones to be signed with the same key. `stamp`: clock of the
+        timestamps, with which TIMESYNC is answered. `own_receiver`: number of the GNSS receiver
+        that orthonav stands for. Raises `MissingExtraError` where pymavlink is missing or old.
         """
         dialect()
         self._opener, self._clocks = opener, clocks
@@ -115,7 +82,7 @@ class AutopilotLink:
         self._transport: Transport | None = None
         self._retry_ns, self._failures = 0, 0
         self.target: Target | None = None
-        self._others: list[Target] = []
+        self.others: list[Target] = []  # heard and not used
         self.kind: Autopilot | None = None
         self.origin: Origin | None = None
         self.armed: bool | None = None
@@ -129,10 +96,7 @@ class AutopilotLink:
         self._sequence, self._packed, self._resign_ns = 0, 0, 0
 
     def poll(self, timeout_s: float = 0.0) -> int:
-        """Read incoming messages, waiting at most `timeout_s`, and send what is due.
-
-        Returns the number of messages from the autopilot.
-        """
+        """Read, waiting at most `timeout_s`, and send what is due; the number of messages."""
         transport = self._opened()
         if transport is None:
             return 0
@@ -152,7 +116,6 @@ class AutopilotLink:
         return understood
 
     def send(self, message: Message) -> bool:
-        """Pack and send one message; whether the port was open."""
         with self._lock:
             if self._silent or self._transport is None:
                 return False
@@ -164,13 +127,11 @@ class AutopilotLink:
             return True
 
     def covers(self, exposed_ns: int) -> bool:
-        """Whether the attitude at a time of our clock is known."""
         covered_ns = self.covered_ns
         return covered_ns is not None and covered_ns >= exposed_ns
 
     @property
     def covered_ns(self) -> int | None:
-        """Time of our clock up to which the attitude is known; None without any."""
         with self._lock:
             newest = self.buffer.covered_ns
             return None if newest is None else self.sync.mono_ns(newest)
@@ -190,30 +151,24 @@ class AutopilotLink:
         with self._lock:
             return self.sync.boot_ns(mono_ns)
 
-    def status(self) -> LinkStatus:
-        """Status of the link."""
-        with self._lock:
-            now_ns = self._clocks.mono_ns()
-            return LinkStatus(
-                is_open=self._transport is not None,
-                heard_age_s=_age_s(now_ns, self._heard_ns),
-                attitude_age_s=_age_s(now_ns, self._attitude_ns),
-                synced=self.sync.is_exact,
-                jumps=self.sync.jumps,
-                errors=self.counts["error"],
-                target=self.target,
-                kind=self.kind,
-                others=tuple(self._others),
-                damaged=self.counts["damaged"],
-            )
+    @property
+    def is_open(self) -> bool:
+        return self._transport is not None
+
+    @property
+    def heard_age_s(self) -> float:
+        """Time since the last message; infinite for "never"."""
+        return _age_s(self._clocks.mono_ns(), self._heard_ns)
+
+    @property
+    def attitude_age_s(self) -> float:
+        return _age_s(self._clocks.mono_ns(), self._attitude_ns)
 
     def signing_now(self) -> int | None:
-        """Timestamp of the last signature; None without signing."""
         with self._lock:
             return None if self._signing is None else self._signing.timestamp_10us + self._packed
 
     def close(self) -> None:
-        """Close the port."""
         with self._lock:
             if self._transport is not None:
                 self._transport.close()
@@ -235,7 +190,6 @@ class AutopilotLink:
         return opened
 
     def _lost(self, error: OSError) -> None:
-        """Close the port after a failure; it is opened again after a pause."""
         with self._lock:
             if self.counts["error"] == 0 or self._transport is not None:
                 log.warning("link to the autopilot: %s", error)
@@ -291,8 +245,8 @@ class AutopilotLink:
             return False
         heard = Target(system_id, component_id or _AUTOPILOT_COMPONENT)
         if self.target is not None or self._wanted not in (None, system_id):
-            if heard not in self._others and len(self._others) < _MOST_OTHERS:
-                self._others.append(heard)
+            if heard not in self.others and len(self.others) < _MOST_OTHERS:
+                self.others.append(heard)
             return False
         self.target = heard
         self._packer = None
@@ -306,7 +260,6 @@ class AutopilotLink:
             handler(self, message, now_ns)
 
     def _timed(self, boot_ms: int, now_ns: int) -> int:
-        """Time of a message in ns; updates the clock offset."""
         boot_ns = int(boot_ms) * 1_000_000
         if self.sync.heard(now_ns, boot_ns):
             self._restarted()
@@ -316,9 +269,6 @@ class AutopilotLink:
         """Discard what the autopilot reported before its clock jumped: it may have restarted."""
         self.buffer.clear()
         self.origin = None
-
-    def _arrived(self, now_ns: int) -> int | None:
-        return self.sync.boot_ns(now_ns)
 
     def _heartbeat(self, message: Message, now_ns: int) -> None:
         self.kind = _KINDS.get(message.autopilot, self.kind)
@@ -354,7 +304,7 @@ class AutopilotLink:
 
     def _altitude(self, message: Message, now_ns: int) -> None:
         """Its timestamp may be UTC instead of time since boot; then the time of arrival is used."""
-        arrived_ns, reported_ns = self._arrived(now_ns), int(message.time_usec) * 1000
+        arrived_ns, reported_ns = self.sync.boot_ns(now_ns), int(message.time_usec) * 1000
         if arrived_ns is None:
             return
         time_ns = reported_ns if abs(reported_ns - arrived_ns) < _FAR_NS else arrived_ns
@@ -376,7 +326,7 @@ class AutopilotLink:
             self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
 
     def _rangefinder(self, message: Message, now_ns: int) -> None:
-        arrived_ns = self._arrived(now_ns)
+        arrived_ns = self.sync.boot_ns(now_ns)
         if arrived_ns is not None and message.distance > 0:
             self.buffer.add_distance(arrived_ns, message.distance)
 
@@ -403,7 +353,7 @@ class AutopilotLink:
     def _gnss(self, message: Message, now_ns: int) -> None:
         number = 0 if message.get_type() == "GPS_RAW_INT" else 1
         self.aiding.receiver(number, message.fix_type, now_ns)
-        self.gnss.append(gnss_sample(message, now_ns, self._arrived(now_ns)))
+        self.gnss.append(gnss_sample(message, now_ns, self.sync.boot_ns(now_ns)))
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
@@ -453,8 +403,6 @@ _HANDLERS: dict[str, Callable[[AutopilotLink, Message, int], None]] = {
 
 
 class LinkThread:
-    """Polls a link in a thread until it is stopped."""
-
     def __init__(self, link: AutopilotLink) -> None:
         self._link, self._stop = link, threading.Event()
         self._thread = threading.Thread(target=self._run, name="autopilot link", daemon=True)
@@ -463,14 +411,13 @@ class LinkThread:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                if self._link.poll(0.02) == 0 and not self._link.status().is_open:
+                if self._link.poll(0.02) == 0 and not self._link.is_open:
                     self._stop.wait(0.1)
             except Exception:  # one malformed message must not end a flight
                 log.exception("unexpected error in the link to the autopilot")
                 self._stop.wait(0.1)
 
     def stop(self) -> None:
-        """Stop and close the port."""
         self._stop.set()
         self._thread.join(2.0)
         self._link.close()

@@ -1,9 +1,8 @@
 """The flight log: images, telemetry and results in MCAP files that can be replayed.
 
 The flight never waits for the log. Messages go into a bounded queue; a thread encodes them and
-writes a chunk about once a second, each synced to disk before the next. Where the thread falls
-behind or the disk is full, images are dropped first and other messages last; dropped messages are
-counted. `docs/flights.md` describes the files, `orthonav.ground.recordings` reads them.
+writes a chunk about once a second. Where it falls behind or the disk is full, images are dropped
+first and other messages last. `docs/flights.md` describes the files.
 """
 
 import contextlib
@@ -13,9 +12,9 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -81,20 +80,14 @@ CLOSE_S = 30.0
 Grey = NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class _WaitingMessage:
-    """A message to be encoded; `size_bytes` is the memory that it holds in the queue."""
-
+class _WaitingMessage(NamedTuple):
     make: Callable[[], list[Message]]
     size_bytes: int
     has_view: bool = False
 
 
 class FlightLog:
-    """A flight log being written. Every method returns at once, and none raises.
-
-    `lost`: number of images (`views`) and other messages (`messages`) dropped so far.
-    """
+    """A flight log being written. No method waits or raises. `lost` counts dropped messages."""
 
     def __init__(
         self,
@@ -107,16 +100,11 @@ class FlightLog:
         segment_bytes: int | None = None,
         chunk_s: float = CHUNK_S,
     ) -> None:
-        """Write files `NAME_0001.mcap` and so on in the folder of `path`, which is `NAME.mcap`.
+        """Write files `NAME_0001.mcap` and so on beside `path`, which is `NAME.mcap`.
 
-        `map_info`: its `name` and `manifest_sha256`.
-        `views`: images to log; a replay needs full ones.
-        `max_bytes`: largest total size of all files of this name; the oldest are deleted.
-        `segment_bytes`: largest size of a file (default 256 MB, or an eighth of `max_bytes`),
-        unless a single chunk is larger.
-        `chunk_s`: seconds between chunks, the most that a power cut loses.
-        Numbers continue after those of existing files. Raises `OutputError` where the folder
-        cannot be written, `MissingExtraError` where mcap is missing.
+        `map_info`: its `name` and `manifest_sha256`. `max_bytes`: of all files of this name; the
+        oldest are deleted. `segment_bytes`: of a file, unless a single chunk is larger. `chunk_s`:
+        the most that a power cut loses. Raises `OutputError` and `MissingExtraError`.
         """
         needed("mcap", "autopilot", "a flight log")
         path = Path(path)
@@ -157,12 +145,7 @@ class FlightLog:
         self._thread.start()
 
     def options(self, options: Mapping[str, Any]) -> None:
-        """Log the options of the flight, named as those of `orthonav localize`.
-
-        A replay uses `heading` ("known", "unknown"), `prior` ("telemetry", "none"),
-        `registration` ("on", "off"), `position`, `accept` (text or None), `track` (bool) and
-        `mount` (None, or `dataclasses.asdict` of a `Mount`). Other keys are logged as they are.
-        """
+        """Log the options of the flight, named as those of `orthonav localize`, for a replay."""
         try:
             session = {**self._session, "options": dict(options)}
             to_json(session)  # options that cannot be encoded must not block later messages
@@ -181,12 +164,8 @@ class FlightLog:
         latency_ms: float | None = None,
         withheld: bool = False,
     ) -> None:
-        """Log a view before it is located: `grey` (H, W), None for an unusable image.
-
-        `number` is that of the runner; `telemetry` is uncorrected by the mount. The image is
-        copied. `latency_ms`, `withheld`: see `LoggedView`. The first image sets the size of the
-        camera; images of another size cannot be replayed.
-        """
+        """Log a view before it is located: `grey` (H, W), which is copied, None for an unusable
+        image; `telemetry` uncorrected by the mount. The first image sets the size of the camera."""
         time_ns = self._time_ns = telemetry.time_ns
         if grey is not None and not self._sized:
             self._fit(grey.shape)
@@ -211,12 +190,10 @@ class FlightLog:
             self._add(lambda: _with_thumbnail(seen, small), small.nbytes)
 
     def result(self, result: ViewResult) -> None:
-        """Log the result of a view."""
         index = self._indices.get(result.frame, 0)
         self._add(lambda: _result(result, index), 1000)
 
     def health(self, health: Mapping[str, Any]) -> None:
-        """Log the health (JSON values); the counts of dropped messages are added as `log_lost`."""
         try:
             data = to_json({**health, "log_lost": dict(self.lost)})
         except Exception as error:
@@ -226,11 +203,10 @@ class FlightLog:
         self._add(lambda: [_message(HEALTH, time_ns, data)], len(data))
 
     def gnss(self, time_ns: int, cdr: bytes) -> None:
-        """Log a `sensor_msgs/NavSatFix` (CDR) of a GNSS receiver, as received at `time_ns`."""
+        # A `sensor_msgs/NavSatFix` (CDR).
         self._add(lambda: [_message(GNSS, time_ns, cdr)], len(cdr))
 
     def close(self) -> None:
-        """Write all queued messages and finish the file; waits at most half a minute."""
         with self._change:
             self._closing = True
             self._change.notify()
@@ -239,7 +215,6 @@ class FlightLog:
             log.warning("the flight log could not be finished within %.0f s", CLOSE_S)
 
     def _fit(self, shape: tuple[int, ...]) -> None:
-        """Scale the camera to the size of the images, as the runner does."""
         self._sized = True
         try:
             camera = fitted(self._camera, shape[1], shape[0], "the flight log")
@@ -350,7 +325,6 @@ class FlightLog:
                 log.debug("flight log ends without an index: %s", error)
 
     def _head(self) -> list[Message]:
-        """First messages of every file."""
         camera = _message(CAMERA, self._time_ns, calibration_message(self._camera, self._time_ns))
         return [self._session_message(self._session), camera]
 

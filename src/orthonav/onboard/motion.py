@@ -7,7 +7,7 @@ a pyramid, Bouguet 2001) in a small picture, independently of the odometry of th
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,16 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.camera import Camera, undistort
 
 SIDE_PX = 240
-"""Images are compared at this width or height, whichever is larger: corners are then found to about
-0.1 px, 0.03 deg for a usual lens."""
+"""Longer side of compared images: corners are found to 0.1 px, 0.03 deg for a usual lens."""
 CORNERS, LEAST_CORNERS, LEAST_SHARE = 90, 20, 0.5
 """Corners that are sought; those that must be found again, by number and share."""
 RETURN_PX = 0.5
 """A corner tracked forth and back must return within this distance (Kalal et al. 2010)."""
 RANSAC_PX = 1.0
 EVENED_PX, LEAST_CONTRAST = 41, 2.0
-"""Brightness and contrast are evened within squares of this size, contrast (grey levels, standard
-deviation) from this on. Tracking assumes constant brightness: with an automatic exposure that
+"""Brightness and contrast (grey levels) are evened within squares of this size: of an exposure that
 varies by 5 %, 65 % of the pairs were found without it, 99 % with it (benchmarks.faults)."""
 SHORTEST_S, LONGEST_S = 0.08, 1.2
 """Images closer than this are skipped, and not compared if they are further apart."""
@@ -63,7 +61,6 @@ class ImageMotion:
 
     @property
     def seconds(self) -> float:
-        """Time between the images."""
         return (self.end_ns - self.start_ns) / 1e9
 
 
@@ -74,20 +71,15 @@ class PictureOdometry:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the image before."""
         self._before: Grey | None = None
         self._arrived_ns = 0
         self._corners: Corners | None = None
 
     def wants(self, arrived_ns: int) -> bool:
-        """Whether an image that arrived then would be used."""
         return self._before is None or not 0 <= arrived_ns - self._arrived_ns < SHORTEST_S * 1e9
 
     def motion(self, grey: Grey, camera: Camera, arrived_ns: int) -> ImageMotion | None:
-        """Motion since the image before; None where they are too close, too far apart, or differ.
-
-        `grey` (H, W); `camera` of its size; `arrived_ns`: time of arrival.
-        """
+        """Motion since the image before; None where it is too close, too far away, or differs."""
         if not self.wants(arrived_ns):
             return None
         share = min(1.0, SIDE_PX / max(grey.shape))
@@ -176,13 +168,11 @@ def centre_motion(homographies: Array) -> tuple[Array, Array]:
     return np.asarray(turn), np.asarray(shift)
 
 
-@dataclass(frozen=True, eq=False)
-class ReportedMotion:
-    """Motion of the picture that follows from the reported state, for N pairs of times.
+class ReportedMotion(NamedTuple):
+    """Motion of the picture by the reported state for N pairs of times; NaN where not known.
 
-    `turn_rad` (N,): by the attitudes, and by the velocity where that is known. `tilt_shift`
-    (N, 2): by the attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground. NaN
-    where the state is not known.
+    `turn_rad` (N,): by the attitudes, and the velocity where known. `tilt_shift` (N, 2): by the
+    attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground.
     """
 
     turn_rad: Array
@@ -212,17 +202,13 @@ def reported_motion(
 
 
 class StateHistory:
-    """Attitude, velocity and height of the camera over time. Mutable."""
-
     def __init__(self, gap_s: float = GAP_S) -> None:
-        """`gap_s`: longest interval between states that is interpolated."""
         self._gap_ns = round(gap_s * 1e9)
         self._times: Times = np.zeros(0, np.int64)
         self._rows: Array = np.zeros((0, 13))
 
     @property
     def newest_ns(self) -> int:
-        """Time of the newest state; a time before all where there is none."""
         return int(self._times[-1]) if len(self._times) else -(2**62)
 
     def add(
@@ -247,7 +233,6 @@ class StateHistory:
         self._rows = np.concatenate([self._rows[first:], row[None]])
 
     def motion(self, start_ns: Times, end_ns: Times) -> ReportedMotion:
-        """Motion of the picture between N pairs of times (N,), all of one duration."""
         start, end = self._at(start_ns), self._at(end_ns)
         seconds = float(end_ns[0] - start_ns[0]) / 1e9
         velocity, height = (start[:, 9:12] + end[:, 9:12]) / 2, start[:, 12]
@@ -255,7 +240,6 @@ class StateHistory:
         return reported_motion(before, after, velocity, height, seconds)
 
     def velocity(self, times_ns: Times) -> Array:
-        """Velocities (N, 2) east and north at N times; NaN where not known."""
         return self._at(times_ns)[:, 9:11]
 
     def _at(self, times_ns: Times) -> Array:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
@@ -27,7 +27,6 @@ from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Message,
-    Target,
     external_position_estimate,
     global_position_sensor,
     gps_input,
@@ -45,6 +44,10 @@ from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
 from orthonav.onboard.ports import Descriptor, Udp, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
+if TYPE_CHECKING:
+    from orthonav.onboard.console import Narrator
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
+
 log = logging.getLogger(__name__)
 KINDS = {
     "global-position": "GLOBAL_POSITION_SENSOR",
@@ -59,29 +62,17 @@ ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
 DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
 """Standard deviations sent with the autopilot's own height and vertical velocity: assumed."""
 PX4_VISION_S = 0.2
-"""PX4 starts to fuse a local message only where it follows the one before sooner than this, and
-stops after twice this time without one (`EV_MAX_INTERVAL`; docs/autopilots.md)."""
+"""PX4 starts to fuse local messages only at shorter intervals (`EV_MAX_INTERVAL`)."""
 ORIGIN_NS, ORIGIN_REQUESTS = 2 * 10**9, 3
-"""Interval at which the autopilot is asked for its origin until it reports one, and number of
-requests without an answer after which it has none."""
+"""Interval of requests for the origin, and their number after which the autopilot has none."""
 _GPS_GLOBAL_ORIGIN = 49
 _MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
 
 
 @dataclass(frozen=True)
 class MessageOptions:
-    """Messages to send and their fields; docs/autopilots.md describes each message.
-
-    `kinds`: names of messages, keys of `KINDS`.
-    `clock`: clock of the timestamps.
-    `sensor_id`: id of GLOBAL_POSITION_SENSOR, 1 to 255; PX4's `EKF2_AGP0_ID`.
-    `gps_id`, `satellites`: fields of GPS_INPUT.
-    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored.
-    `min_std_m`: lower bound of the reported standard deviation, metres.
-    `min_confidence`: confidence (0 to 1) from which a position is reported as valid.
-    `autopilot`: whose conventions local messages follow; None: those of the autopilot heard.
-    `origin`: origin of the local frame to set, on the ground, where the autopilot has none.
-    """
+    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md). `origin`: of the
+    local frame, set on the ground where the autopilot has none."""
 
     kinds: tuple[str, ...] = ("global-position",)
     clock: Clock = Clock.UTC
@@ -91,7 +82,6 @@ class MessageOptions:
     hdop_m: float | None = None
     min_std_m: float = 0.0
     min_confidence: float = CONFIDENT
-    autopilot: Autopilot | None = None
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
@@ -101,39 +91,24 @@ class MessageOptions:
 
 
 class Messenger:
-    """Builds the messages of a view and sends those that are due. Mutable.
-
-    `incomplete`: number of messages that could not be built. `too_slow`: number of local messages
-    that followed the one before too late for PX4.
-    """
+    """Builds and sends the messages that are due; counts those that are `incomplete`, and local
+    ones that are `too_slow` for PX4. Mutable."""
 
     def __init__(
-        self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
+        self, options: MessageOptions, gate: Gate, link: AutopilotLink, clocks: Clocks
     ) -> None:
-        """`gate` limits the rates; `send` returns whether the port was open."""
-        self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
+        self.options, self._gate, self._link, self._clocks = options, gate, link, clocks
         self._covariance = FilterCovariance(options.min_std_m)
         self.incomplete = self.too_slow = 0
         self._said: set[str] = set()
         self._origin_due_ns = self._requests = 0
 
     def publish(
-        self,
-        estimate: NavigationEstimate,
-        vehicle: VehicleState,
-        *,
-        exposed_ns: int,
-        boot_ns: int | None,
-        target: Target | None,
-        kind: Autopilot | None,
-        origin: Origin | None,
+        self, estimate: NavigationEstimate, vehicle: VehicleState, exposed_ns: int
     ) -> tuple[str, ...]:
-        """Names of the messages that were sent.
-
-        `exposed_ns` is the time of exposure by our clock, `boot_ns` by the autopilot's. `vehicle`,
-        `target`, `kind` and `origin` are what the autopilot reported.
-        """
+        """Names of the messages sent."""
         sent = []
+        boot_ns = self._link.boot_ns(exposed_ns)
         for name in self.options.kinds:
             if estimate.dead_reckoned and name != "global-position":
                 continue  # only this message can mark it
@@ -141,25 +116,17 @@ class Messenger:
             stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
             stated = self._covariance.prepare(name, stamped, exposed_ns)
             try:
-                made = self._make(name, stated, vehicle, target or AUTOPILOT, kind, origin)
+                made = self._make(name, stated, vehicle)
             except EstimateError as error:
                 self._not_made(name, error)
                 continue
-            if self._gate.due(KINDS[name], now_ns) and self._send(made):
+            if self._gate.due(KINDS[name], now_ns) and self._link.send(made):
                 sent.append(KINDS[name])
-                self._note(name, exposed_ns, kind)
+                interval_s = self._covariance.interval_s(name, exposed_ns)
+                self._covariance.sent(name, exposed_ns)
+                if name in LOCAL and self._link.kind is not Autopilot.ARDUPILOT:
+                    self.too_slow += PX4_VISION_S <= interval_s < math.inf
         return tuple(sent)
-
-    def _note(self, name: str, exposed_ns: int, kind: Autopilot | None) -> None:
-        """Note that a message was sent, and whether it was too late for PX4."""
-        interval_s = self._covariance.interval_s(name, exposed_ns)
-        self._covariance.sent(name, exposed_ns)
-        if name in LOCAL and self._convention(kind) is Autopilot.PX4:
-            self.too_slow += PX4_VISION_S <= interval_s < math.inf
-
-    def _convention(self, kind: Autopilot | None) -> Autopilot:
-        """Whose conventions local messages follow; `kind` is the autopilot heard."""
-        return self.options.autopilot or kind or Autopilot.PX4
 
     def _not_made(self, name: str, error: EstimateError) -> None:
         """Count a message that could not be built, and log why, once for each reason."""
@@ -172,39 +139,26 @@ class Messenger:
 
     @property
     def needs_origin(self) -> bool:
-        """Whether messages are in the autopilot's local frame."""
         return any(kind in LOCAL for kind in self.options.kinds)
 
-    def find_origin(
-        self, known: Origin | None, target: Target | None, *, armed: bool | None
-    ) -> None:
-        """Ask the autopilot for the origin of its local frame until it reports one (`known`).
-
-        One that has none gets that of the options, unless it is `armed`: an origin that moves in
-        flight moves the aircraft.
-        """
-        now_ns, origin = self._clocks.mono_ns(), self.options.origin
-        if known is not None:
+    def find_origin(self) -> None:
+        """Ask for the origin of the local frame until it is known. Where there is none, set that of
+        the options, unless armed: an origin that moves in flight moves the aircraft."""
+        now_ns, origin, link = self._clocks.mono_ns(), self.options.origin, self._link
+        if link.origin is not None:
             self._requests = 0
             return
-        if not self.needs_origin or target is None or now_ns < self._origin_due_ns:
+        if not self.needs_origin or link.target is None or now_ns < self._origin_due_ns:
             return
         self._origin_due_ns = now_ns + ORIGIN_NS
-        if origin is not None and armed is False and self._requests >= ORIGIN_REQUESTS:
-            self._send(set_gps_global_origin(origin, target_system=target.system_id))
-        self._requests += self._send(request_message(_GPS_GLOBAL_ORIGIN, target))
+        if origin is not None and link.armed is False and self._requests >= ORIGIN_REQUESTS:
+            link.send(set_gps_global_origin(origin, target_system=link.target.system_id))
+        self._requests += link.send(request_message(_GPS_GLOBAL_ORIGIN, link.target))
 
-    def _make(
-        self,
-        name: str,
-        estimate: NavigationEstimate,
-        vehicle: VehicleState,
-        target: Target,
-        kind: Autopilot | None,
-        origin: Origin | None,
-    ) -> Message:
+    def _make(self, name: str, estimate: NavigationEstimate, vehicle: VehicleState) -> Message:
         chosen = self.options
         clock, least = chosen.clock, chosen.min_confidence
+        target = self._link.target or AUTOPILOT
         if name == "global-position":
             return global_position_sensor(
                 estimate,
@@ -229,8 +183,9 @@ class Messenger:
                 estimate, clock=clock, target=target, min_confidence=least
             )
         make = odometry if name == "odometry" else vision_position_estimate
-        pose = _pose(vehicle, origin)
-        return make(estimate, pose, self._convention(kind), clock=clock, min_confidence=least)
+        pose = _pose(vehicle, self._link.origin)
+        kind = self._link.kind or Autopilot.PX4
+        return make(estimate, pose, kind, clock=clock, min_confidence=least)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -247,16 +202,6 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
     )
 
 
-class Sink(Protocol):
-    """Output for bytes that never blocks. `write` raises `OSError` where it fails."""
-
-    def write(self, data: bytes) -> None:
-        """Send `data`."""
-
-    def close(self) -> None:
-        """Close the output."""
-
-
 class TcpSink:
     """TCP server that sends the same data to all clients; one that does not read is dropped."""
 
@@ -265,13 +210,7 @@ class TcpSink:
         self._listening.setblocking(False)
         self._clients: list[socket.socket] = []
 
-    @property
-    def port(self) -> int:
-        """Port of the server."""
-        return int(self._listening.getsockname()[1])
-
     def write(self, data: bytes) -> None:
-        """Send to each client, all of `data` or nothing."""
         try:
             while len(self._clients) < _MOST_CLIENTS:
                 client, _ = self._listening.accept()
@@ -290,7 +229,6 @@ class TcpSink:
                 self._clients.remove(client)
 
     def close(self) -> None:
-        """See `Sink.close`."""
         for each in (*self._clients, self._listening):
             each.close()
 
@@ -303,7 +241,6 @@ class SerialSink:
         self._port: Descriptor | None = open_serial(device, baud)
 
     def write(self, data: bytes) -> None:
-        """See `Sink.write`."""
         if self._port is None:
             self._port = open_serial(self._device, self._baud)
         try:
@@ -313,10 +250,12 @@ class SerialSink:
             raise
 
     def close(self) -> None:
-        """See `Sink.close`."""
         if self._port is not None:
             self._port.close()
             self._port = None
+
+
+Sink = Udp | TcpSink | SerialSink
 
 
 def open_sink(url: str) -> Sink:
@@ -343,19 +282,16 @@ class NmeaOut:
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
-        """Write one view; `utc_ns` is its time where there is no estimate. Raises `OSError`."""
         options: dict[str, Any] = {"utc_ns": utc_ns, "min_confidence": min_confidence}
         sentences = [make(estimate, quality=self._quality, **options) for make in (gga, rmc)]
         self._sink.write(b"".join([*sentences, gst(estimate, **options)]))
 
     def close(self) -> None:
-        """Close the sink."""
         self._sink.close()
 
 
 class JsonOut:
-    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld` in addition, and
-    lines of health, which begin with the key `health`."""
+    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; the health."""
 
     def __init__(
         self, path: Path | None, stream: TextIO | None = None, identity: Identity = UNKNOWN
@@ -370,18 +306,15 @@ class JsonOut:
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
     ) -> None:
-        """Write one view. Raises `OSError`."""
         more = {"age_ms": round(age_ms, 3), "sent": list(sent), "withheld": withheld}
         line = result_to_json(result)[:-1] + ", " + json.dumps(more)[1:]
         self._write(self._identity.added_to(line))
         self._identity = UNKNOWN
 
     def health(self, plain: dict[str, object]) -> None:
-        """Write one line of health. Raises `OSError`."""
         self._write(json.dumps(plain, allow_nan=False))
 
     def close(self) -> None:
-        """Close the file."""
         if self._path is not None and self._stream is not None:
             self._stream.close()
 
@@ -402,41 +335,6 @@ class JsonOut:
             raise
 
 
-class ViewOutput(Protocol):
-    """Takes every view, and the health: lines of JSON, the console. Raises `OSError`."""
-
-    def view(
-        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
-    ) -> None:
-        """Take one view: its age at the end, the messages sent, why none was."""
-
-    def health(self, plain: dict[str, Any]) -> None:
-        """Take the health."""
-
-    def close(self) -> None:
-        """Close the output."""
-
-
-class PositionOutput(Protocol):
-    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`.
-
-    `for_filter`: whether it gets covariances for a filter instead of those of the fixes.
-    """
-
-    for_filter: bool
-
-    def position(
-        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
-    ) -> tuple[str, ...]:
-        """Send one position; returns the names of messages. `stamp_ns`: time of the image."""
-
-    def health(self, plain: dict[str, Any]) -> None:
-        """Send the health."""
-
-    def close(self) -> None:
-        """Close the output."""
-
-
 class Publisher:
     """Publishes results to all outputs. Mutable."""
 
@@ -446,18 +344,17 @@ class Publisher:
         clocks: Clocks,
         *,
         messenger: Messenger | None = None,
-        link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
-        lines: Sequence[ViewOutput] = (),
-        graph: PositionOutput | None = None,
+        lines: "Sequence[JsonOut | Narrator]" = (),
+        graph: "Ros2Publisher | None" = None,
         min_confidence: float = CONFIDENT,
         min_std_m: float = 0.0,
     ) -> None:
         """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
         self.gate, self._clocks = gate, clocks
-        self.messenger, self._link = messenger, link
+        self.messenger = messenger
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
-        self._graph = [graph] if graph is not None else []
+        self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
         self.failed = 0
 
@@ -470,12 +367,8 @@ class Publisher:
         judged: bool,
         withheld: str | None = None,
     ) -> tuple[str, ...]:
-        """Send the position of a view where the gate admits it; the names of the messages.
-
-        Only views that the locator processed (`judged`) can give a position: the prediction of a
-        track is not a measurement. `withheld`: reason why a view was not located, which the gate
-        counts.
-        """
+        """Send a position that the gate admits; the names of the messages. Only a view that was
+        processed (`judged`) gives one: the prediction of a track is not a measurement."""
         estimate: NavigationEstimate | None = None
         sent: tuple[str, ...] = ()
         if withheld is not None:
@@ -488,7 +381,8 @@ class Publisher:
             before = self.gate.withheld.copy()
             estimate = self.gate.admit(made, now_ns)
             if estimate is not None:
-                sent = self._send(estimate, exposed_ns, vehicle)
+                if self.messenger is not None:
+                    sent = self.messenger.publish(estimate, vehicle, exposed_ns)
                 if not estimate.dead_reckoned:  # messages of ROS cannot mark it
                     sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
             withheld = None if sent else next(iter(self.gate.withheld - before), None)
@@ -498,27 +392,10 @@ class Publisher:
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
-        """Send the health to the outputs that carry it."""
         self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
-        """Close all outputs."""
         self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
-
-    def _send(
-        self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState
-    ) -> tuple[str, ...]:
-        if self.messenger is None or self._link is None:
-            return ()
-        return self.messenger.publish(
-            estimate,
-            vehicle,
-            exposed_ns=exposed_ns,
-            boot_ns=self._link.boot_ns(exposed_ns),
-            target=self._link.target,
-            kind=self._link.kind,
-            origin=self._link.origin,
-        )
 
     def _to_graph(
         self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int

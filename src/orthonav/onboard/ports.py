@@ -24,8 +24,7 @@ _MAX_BYTES = 4096
 class Transport(Protocol):
     """Bytes in and out without blocking. `read` and `write` raise `OSError` on failure."""
 
-    def fileno(self) -> int:
-        """File descriptor for `select`."""
+    def fileno(self) -> int: ...
 
     def read(self) -> bytes:
         """Available data; empty where there is none."""
@@ -33,11 +32,9 @@ class Transport(Protocol):
     def write(self, data: bytes) -> None:
         """Send one message; it is dropped while no receiver is known."""
 
-    def heard(self) -> None:
-        """Confirm that the data read last came from the autopilot."""
+    def heard(self) -> None: ...
 
-    def close(self) -> None:
-        """Close the port."""
+    def close(self) -> None: ...
 
 
 class Udp:
@@ -55,7 +52,6 @@ class Udp:
             raise
 
     def fileno(self) -> int:
-        """See `Transport.fileno`."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
@@ -67,12 +63,10 @@ class Udp:
         return data
 
     def heard(self) -> None:
-        """Send to the source of the last datagram from now on."""
         if not self._fixed:
             self._peer = self._candidate
 
     def write(self, data: bytes) -> None:
-        """Send one datagram to the peer."""
         if self._peer is not None:
             try:
                 self._socket.sendto(data, self._peer)
@@ -80,19 +74,15 @@ class Udp:
                 return
 
     def close(self) -> None:
-        """See `Transport.close`."""
         self._socket.close()
 
 
 class Descriptor:
-    """A TCP connection or a serial port: a stream behind a file descriptor."""
-
     def __init__(self, fd: int) -> None:
         self._fd = fd
         os.set_blocking(fd, False)
 
     def fileno(self) -> int:
-        """See `Transport.fileno`."""
         return self._fd
 
     def read(self) -> bytes:
@@ -105,8 +95,7 @@ class Descriptor:
             raise ConnectionResetError(errno.ECONNRESET, "the other end closed")
         return data
 
-    def heard(self) -> None:
-        """Nothing to do: a stream has one peer."""
+    def heard(self) -> None: ...
 
     def write(self, data: bytes) -> None:
         """Send all or nothing: half a message would damage the next one."""
@@ -120,7 +109,6 @@ class Descriptor:
             return  # the buffer is full: a delayed position is of no use
 
     def close(self) -> None:
-        """See `Transport.close`."""
         os.close(self._fd)
 
 
@@ -149,11 +137,8 @@ def _open_tcp(host: str, port: int) -> Descriptor:
 
 
 def transport_opener(url: str) -> Callable[[], Transport]:
-    """Function that opens a pymavlink connection string.
-
-    `udpin:[HOST:]PORT` (default HOST: loopback), `udpout:HOST:PORT`, `tcp:HOST:PORT` or
-    `[serial:]DEVICE[:BAUD]`. Raises `VariantError` for anything else.
-    """
+    """Opener of a pymavlink connection string: `udpin:[HOST:]PORT` (default HOST: loopback),
+    `udpout:HOST:PORT`, `tcp:HOST:PORT` or `[serial:]DEVICE[:BAUD]`. Raises `VariantError`."""
     kind, _, rest = url.partition(":")
     if kind in ("udpin", "udp"):
         bind = host_port(rest, url)

@@ -1,8 +1,7 @@
 """One MCAP file of a flight log, written in complete chunks.
 
-A chunk that cannot be written completely is truncated, so the file always ends with a complete one.
-After a power cut all chunks but the last are complete, and the index that `finish` writes is
-missing: readers scan the file from the start.
+A chunk that cannot be written completely is truncated, so the file ends with a complete one. After
+a power cut the index that `finish` writes is missing: readers scan the file from the start.
 """
 
 import contextlib
@@ -38,8 +37,7 @@ class _Tail:
     def tell(self) -> int:
         return self._count
 
-    def flush(self) -> None:
-        """Do nothing: `Segment` writes to disk."""
+    def flush(self) -> None: ...
 
     def taken(self) -> bytes:
         parts, self._parts = self._parts, []
@@ -140,11 +138,8 @@ def _write_ending(handle: int, size_bytes: int) -> None:
 
 
 def next_segment(folder: Path, name: str, needed_bytes: int, max_bytes: int | None) -> Segment:
-    """Next file `NAME_0001.mcap` of a log.
-
-    The oldest files are deleted until the others and `needed_bytes` fit into `max_bytes`. Raises
-    `OSError`.
-    """
+    """Next file `NAME_0001.mcap` of a log; the oldest are deleted until the rest and `needed_bytes`
+    fit into `max_bytes`. Raises `OSError`."""
     pattern = re.compile(re.escape(name) + r"_(\d{4,9})\.mcap")
     found = ((pattern.fullmatch(path.name), path) for path in folder.iterdir())
     files = {int(match[1]): path for match, path in found if match}

@@ -1,7 +1,7 @@
 """The last position of the aircraft, saved for a restart, and the serial numbers of flown maps.
 
-A small JSON file, replaced atomically about once a second. It is not synced to disk, which can be
-slow on memory cards: it survives a killed process, but not always a power cut.
+Files are replaced atomically, but not synced, which is slow on memory cards: they survive a killed
+process, but not always a power cut.
 """
 
 import contextlib
@@ -19,16 +19,14 @@ from orthonav.core.errors import MapFileError, OutputError
 from orthonav.core.files import write_text
 from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 from orthonav.core.records import Prior
-from orthonav.onboard.gnss.biases import Biases, biases_from_plain
-from orthonav.onboard.gnss.learner import Resumed, before_flight
+from orthonav.onboard.gnss.biases import Biases, Resumed, before_flight, biases_from_plain
 
 VERSION = 1
 MAX_BYTES = 100_000
 MAX_MAPS = 100
 """Maps of which something is stored, the latest."""
 SAVE_S = 10.0
-"""A state is saved again after so long, also without a new position: it shows that the flight goes
-on."""
+"""A state is saved again after so long without a new position: the flight goes on."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -39,13 +37,9 @@ log = logging.getLogger(__name__)
 class SavedState:
     """A position with its standard deviation, and when it was taken and saved, by two clocks.
 
-    `lat_deg`, `lon_deg`, `std_m`: position (WGS84) and standard deviation along the worst axis.
-    `utc_ns`: time of exposure in UTC.
-    `mono_ns`: the same by the monotonic clock, valid while `boot_id` is the same.
-    `boot_id`: identifies the run of the operating system.
-    `signing_timestamp_10us`: must not decrease for a key, see
-    `orthonav.onboard.messages.mavlink.Signing`.
-    `saved_utc_ns`, `saved_mono_ns`: time of the last save, when the program still ran.
+    `std_m`: along the worst axis. `utc_ns`, `mono_ns`: time of exposure; the second is valid while
+    `boot_id`, that of the operating system, is the same. `signing_timestamp_10us`: see
+    `orthonav.onboard.messages.mavlink.Signing`. `saved_utc_ns`, `saved_mono_ns`: of the last save.
     """
 
     lat_deg: float = math.nan
@@ -71,7 +65,6 @@ class SavedState:
 
 
 def boot_id() -> str:
-    """Identifier of this run of the operating system; empty where it is not available."""
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
@@ -87,20 +80,13 @@ def prior_of(saved: SavedState, age_s: float, max_age_s: float) -> Prior | None:
 
 
 def save(path: Path, saved: SavedState, maps: Mapping[str, Any] | None = None) -> None:
-    """Write the file, replacing an existing one atomically. Raises `OSError`.
-
-    `maps`: what was learnt of maps, by their digest; None keeps what the file has.
-    """
+    """Replace the file atomically; `maps` None keeps what it has of them. Raises `OSError`."""
     maps = _maps_of(path) if maps is None else maps
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "w", encoding="ascii") as stream:
-            plain = {
-                "version": VERSION,
-                **asdict(saved),
-                "maps": dict(list(maps.items())[-MAX_MAPS:]),
-            }
-            json.dump(plain, stream, allow_nan=True)
+            latest = dict(list(maps.items())[-MAX_MAPS:])
+            json.dump({"version": VERSION, **asdict(saved), "maps": latest}, stream)
         Path(name).replace(path)
     except BaseException:
         Path(name).unlink(missing_ok=True)
@@ -117,8 +103,7 @@ def learnt_biases(path: Path) -> dict[str, Biases]:
 
 
 def before_the_flight(path: Path, digest: str) -> tuple[dict[str, Biases], Resumed | None]:
-    """As `learnt_biases`, but of the time before the flight that saved the file, and what that
-    flight had learnt of the map `digest`, None where it had learnt nothing."""
+    """As `learnt_biases`, before the flight that saved the file; what that learnt of `digest`."""
     known, resumed = {}, None
     for each, plain in _maps_of(path).items():
         with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
@@ -136,7 +121,6 @@ def _maps_of(path: Path) -> dict[str, Any]:
 
 
 def _plain_of(path: Path) -> dict[str, Any]:
-    """Content of the file; empty where it is missing or damaged."""
     try:
         if path.stat().st_size > MAX_BYTES:
             return {}
@@ -147,37 +131,27 @@ def _plain_of(path: Path) -> dict[str, Any]:
 
 
 def load(path: Path) -> SavedState | None:
-    """Saved state; None where the file is missing or damaged."""
     plain = _plain_of(path)
     if plain.get("version") != VERSION:
         return None
+    plain = {"saved_utc_ns": plain.get("utc_ns"), "saved_mono_ns": plain.get("mono_ns"), **plain}
     try:
         return SavedState(
-            lat_deg=float(plain["lat_deg"]),
-            lon_deg=float(plain["lon_deg"]),
-            std_m=float(plain["std_m"]),
-            utc_ns=int(plain["utc_ns"]),
-            mono_ns=int(plain["mono_ns"]),
-            boot_id=str(plain["boot_id"]),
-            signing_timestamp_10us=int(plain["signing_timestamp_10us"]),
-            saved_utc_ns=int(plain.get("saved_utc_ns", plain["utc_ns"])),
-            saved_mono_ns=int(plain.get("saved_mono_ns", plain["mono_ns"])),
+            **{name: type(value)(plain[name]) for name, value in asdict(SavedState()).items()}
         )
     except (ValueError, KeyError, TypeError, OverflowError):
         return None
 
 
 def serials_path(state: Path) -> Path:
-    """The file of the newest serial number flown with each signing key, beside a state file. It is
-    separate because it outlives flights."""
+    """File of the newest serial number flown with each key; it outlives the state of a flight."""
     return state.with_name(f"{state.name}.serials")
 
 
 def require_newest(state: Path, signature: Signature, map_path: Path) -> None:
     """Refuse a map older than the newest flown with its key; else remember its serial number.
 
-    A file that is damaged or cannot be written is a warning: it must not keep a flight from being
-    resumed. Raises `MapFileError`.
+    A damaged or unwritable file is a warning: it must not keep a flight from being resumed.
     """
     path = serials_path(state)
     known = _read(path)

@@ -1,8 +1,6 @@
 """Telemetry of the last seconds, interpolated to the exposure of a view.
 
-There are two clocks: ours (monotonic) and the autopilot's (since boot). Samples carry times of the
-autopilot's clock; `ClockSync` converts the time of exposure to it. Nothing here reads a clock or a
-port.
+Samples carry times of the autopilot's clock (since boot); `ClockSync` converts ours to it.
 """
 
 import math
@@ -24,9 +22,8 @@ from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Telemetry
 
 HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
-"""Sources of the height above ground, best first: a rangefinder that looks down, the autopilot's
-terrain model, the height above sea level (with the terrain of the map only), and the height above
-home (without that terrain correct over flat ground only) of two messages."""
+"""Sources of the height above ground, best first: a rangefinder, the autopilot's terrain model, the
+height above sea level (with the terrain of the map only), that above home of two messages."""
 _ABOVE_HOME = ("home", "relative")
 _SECOND_AMSL = "altitude"
 """Height above sea level of a second message, where the first gives none."""
@@ -34,27 +31,25 @@ _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
 TRAVELLED = slice(4, 7)
 """The displacement in a sample of the local frame, after velocity and down position."""
-KEEP_S = 20.0
+KEEP_NS = 20 * 10**9
 """Samples are kept for so long: the longest latency of a camera, and some more."""
 ATTITUDE_GAP_S, SLOW_GAP_S = 0.5, 2.0
 """Longest interval that is interpolated: of attitudes, which change fast, and of the rest."""
 ATTITUDE_HOLD_S, SLOW_HOLD_S = 0.1, 1.5
 """Time for which the last sample holds."""
-ATTITUDE_AHEAD_S = 0.03
+ATTITUDE_AHEAD_NS = 30_000_000
 """Longest extrapolation of the attitude."""
 FASTEST_MPS = 300.0
 """A faster velocity is an error and is not integrated."""
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 UNAIDED_VEL_STD_MPS = 5.0
-"""Of the velocity without GNSS: that of PX4 was 2 to 5 m/s off in simulated flights, and changed
-within 10 s."""
+"""Of the velocity without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
 UNAIDED_TILT_STD_DEG, AIDED_TILT_STD_DEG = 3.0, 1.5
 """Of the horizon: PX4's was 2 to 4 deg off without GNSS. With GNSS, errors of the accelerometers
 and of the mount remain; ArduPilot's was 0.4 deg off without it (docs/closed-loop.md)."""
 LARGEST_AIDED_MPS = 1.0
-"""A filter that claims a larger standard deviation of its velocity does not fuse GNSS, whatever the
-receiver has."""
+"""A filter that claims more for its velocity does not fuse GNSS, whatever the receiver has."""
 STATUS_NS, FIX_NS = 5 * 10**9, 3 * 10**9
 """A status and a fix hold for so long; the autopilots send both at 1 Hz or more."""
 ABSOLUTE = 16
@@ -72,18 +67,14 @@ class Clocks:
 
 
 class Travelled(NamedTuple):
-    """Displacement since an arbitrary time: the integral of the reported velocity.
-
-    `part`: number of the uninterrupted part of the telemetry that it was integrated over.
-    """
+    """Integral of the reported velocity over an uninterrupted `part` of the telemetry."""
 
     part: int
     north_m: float
     east_m: float
 
     def since(self, before: "Travelled | None") -> tuple[float, float] | None:
-        """Metres east and north since an earlier one; None where the velocity in between is not
-        known."""
+        """Metres east and north; None where the velocity in between is not known."""
         if before is None or before.part != self.part:
             return None
         return self.east_m - before.east_m, self.north_m - before.north_m
@@ -93,14 +84,10 @@ class Travelled(NamedTuple):
 class VehicleState:
     """State of the aircraft that the autopilot reported for one time of its clock.
 
-    `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known.
-    `height_m`: height above ground; NaN where not known, as the rest. It equals `home_m` where only
-    that is known: then level ground is assumed.
-    `velocity_ned_mps`: velocity north, east, down.
-    `down_m`: distance below the origin of the autopilot's local frame.
-    `home_m`, `amsl_m`: height above the place of take-off, and above mean sea level.
-    `travelled`: displacement by the velocity; None where that is not known.
-    `vel_std_mps`, `tilt_std_deg`: standard deviations of velocity and attitude; NaN: as usual.
+    `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known. The rest is NaN
+    where not known. `height_m`: above ground; it equals `home_m`, the height above the take-off,
+    where only that is known: level ground is assumed. `down_m`: below the origin of the autopilot's
+    local frame. `vel_std_mps`, `tilt_std_deg`: NaN: as usual.
     """
 
     ned_from_body: Array | None
@@ -121,7 +108,6 @@ class VehicleState:
         return roll, pitch, yaw
 
     def telemetry(self, time_ns: int, mount_deg: Angles = LOOKS_DOWN) -> Telemetry:
-        """Heading, tilt and height of a camera mounted at `mount_deg`, with the time `time_ns`."""
         yaw = pitch = roll = math.nan
         if self.ned_from_body is not None:
             yaw, pitch, roll = attitude_of(enu_from_body_camera(self.ned_from_body, mount_deg))
@@ -142,8 +128,6 @@ class VehicleState:
 
 
 class _Samples:
-    """Samples of one quantity at increasing times."""
-
     def __init__(self, gap_s: float, hold_s: float) -> None:
         self.gap_ns, self.hold_ns = round(gap_s * 1e9), round(hold_s * 1e9)
         self.times: list[int] = []
@@ -182,7 +166,7 @@ class _Samples:
         return self.values[-2], self.values[-1], 1 + (time_ns - self.times[-1]) / interval
 
     def covered_ns(self, most_ns: int) -> int:
-        """Time up to which values are known, extrapolation included where samples are dense."""
+        """Time up to which values are known; extrapolated where samples are dense."""
         close = len(self.times) > 1 and self.times[-1] - self.times[-2] <= 2 * most_ns
         return self.times[-1] + (most_ns if close else 0)
 
@@ -196,8 +180,6 @@ class _Samples:
 
 
 class TelemetryBuffer:
-    """Samples of the last seconds by the autopilot's clock. Mutable; not to be shared."""
-
     def __init__(self, heights: Sequence[str] = HEIGHT_SOURCES) -> None:
         """`heights` are those of `HEIGHT_SOURCES` that may be used, the best first."""
         self._order = tuple(heights)
@@ -205,7 +187,6 @@ class TelemetryBuffer:
         self.clear()
 
     def clear(self) -> None:
-        """Discard all samples, as after a restart of the autopilot."""
         slow = SLOW_GAP_S, SLOW_HOLD_S
         self._attitude = _Samples(ATTITUDE_GAP_S, ATTITUDE_HOLD_S)
         self._heights = {name: _Samples(*slow) for name in self._order}
@@ -224,15 +205,12 @@ class TelemetryBuffer:
         before = self._attitude.values
         if before and float(before[-1] @ quaternion) < 0:
             quaternion = -quaternion  # the same attitude, for the shorter interpolation
-        self._attitude.add(time_ns, quaternion, self._keep_ns)
+        self._attitude.add(time_ns, quaternion, KEEP_NS)
 
     def add_height(self, source: str, time_ns: int, height_m: float) -> None:
-        """Add a height from one of `HEIGHT_SOURCES`; values that are not finite are dropped.
-
-        `altitude` is a second height above sea level, for messages that come beside the first.
-        """
+        """Add a height from one of `HEIGHT_SOURCES`; `altitude` is a second one above sea level."""
         if source in self._heights and math.isfinite(height_m):
-            self._heights[source].add(time_ns, np.array([height_m]), self._keep_ns)
+            self._heights[source].add(time_ns, np.array([height_m]), KEEP_NS)
 
     def add_distance(self, time_ns: int, distance_m: float) -> None:
         """Add a distance along the body's down axis, converted to a height over flat ground."""
@@ -243,7 +221,6 @@ class TelemetryBuffer:
                 self.add_height("distance", time_ns, distance_m * float(down))
 
     def add_local(self, time_ns: int, velocity_ned_mps: Triple, down_m: float) -> None:
-        """Add velocity and down position of the autopilot's local frame."""
         values = np.array([*velocity_ned_mps, down_m, 0.0, 0.0, 0.0])
         if not np.isfinite(values).all():
             return
@@ -256,18 +233,16 @@ class TelemetryBuffer:
                 values[TRAVELLED] = self._parts, 0.0, 0.0
             else:
                 values[TRAVELLED] = self._travelled_at(time_ns, values[:2])
-        local.add(time_ns, values, self._keep_ns)
+        local.add(time_ns, values, KEEP_NS)
 
     @property
     def covered_ns(self) -> int | None:
-        """Time up to which the attitude is known, extrapolation included; None without any."""
-        return self._attitude.covered_ns(self._ahead_ns) if self._attitude.times else None
+        return self._attitude.covered_ns(ATTITUDE_AHEAD_NS) if self._attitude.times else None
 
     def at(self, time_ns: int) -> VehicleState:
-        """State at a time; attitudes are interpolated by slerp, other values linearly."""
         found = self._attitude.around(time_ns)
         if found is not None and time_ns > self._attitude.times[-1]:
-            found = self._attitude.ahead(time_ns, self._ahead_ns) or found
+            found = self._attitude.ahead(time_ns, ATTITUDE_AHEAD_NS) or found
         turn = None
         if found is not None:
             before, after, weight = found
@@ -300,17 +275,8 @@ class TelemetryBuffer:
         return Travelled(round(part), north + seconds * mean_n, east + seconds * mean_e)
 
     def _height(self, names: Sequence[str], time_ns: int) -> float:
-        """The first of these heights that is known at a time, else NaN."""
         found = (self._heights[name].at(time_ns) for name in names if name in self._heights)
         return next((float(value[0]) for value in found if value is not None), math.nan)
-
-    @property
-    def _ahead_ns(self) -> int:
-        return round(ATTITUDE_AHEAD_S * 1e9)
-
-    @property
-    def _keep_ns(self) -> int:
-        return round(KEEP_S * 1e9)
 
 
 def _known(value: float) -> float | None:
@@ -337,13 +303,12 @@ def _matrix(wxyz: Array) -> Array:
 
 
 class ClockSync:
-    """Converts times of our clock to the autopilot's and back.
+    """Converts times of our clock to the autopilot's and back. Mutable.
 
-    Offset and rate are those of the last `WINDOW` TIMESYNC exchanges: simulators run slower than
-    real time, so the rate is fitted where the exchanges show it. Without exchanges the offset comes
-    from the timestamps of messages: the one with the least delay counts. An outlier is ignored
-    unless others agree with it; then a clock was set or the autopilot restarted, and the estimate
-    starts again (`jumps`). Mutable.
+    Offset and rate are those of the last TIMESYNC exchanges: simulators run slower than real time.
+    Without exchanges the timestamp of the message with the least delay counts. An outlier is
+    ignored unless others agree with it; then a clock was set or the autopilot restarted, and the
+    estimate starts again (`jumps`).
     """
 
     WINDOW = 32
@@ -366,7 +331,6 @@ class ClockSync:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all samples."""
         self._offset_ns: int | None = None
         self._at_ns, self._rate = 0, 0.0
         self._exact: deque[_Exchange] = deque(maxlen=self.WINDOW)
@@ -375,27 +339,21 @@ class ClockSync:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the offset comes from TIMESYNC exchanges, not from times of arrival."""
         return bool(self._exact)
 
     def boot_ns(self, mono_ns: int) -> int | None:
-        """Time of the autopilot's clock at one of ours; None while it is not known."""
         if self._offset_ns is None:
             return None
         return mono_ns + self._offset_ns + round(self._rate * (mono_ns - self._at_ns))
 
     def mono_ns(self, boot_ns: int) -> int | None:
-        """Time of our clock at one of the autopilot's; None while it is not known."""
         if self._offset_ns is None:
             return None
         since_ns = boot_ns - self._offset_ns - self._at_ns
         return self._at_ns + round(since_ns / (1 + self._rate))
 
     def exchange(self, sent_ns: int, received_ns: int, reported_ns: int) -> bool:
-        """Add an exchange; whether a clock was found to have jumped.
-
-        `sent_ns` and `received_ns` are times of our clock, `reported_ns` one of the autopilot's.
-        """
+        """Whether a clock was found to have jumped. `reported_ns`: the autopilot's time."""
         trip_ns = received_ns - sent_ns
         if not 0 <= trip_ns <= self.LONGEST_NS:
             return False
@@ -474,10 +432,7 @@ class _Exchange(NamedTuple):
 
 
 class Aiding:
-    """What the autopilot reported about its filter and its receivers. Mutable.
-
-    Times are those of our clock.
-    """
+    """What the autopilot reported about its filter and receivers, by our clock. Mutable."""
 
     def __init__(self, own_receiver: int | None = None) -> None:
         """`own_receiver`: number of the receiver in whose place orthonav sends GPS_INPUT."""
@@ -501,11 +456,9 @@ class Aiding:
             self._fixed_ns = now_ns
 
     def velocity(self, std_mps: float, now_ns: int) -> None:
-        """Take the standard deviation that the filter claims for its velocity."""
         self._vel = (now_ns, std_mps) if math.isfinite(std_mps) else None
 
     def is_aided(self, now_ns: int) -> bool:
-        """Whether GNSS holds the filter; False where that is not known."""
         return (
             _is_recent(self._absolute_ns, now_ns, STATUS_NS)
             and _is_recent(self._fixed_ns, now_ns, FIX_NS)

@@ -35,8 +35,7 @@ class AutoEncoder(nn.Module):
     """Auto-encoder for tiles (N, C, S, S) of `tile_px` S; only `encoder` flies.
 
     `width` is the number of channels before the dense layer, a multiple of 8. `binary` adds the
-    sigmoid. Raises `ValueError` for a tile that the decoder's four strides of 2 do not divide, or
-    below 32 px.
+    sigmoid.
     """
 
     def __init__(
@@ -49,15 +48,6 @@ class AutoEncoder(nn.Module):
         binary: bool = True,
     ) -> None:
         super().__init__()
-        if tile_px < 32 or tile_px % STRIDE_PX**UP:
-            raise ValueError(
-                f"tile must be at least 32 px and a multiple of {STRIDE_PX**UP} px, got {tile_px}"
-            )
-        if width < 8 or width % 8 or channels < 1 or dims < 1:
-            raise ValueError(
-                f"width must be a multiple of 8, channels and dims above 0, "
-                f"got {width}, {channels}, {dims}"
-            )
         self.tile_px, self.channels, self.dims, self.binary = tile_px, channels, dims, binary
         widths = [channels, width // 8, width // 4, width // 2, width, width]
         side = -(-tile_px // STRIDE_PX**DOWN)
@@ -105,10 +95,9 @@ class Reconstruction:
         """Tiles (B, C, S, S)."""
         return (self.tiles.batch(indices),)
 
-    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
-        """The L2 loss, after adding its gradients times `scale`."""
+    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
         (maps,) = tensors
-        loss = reconstruction_loss(maps, run(maps))
+        loss = reconstruction_loss(maps, self.model(maps))
         torch.autograd.backward(loss * scale)
         return loss.detach()
 

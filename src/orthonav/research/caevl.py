@@ -7,38 +7,156 @@ their feature maps before the dense layer, through projection heads that are dis
 has the five strided convolutions of `orthonav.research.autoencoder`. Not as there: the perceptual
 loss, which needs DINOv2, is left out; LeakyReLU has the slope of our auto-encoder; heads are
 normalized as there (batch norm), and there is no validation set that would stop a training early.
+
+Augmentations: geometry (one of rotation, displacement and magnification), then blur, contrast and
+brightness, in the ranges of the authors' released configuration. Their vignetting and the mask of
+their camera are left out: they are of one camera.
+
+VICReg: Bardes, Ponce and LeCun, ICLR 2022 (arXiv 2105.04906), algorithm 1; its local form: Bardes,
+Ponce and LeCun, "VICRegL", NeurIPS 2022 (arXiv 2210.01571), section 3.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from orthonav.core.files import Progress
-from orthonav.research.augment import Augmented, augmented
 from orthonav.research.caevl_recipe import CaevlRecipe
-from orthonav.research.export import export_encoder
-from orthonav.research.means import Means, device_of, kept_memory, processes
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.training import (
-    CALIBRATION_TILES,
-    HELD_OUT_TILES,
-    TrainedNetwork,
-    learn_network,
-    train,
-)
-from orthonav.research.vicreg import local_vicreg, vicreg
+from orthonav.research.training import Means, TrainedNetwork, finished, learn_network, train
 
+GEOMETRY, LIGHT = 0.8, 0.5
+"""Probability of a change of geometry, and of each of blur, contrast and brightness."""
+TURN_DEG, SHIFT_PX, SHIFTED, LEAST_AREA = 30.0, 10.0, 0.75, 0.7
+"""Largest rotation; largest displacement along an axis, at 256 px, and its probability; smallest
+share of a tile that is magnified."""
+SIDE_PX = 256.0
+BLUR_PX, BLUR_KERNEL = (0.1, 2.0), 5
+CONTRAST, BRIGHTNESS = (0.1, 2.0), (1.0, 2.0)
+INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0
+"""Weights of the three terms, of VICReg and of CAEVL."""
+LEAST_SPREAD, TINY = 1.0, 1e-4
+"""Standard deviation that every number of an embedding is held at, and what keeps its root off
+zero."""
+BEST_MATCHES = (20, 4)
+"""Pairs by place that are compared, from the tile to the view and back, as in VICRegL."""
 LOCAL_NUMBERS = 512
 """Numbers of the local projection head, over all of a feature map, as in the released code."""
 FIRST = "autoencoder"
 """Folder of the auto-encoder's checkpoint, within that of the training."""
 
 Represent = Callable[[NDArray[np.uint8], NDArray[np.bool_]], NDArray[np.float32]]
+
+
+@dataclass(frozen=True, eq=False)
+class Augmented:
+    """`grey` (S, S) uint8, and where it shows the tile: `tile_from_view` (2, 3) maps x and y of a
+    pixel coordinate in it to those in the tile (outer corner of the first pixel: 0, 0)."""
+
+    grey: NDArray[np.uint8]
+    tile_from_view: NDArray[np.float32]
+
+
+def augmented(rng: np.random.Generator, grey: NDArray[np.uint8]) -> Augmented:
+    """A tile (S, S) seen anew; every part of it lies within the tile."""
+    size = grey.shape[0]
+    matrix = _geometry(rng, size)
+    half = np.full(2, 0.5)
+    of_centres = matrix.copy()  # OpenCV counts from the centre of the first pixel
+    of_centres[:, 2] += matrix[:, :2] @ half - half
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    seen = cv2.warpAffine(
+        grey, of_centres, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float32)
+    if rng.random() < LIGHT:
+        blur = rng.uniform(*BLUR_PX)
+        seen = cv2.GaussianBlur(seen, (BLUR_KERNEL, BLUR_KERNEL), blur).astype(np.float32)
+    if rng.random() < LIGHT:
+        mean = float(seen.mean())
+        seen = np.clip(mean + (seen - mean) * np.float32(rng.uniform(*CONTRAST)), 0, 255)
+    if rng.random() < LIGHT:
+        seen = np.clip(seen * np.float32(rng.uniform(*BRIGHTNESS)), 0, 255)
+    return Augmented(np.rint(seen).astype(np.uint8), matrix.astype(np.float32))
+
+
+def _geometry(rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Tile from view (2, 3): rotation, displacement, magnification or nothing."""
+    scale, turn, middle = np.ones(2), 0.0, np.full(2, size / 2)
+    kind = rng.integers(3) if rng.random() < GEOMETRY else -1
+    if kind == 0:
+        turn = np.radians(rng.uniform(-TURN_DEG, TURN_DEG))
+        scale /= abs(np.cos(turn)) + abs(np.sin(turn))  # the largest square within the tile
+    elif kind == 1:
+        shift = rng.uniform(-SHIFT_PX, SHIFT_PX, 2) * (rng.random(2) < SHIFTED) * size / SIDE_PX
+        scale -= np.abs(shift) / size
+        middle = middle - shift / 2
+    elif kind == 2:
+        scale *= np.sqrt(rng.uniform(LEAST_AREA, 1))
+        middle = middle + rng.uniform(-1, 1, 2) * (1 - scale) * size / 2
+    cos, sin = np.cos(turn), np.sin(turn)
+    linear = np.array([[cos, -sin], [sin, cos]]) * scale
+    return np.column_stack([linear, middle - linear @ np.full(2, size / 2)])
+
+
+def vicreg(first: Tensor, second: Tensor) -> Tensor:
+    """Loss of embeddings (..., B, D) of the same B things seen twice, the mean over `...`.
+
+    Invariance: both are the same. Variance: every number differs between things. Covariance: no
+    two numbers say the same. B at least 2.
+    """
+    first, second = first.float(), second.float()
+    invariance = functional.mse_loss(first, second)
+    spreads = [torch.sqrt(each.var(dim=-2) + TINY) for each in (first, second)]
+    variance = sum(functional.relu(LEAST_SPREAD - each).mean() for each in spreads) / 2
+    covariance = _covariance(first) + _covariance(second)
+    return INVARIANCE * invariance + VARIANCE * variance + COVARIANCE * covariance
+
+
+def _covariance(values: Tensor) -> Tensor:
+    """Squared covariances of different numbers, summed, per number."""
+    count, dims = values.shape[-2:]
+    away = values - values.mean(dim=-2, keepdim=True)
+    squared = (away.transpose(-2, -1) @ away / (count - 1)).square()
+    diagonal = torch.diagonal(squared, dim1=-2, dim2=-1).sum(-1)
+    return ((squared.sum((-2, -1)) - diagonal) / dims).mean()
+
+
+def local_vicreg(
+    first: Tensor, second: Tensor, first_places: Tensor, second_places: Tensor
+) -> Tensor:
+    """Loss of feature maps (B, C, h, w) of the same B things seen twice.
+
+    `first_places`, `second_places` (B, h * w, 2): what part of the thing each feature shows. Each
+    feature is compared with the most similar one of the other map, and those that lie nearest to
+    one of the other map with that one.
+    """
+    one, other = (each.flatten(2).transpose(1, 2).float() for each in (first, second))
+    alike = torch.cdist(one, other)
+    near = torch.cdist(first_places, second_places)
+    by_content = _matched(one, other, alike, None) + _matched(other, one, alike.mT, None)
+    by_place = _matched(one, other, near, BEST_MATCHES[0])
+    by_place = by_place + _matched(other, one, near.mT, BEST_MATCHES[1])
+    return (by_content + by_place) / 2
+
+
+def _matched(one: Tensor, other: Tensor, distances: Tensor, best: int | None) -> Tensor:
+    """VICReg of features (B, P, C) and the nearest of the other ones by distances (B, P, P)."""
+    least, nearest = distances.min(dim=2)
+    rows = least.argsort(dim=1)[:, : best or least.shape[1]]
+    columns = torch.gather(nearest, 1, rows)
+    pairs = [
+        torch.gather(each, 1, at[..., None].expand(-1, -1, each.shape[2])).transpose(0, 1)
+        for each, at in ((one, rows), (other, columns))
+    ]
+    return vicreg(*pairs)
 
 
 class Heads(nn.Module):
@@ -100,15 +218,14 @@ class Tuning:
         places = np.empty((len(indices), 2, 3), np.float32)
         for row, index in enumerate(indices):
             rng = np.random.default_rng([self.seed, epoch, int(index)])
-            made: Augmented = augmented(rng, self.tiles.grey_tile(int(index)))
+            made = augmented(rng, self.tiles.grey_tile(int(index)))
             seen[row] = self.represent(made.grey, np.ones(made.grey.shape, np.bool_))
             places[row] = made.tile_from_view
         return plain, seen, places
 
-    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
-        """The weighted loss, after adding its gradients times `scale`."""
+    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
         plain, seen, tile_from_view = tensors
-        (first, first_maps), (second, second_maps) = run(plain), run(seen)
+        (first, first_maps), (second, second_maps) = self.model(plain), self.model(seen)
         loss = self.alpha * vicreg(first, second)
         if self.alpha < 1:
             there = centres(self.tiles.tile_px, self.model.side).to(plain.device)
@@ -154,24 +271,10 @@ def learn_caevl(
     )
     encoder = first.encoder
     assert isinstance(encoder, nn.Sequential)
-    with kept_memory(means.keep_memory), processes(means) as world:
-        task = Tuning(recipe, tiles, encoder.to("cpu"), represent, seed)
-        train(
-            task,
-            recipe.exchanged(),
-            tiles,
-            seed=seed,
-            work=work,
-            report=lambda text, done: report(f"fine-tuning: {text}", share + (1 - share) * done),
-            means=means,
-            world=world,
-        )
-        device = device_of(means, world)
-    taken, held = (_spread(len(tiles), count) for count in (CALIBRATION_TILES, HELD_OUT_TILES))
-    made = export_encoder(encoder.to("cpu"), recipe, tiles.batch(taken), tiles.batch(held))
-    return TrainedNetwork(made.embedder, encoder.to(device).eval(), device)
+    task = Tuning(recipe, tiles, encoder.to("cpu"), represent, seed)
 
+    def tuning(text: str, done: float) -> None:
+        report(f"fine-tuning: {text}", share + (1 - share) * done)
 
-def _spread(count: int, wanted: int) -> NDArray[np.intp]:
-    """Up to so many indices below `count`, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, wanted).astype(np.intp))
+    train(task, recipe.exchanged(), tiles, seed=seed, work=work, report=tuning, means=means)
+    return finished(encoder, recipe, tiles, tuning, means)

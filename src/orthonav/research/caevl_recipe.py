@@ -43,7 +43,6 @@ class CaevlRecipe(AutoEncoderRecipe):
             raise VariantError(f"batch must be at least 2, got {self.batch}")
 
     def first(self) -> AutoEncoderRecipe:
-        """The auto-encoder that is learnt first."""
         return AutoEncoderRecipe(
             **{each.name: getattr(self, each.name) for each in fields(AutoEncoderRecipe)}
         )

@@ -222,7 +222,6 @@ class _Graph:
         return value
 
     def block(self, block: nn.Module, value: str) -> str:
-        """A residual block."""
         if not isinstance(block, BasicBlock):
             raise TypeError(f"this block cannot be exported: {type(block).__name__}")
         shortcut = value if block.short_cut is None else self.sequence(block.short_cut, value)
@@ -231,7 +230,6 @@ class _Graph:
         return self._node("Relu", [self._node("Add", [value, shortcut])])
 
     def convolution(self, layer: nn.Conv2d, norm: nn.BatchNorm2d | None, value: str) -> str:
-        """A convolution with its trained batch norm folded in."""
         weights = layer.weight.detach().double().cpu()
         bias = torch.zeros(layer.out_channels, dtype=torch.float64)
         if layer.bias is not None:
@@ -250,7 +248,6 @@ class _Graph:
         )
 
     def plain(self, module: nn.Module, value: str) -> str:
-        """A layer without batch norm."""
         match module:
             case nn.LeakyReLU():
                 return self._node("LeakyRelu", [value], alpha=float(module.negative_slope))

@@ -11,31 +11,51 @@ never flies.
 
 import hashlib
 import itertools
+import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+import pickle
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import VariantError
+from orthonav.core.errors import OutputError, VariantError
 from orthonav.core.extras import missing_extra
-from orthonav.research.sam_cache import cache_folder, cached, keep
-from orthonav.research.sam_weights import WHERE, network, weights_digest
-from orthonav.research.superpoint import chosen_device, require_device, weights_stamp
+from orthonav.core.files import replacing
+from orthonav.research.pretrained import (
+    chosen_device,
+    pretrained,
+    quiet,
+    require_device,
+    transformers,
+    weights_stamp,
+)
 
 try:
     import torch
 except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
 
+log = logging.getLogger(__name__)
+
+WHERE = (
+    "the folder of facebook/sam-vit-base, -large or -huge (config.json and model.safetensors) from "
+    "the Hugging Face hub, or an original checkpoint such as sam_vit_b_01ec64.pth from "
+    "https://dl.fbaipublicfiles.com/segment_anything/"
+)
+
+
 PER = ("sheet", "tile")
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
-CACHE_FORMAT = b"orthonav sam boundaries 1"
+CACHE_FORMAT = b"orthonav sam boundaries 2"
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in training
 _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
 """Pixels of masks scaled at once. On a CPU, small chunks reuse memory of the process: 0.57 s per
@@ -121,7 +141,6 @@ class SamBoundaries:
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return 1
 
     @property
@@ -161,9 +180,9 @@ class SamBoundaries:
         """Boundaries (H, W) of one window, from the cache where it is there."""
         filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
         stamp = weights_stamp(self.path, WHERE)
-        folder = cache_folder(self.cache)
+        folder = _cache_folder(self.cache)
         path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
-        edges = cached(path, grey.shape) if path else None
+        edges = _cached(path, grey.shape) if path else None
         if edges is None:
             device = chosen_device(self.device)
             model = _model(self.path, stamp, str(device))
@@ -171,7 +190,7 @@ class SamBoundaries:
             side = int(model.config.vision_config.image_size)
             edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
             if path:
-                keep(path, edges)
+                _keep(path, edges)
         return edges
 
     def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
@@ -341,3 +360,174 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
 def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
     del stamp  # part of the key only: files may change
     return network(weights).to(device)
+
+
+def _cache_folder(cache: str) -> Path | None:
+    """Folder of entries: `cache`, ORTHONAV_CACHE or the user's cache folder; None for "none"."""
+    if cache == "none":
+        return None
+    if cache:
+        return Path(cache).expanduser()
+    if own := os.environ.get("ORTHONAV_CACHE"):
+        return Path(own) / "sam"
+    users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(users).expanduser() / "orthonav" / "sam"
+
+
+def _cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
+    """Edge map (H, W) of a cache entry, compressed bits; None if it is absent or damaged."""
+    try:
+        bits = np.unpackbits(np.frombuffer(zlib.decompress(path.read_bytes()), np.uint8))
+        return bits[: shape[0] * shape[1]].reshape(shape).astype(bool)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, zlib.error) as error:
+        log.warning("unreadable cache entry; computing it again (%s): %s", error, path)
+        return None
+
+
+def _keep(path: Path, edges: Mask) -> None:
+    """Write a cache entry; if that fails, log a warning and go on without it."""
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(zlib.compress(np.packbits(edges).tobytes()))
+    except OutputError as error:
+        log.warning("could not write the cache entry: %s", error)
+
+
+def network(weights: str) -> Any:
+    """Network in float32 on the CPU, from a Hugging Face folder or an original checkpoint.
+
+    Raises `VariantError` if the path holds neither.
+    """
+    path = Path(weights).expanduser()
+    return pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
+
+
+@lru_cache(maxsize=8)
+def weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
+    """SHA-256 of the weights file, or of the config and weights of a folder."""
+    del stamp  # part of the key only: files may change
+    path = Path(weights).expanduser()
+    files = [path]
+    if path.is_dir():
+        files = sorted([*path.glob("config.json"), *path.glob("*.safetensors")])
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+_RENAMES = [
+    (re.compile(pattern), name)
+    for pattern, name in (
+        (r"^image_encoder\.", "vision_encoder."),
+        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
+        (r"\.neck\.0\.", ".neck.conv1."),
+        (r"\.neck\.1\.", ".neck.layer_norm1."),
+        (r"\.neck\.2\.", ".neck.conv2."),
+        (r"\.neck\.3\.", ".neck.layer_norm2."),
+        (
+            r"\.pe_layer\.positional_encoding_gaussian_matrix$",
+            ".shared_embedding.positional_embedding",
+        ),
+        (r"\.point_embeddings\.", ".point_embed."),
+        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.0\.", r".\1.proj_in."),
+        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.1\.", r".\1.layers.0."),
+        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.2\.", r".\1.proj_out."),
+        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+    )
+]
+_POSITIONS = "prompt_encoder.shared_embedding.positional_embedding"
+
+
+def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Weights of an original checkpoint, renamed as `transformers` expects them."""
+    converted = {}
+    for key, value in original.items():
+        for pattern, name in _RENAMES:
+            key = pattern.sub(name, key)
+        converted[key] = value
+    converted["shared_image_embedding.positional_embedding"] = converted[_POSITIONS]
+    return converted
+
+
+def original_model(path: Path) -> Any:
+    """Network of an original checkpoint such as `sam_vit_b_01ec64.pth`, in float32.
+
+    The shapes of the weights give its size. Raises `VariantError` for any other file.
+    """
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise VariantError(f"cannot read the weights; expected {WHERE}: {path}") from error
+    try:
+        # Some files also hold the constants that normalize pictures.
+        named = {k: v for k, v in weights.items() if k not in ("pixel_mean", "pixel_std")}
+        with quiet():
+            model = transformers().SamModel(_config(named))
+        model.load_state_dict(converted_weights(named))
+    except (KeyError, AttributeError, TypeError, ValueError, IndexError, RuntimeError) as error:
+        raise VariantError(f"not Segment Anything weights; expected {WHERE}: {path}") from error
+    return model.eval().requires_grad_(False)
+
+
+def _config(original: Mapping[str, torch.Tensor]) -> Any:
+    """`SamConfig` derived from the shapes of an original checkpoint."""
+    library = transformers()
+    shapes = {key: tuple(value.shape) for key, value in original.items()}
+    hidden, colours, patch, _ = shapes["image_encoder.patch_embed.proj.weight"]
+    grid = shapes["image_encoder.pos_embed"][1]
+    depth = _count(shapes, r"image_encoder\.blocks\.(\d+)\.norm1\.weight")
+    reaches, head = zip(
+        *(shapes[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(depth)), strict=True
+    )
+    windows = [(reach + 1) // 2 for reach in reaches]  # of 2 * window - 1 relative positions
+    vision = library.SamVisionConfig(
+        hidden_size=hidden,
+        output_channels=shapes["image_encoder.neck.0.weight"][0],
+        num_hidden_layers=depth,
+        num_attention_heads=hidden // head[0],
+        num_channels=colours,
+        image_size=grid * patch,
+        patch_size=patch,
+        window_size=min(windows) if min(windows) < grid else 14,
+        global_attn_indexes=[i for i, window in enumerate(windows) if window == grid],
+        num_pos_feats=shapes["prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"][1],
+        mlp_dim=shapes["image_encoder.blocks.0.mlp.lin1.weight"][0],
+    )
+    tokens, decoded = shapes["mask_decoder.mask_tokens.weight"]
+    prompt = library.SamPromptEncoderConfig(
+        hidden_size=decoded,
+        image_size=grid * patch,
+        patch_size=patch,
+        mask_input_channels=shapes["prompt_encoder.mask_downscaling.3.weight"][0],
+        num_point_embeddings=_count(shapes, r"prompt_encoder\.point_embeddings\.(\d+)\.weight"),
+    )
+    layers = "mask_decoder.transformer.layers"
+    decoder = library.SamMaskDecoderConfig(
+        hidden_size=decoded,
+        mlp_dim=shapes[f"{layers}.0.mlp.lin1.weight"][0],
+        num_hidden_layers=_count(shapes, layers.replace(".", r"\.") + r"\.(\d+)\.norm1\.weight"),
+        attention_downsample_rate=decoded
+        // shapes[f"{layers}.0.cross_attn_token_to_image.q_proj.weight"][0],
+        num_multimask_outputs=tokens - 1,
+        iou_head_hidden_dim=shapes["mask_decoder.iou_prediction_head.layers.0.weight"][0],
+    )
+    return library.SamConfig(
+        vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder
+    )
+
+
+def _count(keys: Iterable[str], pattern: str) -> int:
+    return sum(re.fullmatch(pattern, key) is not None for key in keys)

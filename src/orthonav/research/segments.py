@@ -52,7 +52,6 @@ class Segments:
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return 1
 
     @property

@@ -18,7 +18,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True, eq=False)
 class SheetTiles:
-    """Tiles of one sheet picture. Raises `ValueError` if the fields do not fit together.
+    """Tiles of one sheet picture.
 
     - `pixels`: (C, H, W) uint8, an array or a memory map.
     - `valid`: (H, W) bool, pixels that are imagery.
@@ -39,32 +39,11 @@ class SheetTiles:
     grey: NDArray[np.uint8] | None = None
     singles: NDArray[np.uint8] | None = None
 
-    def __post_init__(self) -> None:
-        if self.pixels.ndim != 3 or self.pixels.dtype != np.uint8:
-            raise ValueError(
-                f"pixels must be uint8 (C, H, W), got {self.pixels.dtype} {self.pixels.shape}"
-            )
-        shape = self.pixels.shape[1:]
-        if self.valid.shape != shape or self.valid.dtype != np.bool_:
-            raise ValueError(
-                f"valid must be bool {shape}, got {self.valid.dtype} {self.valid.shape}"
-            )
-        if self.grey is not None and (self.grey.shape != shape or self.grey.dtype != np.uint8):
-            raise ValueError(f"grey must be uint8 {shape}, got {self.grey.dtype} {self.grey.shape}")
-        if self.tiles_px.ndim != 2 or self.tiles_px.shape[1] != 2 or len(self.tiles_px) == 0:
-            raise ValueError(f"tiles_px must be (N, 2), N above 0, got {self.tiles_px.shape}")
-        if not self.scale > 0:
-            raise ValueError(f"scale must be above 0, got {self.scale}")
-        last = self.tiles_px.max(axis=0) + self.tile_px
-        if self.tile_px < 1 or self.tiles_px.min() < 0 or last[0] > shape[0] or last[1] > shape[1]:
-            raise ValueError(f"tiles of {self.tile_px} px reach beyond the sheet of {shape} px")
-
     def __len__(self) -> int:
         return len(self.tiles_px)
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
         return int(self.pixels.shape[0])
 
     def batch(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
@@ -98,20 +77,15 @@ class SheetTiles:
         return slice(row, row + self.tile_px), slice(col, col + self.tile_px)
 
 
-def epoch_batches(
-    count: int, batch: int, seed: int, epoch: int, *, rank: int = 0, processes: int = 1
-) -> list[NDArray[np.intp]]:
-    """Share of this process of every batch of an epoch: indices below `count`, in random order.
+def epoch_batches(count: int, batch: int, seed: int, epoch: int) -> list[NDArray[np.intp]]:
+    """Batches of an epoch: indices below `count`, in random order.
 
-    Batches hold at most `batch` tiles, nearly the same number each. Every process gets the same
-    number, at least 2; to make that possible some tiles are left out or repeated.
+    Batches hold at most `batch` tiles, nearly the same number each, and at least 2; to make that
+    possible a tile may be repeated.
     """
     order = np.random.default_rng([seed, epoch]).permutation(count)
-    parts = []
-    for whole in np.array_split(order, math.ceil(count / batch)):
-        size = max(len(whole) // processes, min(2, batch))
-        parts.append(np.resize(whole, size * processes)[rank::processes])
-    return parts
+    parts = np.array_split(order, math.ceil(count / batch))
+    return [np.resize(part, max(len(part), min(2, batch))) for part in parts]
 
 
 def made_ahead(

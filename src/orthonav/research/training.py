@@ -1,63 +1,335 @@
-"""Trains the neural encoders: one engine for the auto-encoder and the triplet network.
+"""Trains the neural encoders: one engine for the auto-encoder, the triplet network and CAEVL.
 
-Both are trained as in Di Piazza et al. 2024 (section Methodology): the auto-encoder with AdamW, a
-rate of 3e-4 that halves on plateaus, batches of 32; the triplet network with Adam, 1e-3, batches
-of 512; 200 epochs each. The order of tiles and every positive depend on the seed, the epoch and
-the tile alone. An interrupted training therefore resumes with the same result, also within an
-epoch, and a finished one goes on where it is given more epochs.
+Both of the paper are trained as in Di Piazza et al. 2024 (section Methodology): the auto-encoder
+with AdamW, a rate of 3e-4 that halves on plateaus, batches of 32; the triplet network with Adam,
+1e-3, batches of 512; 200 epochs each. The order of tiles and every positive depend on the seed, the
+epoch and the tile alone. An interrupted training therefore resumes with the same result, also
+within an epoch, and a finished one goes on where it is given more epochs. Checkpoints and pictures
+are written atomically, between batches and after epochs.
 
-Several processes or GPUs: start the program with `torchrun`. Each process takes its share of every
-batch, gradients are averaged, and the first process writes. Negatives and the statistics of batch
-norms come from the share of each process.
+Tensors stay contiguous (NCHW) on every device. In `channels_last` oneDNN writes past a buffer in
+the backward pass of strided 1 x 1 convolutions with fewer channels than its block: the shortcuts
+of a narrow ResNet. On processors with AVX2 only, the gradients are then wrong, or the process
+crashes or hangs (oneDNN issue 6035, present in PyTorch 2.13.0). `torch.compile` is not used,
+because on a CPU it chooses `channels_last` itself.
 """
 
+import contextlib
+import ctypes
+import dataclasses
+import json
 import logging
 import math
+import sys
 import time
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 
-from orthonav.core.files import Progress
-from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder
-from orthonav.research.autoencoder import Reconstruction
-from orthonav.research.checkpoints import CheckpointStore, Recipe, TrainingState, fingerprint
+from orthonav.core.cores import usable_cores
+from orthonav.core.errors import OrthonavError, OutputError
+from orthonav.core.files import Progress, replacing, write_text
+from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.research.autoencoder import AutoEncoder, Reconstruction, reconstructions
 from orthonav.research.export import export_encoder
-from orthonav.research.means import (
-    Means,
-    World,
-    device_of,
-    kept_memory,
-    mean_over_processes,
-    mixed_precision,
-    processes,
-    workers_of,
-    wrapped,
-)
 from orthonav.research.tiles import SheetTiles, epoch_batches, made_ahead
 from orthonav.research.triplet import Positive, Triplets
 
 log = logging.getLogger(__name__)
 
+GPU_WORKERS = 16
+"""Threads that make batches for a GPU: more tiles than one thread cuts, and positives take far
+longer than tiles."""
 CALIBRATION_TILES, HELD_OUT_TILES = 64, 32
 SETTLING_BATCHES = 32
 PROGRESS_EVERY_S = 2.0
+PLATEAU_FACTOR = 0.5
+
+Recipe = AutoEncoderRecipe | TripletRecipe
+
+
+@dataclass(frozen=True)
+class Means:
+    """Options for the speed of training; the learned weights are the same up to rounding.
+
+    - `bf16`: mixed precision with bfloat16; None: if the processor has its instructions, else with
+      float16 on a GPU.
+    - `chunk`: tiles of a triplet batch held for gradients at once; batch norms use each chunk.
+    - `workers`: threads that make batches; None: 2 for a CPU, one per core up to 16 for a GPU.
+    - `save_every_s`: shortest time between checkpoints, s.
+    - `device`: name for PyTorch; None: a GPU if there is one.
+    """
+
+    bf16: bool | None = None
+    chunk: int = 128
+    workers: int | None = None
+    save_every_s: float = 300.0
+    device: str | None = None
+
+
+def device_of(means: Means) -> torch.device:
+    return torch.device(means.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def mixed_precision(means: Means, device: torch.device) -> torch.dtype | None:
+    """Type for mixed precision: as `means.bf16` says, else bfloat16 if the device supports it.
+
+    A GPU without it, before NVIDIA's Ampere, gets float16; on other processors float32 is faster.
+    """
+    if means.bf16 is not None:
+        return torch.bfloat16 if means.bf16 else None
+    if device.type == "cuda":
+        able = torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.bfloat16 if able else torch.float16
+    # Older releases of PyTorch lack this function.
+    found: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    able = any(bool(found.get(name)) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    return torch.bfloat16 if able else None
+
+
+def workers_of(means: Means, device: torch.device) -> int:
+    if means.workers is not None:
+        return means.workers
+    return min(GPU_WORKERS, usable_cores()) if device.type == "cuda" else 2
+
+
+@contextlib.contextmanager
+def _kept_memory() -> Iterator[None]:
+    """Let glibc keep freed memory while this lasts, instead of returning it to the system.
+
+    Every step allocates and frees hundreds of MB of activations and gradients. Zero-filled pages
+    from the system cost as much as the arithmetic (mallopt(3)).
+    """
+    try:
+        library = ctypes.CDLL(None) if sys.platform == "linux" else None
+        mallopt, trim = library and library.mallopt, library and library.malloc_trim
+    except (OSError, AttributeError):
+        mallopt = trim = None
+    if not mallopt or not trim:
+        yield
+        return
+    trim_threshold, mmap_max = -1, -4
+    mallopt(mmap_max, 0)
+    mallopt(trim_threshold, -1)
+    try:
+        yield
+    finally:
+        mallopt(mmap_max, 65_536)
+        mallopt(trim_threshold, 128 * 1024)
+        trim(0)
+
+
+class TrainingError(OrthonavError, RuntimeError):
+    """The loss is not finite."""
+
+
+class TrainingState:
+    """State of a training: weights, optimizer, learning rate and losses.
+
+    `history` holds the mean loss of each epoch, `losses` those of the batches of the current epoch.
+    `scaler` scales gradients of float16 and does nothing for other types.
+    """
+
+    def __init__(self, model: nn.Module, recipe: Recipe, scaler: torch.amp.GradScaler) -> None:
+        kind = torch.optim.AdamW if isinstance(recipe, AutoEncoderRecipe) else torch.optim.Adam
+        self.model, self.scaler = model, scaler
+        self.optimizer: torch.optim.Optimizer = kind(
+            model.parameters(), lr=recipe.learning_rate, fused=True
+        )
+        self.plateau = None
+        if isinstance(recipe, AutoEncoderRecipe):
+            self.plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(
+                self.optimizer, factor=PLATEAU_FACTOR
+            )
+        self.history: list[float] = []
+        self.losses: list[Tensor] = []
+
+    def end_epoch(self, loss: float) -> None:
+        """Store the mean loss and lower the rate on a plateau; raises `TrainingError`."""
+        if not math.isfinite(loss):
+            raise TrainingError(
+                f"loss is {loss} in epoch {len(self.history) + 1}: use a smaller learning_rate"
+            )
+        self.history.append(loss)
+        self.losses = []
+        if self.plateau is not None:
+            self.plateau.step(loss)
+
+    def parts(self) -> dict[str, Any]:
+        return {
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "plateau": self.plateau.state_dict() if self.plateau else None,
+            "scaler": self.scaler.state_dict(),
+            "history": self.history,
+            "losses": self.losses,
+        }
+
+    def take(self, parts: dict[str, Any]) -> None:
+        self.model.load_state_dict(parts["model"])
+        self.optimizer.load_state_dict(parts["optimizer"])
+        if self.plateau is not None:
+            self.plateau.load_state_dict(parts["plateau"])
+        if parts.get("scaler"):
+            self.scaler.load_state_dict(parts["scaler"])
+        self.history = list(parts["history"])
+        self.losses = list(parts.get("losses", []))  # absent in older checkpoints
+
+
+class Checkpoints:
+    """Reports the progress of one training and writes its checkpoints and pictures to a folder.
+
+    `batches`: number of batches of an epoch.
+    """
+
+    def __init__(
+        self,
+        state: TrainingState,
+        tiles: SheetTiles,
+        fingerprint: str,
+        *,
+        work: Path | None,
+        epochs: int,
+        batches: int,
+        every_s: float,
+        report: Progress,
+    ) -> None:
+        self._state, self._tiles, self._fingerprint = state, tiles, fingerprint
+        self._work, self._epochs, self._batches = work, epochs, batches
+        self._every_s, self._report = every_s, report
+        self._saved_s = self._progress_s = self._start_s = time.monotonic()
+        self._start = self._share()
+
+    def load(self, device: torch.device) -> None:
+        """Restore any checkpoint, and remove temporary files of interrupted writes.
+
+        Raises `OutputError` if it belongs to another training, or has more epochs.
+        """
+        for left in self._work.glob(".checkpoint.pt.*.tmp.pt") if self._work else ():
+            left.unlink(missing_ok=True)
+        path = None if self._work is None else self._work / "checkpoint.pt"
+        if path is None or not path.exists():
+            return
+        try:
+            found = torch.load(path, map_location=device, weights_only=True)
+            same = found.pop("fingerprint") == self._fingerprint
+        except Exception as error:
+            # Unpickling a broken file may raise any exception.
+            raise OutputError(f"checkpoint cannot be read; delete it: {path}") from error
+        if not same:
+            raise OutputError(f"folder holds another training; choose another folder: {path}")
+        if len(found["history"]) > self._epochs:
+            raise OutputError(
+                f"folder holds a training of {len(found['history'])} epochs, {self._epochs} are "
+                f"asked for; give as many, or choose another folder: {path}"
+            )
+        self._state.take(found)
+        self._start = self._share()
+
+    def after_batch(self) -> None:
+        """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
+        epoch, done = len(self._state.history), len(self._state.losses)
+        if done == self._batches:
+            return
+        if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
+            at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
+            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
+        self._write(last=False)
+
+    def after_epoch(self) -> None:
+        """Report the mean loss; write if due, and always after the last epoch."""
+        history = self._state.history
+        self._say(f"epoch {len(history)} of {self._epochs}, loss {history[-1]:.5g}")
+        self._write(last=len(history) == self._epochs)
+
+    def _write(self, *, last: bool) -> None:
+        state = self._state
+        if self._work is None or not (last or time.monotonic() - self._saved_s >= self._every_s):
+            return
+        with replacing(self._work / "checkpoint.pt") as temporary:
+            torch.save({"fingerprint": self._fingerprint, **state.parts()}, temporary)
+        self._saved_s = time.monotonic()
+        write_text(self._work / "history.json", json.dumps({"loss": state.history}) + "\n")
+        picture = loss_picture(state.history)
+        if not state.history:
+            picture = loss_picture([float(loss) for loss in state.losses], "batch")
+        _write_png(self._work / "loss.png", picture)
+        if isinstance(state.model, AutoEncoder):
+            _write_png(self._work / "tiles.png", reconstructions(state.model, self._tiles))
+
+    def _share(self) -> float:
+        batches = len(self._state.history) * self._batches + len(self._state.losses)
+        return batches / (self._epochs * self._batches)
+
+    def _say(self, text: str) -> None:
+        """Report with the time left, at the speed since this process began."""
+        self._progress_s, share = time.monotonic(), self._share()
+        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
+        left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
+        self._report(f"{text}{left}", share)
+
+
+def loss_picture(history: Sequence[float], unit: str = "epoch") -> NDArray[np.uint8]:
+    """Plot (360, 640, 3) of the losses, logarithmic; its title gives the first, least and last one.
+
+    `unit`: "epoch" or "batch". The plot is blank without losses or if one of them is not finite.
+    """
+    picture = np.full((360, 640, 3), 255, np.uint8)
+    if not history or not np.isfinite(history).all():
+        return picture
+    levels = np.log(np.maximum(np.asarray(history, np.float64), 1e-12))
+    low, high = float(levels.min()), float(max(levels.max(), levels.min() + 1e-6))
+    x = np.linspace(20, 620, len(levels)) if len(levels) > 1 else np.array([20.0])
+    y = 340 - (levels - low) / (high - low) * 290
+    points = np.stack([x, y], axis=1).round().astype(np.int32)
+    cv2.polylines(picture, [points[:, None]], False, (160, 60, 20), 2, cv2.LINE_AA)
+    text = f"{unit} {len(history)}: loss {history[-1]:.4g} (first {history[0]:.4g}, "
+    cv2.putText(picture, f"{text}least {min(history):.4g})", (20, 28), 0, 0.55, (0, 0, 0), 1, 16)
+    return picture
+
+
+def _write_png(path: Path, picture: NDArray[np.uint8]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+def fingerprint(
+    recipe: Recipe,
+    tiles: SheetTiles,
+    dates: Sequence[SheetTiles],
+    seed: int,
+    means: Means,
+) -> str:
+    """Key of a training: a checkpoint with another key is refused; `dates` are other sheets."""
+    some = np.unique(np.linspace(0, len(tiles) - 1, 64).astype(np.intp))
+    where = np.ascontiguousarray(tiles.tiles_px, dtype=np.int64).tobytes()
+    # Precision is chosen after training, and epochs can be added.
+    learnt = dataclasses.asdict(recipe) | {"precision": "float32", "epochs": 0}
+    key: dict[str, Any] = {
+        "recipe": [type(recipe).__name__, learnt],
+        "tiles": [zlib.crc32(where), zlib.crc32(tiles.batch(some).tobytes()), tiles.tile_px],
+        "seed": seed,
+        "means": [means.bf16, means.chunk, 1],
+    }
+    if dates:
+        key["dates"] = [zlib.crc32(date.batch(some).tobytes()) for date in dates]
+    return json.dumps(key, sort_keys=True)
 
 
 class Task(Protocol):
     """A training task: a model, and how a batch becomes gradients."""
 
     @property
-    def model(self) -> nn.Module:
-        """The trained model."""
-        ...
+    def model(self) -> nn.Module: ...
 
     @property
     def encoder(self) -> nn.Module:
@@ -68,8 +340,8 @@ class Task(Protocol):
         """Arrays for a batch of tiles (B,); called from several threads."""
         ...
 
-    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
-        """Loss, after adding its gradients times `scale`; `run` is the model, possibly wrapped."""
+    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """Loss, after adding its gradients times `scale`."""
         ...
 
 
@@ -125,29 +397,17 @@ def learn_network(
     """
     means = means or Means()
     progress = report or (lambda text, share: None)
-    with kept_memory(means.keep_memory), processes(means) as world:
-        task = _task(recipe, tiles, binary=binary, positive=positive, seed=seed, means=means)
-        dates = () if positive is None or callable(positive) else positive
-        train(
-            task,
-            recipe,
-            tiles,
-            dates=dates,
-            seed=seed,
-            work=work,
-            report=progress,
-            means=means,
-            world=world,
-        )
-        device = device_of(means, world)
-    embedder = _exported(task.encoder, recipe, tiles, progress)
-    return TrainedNetwork(embedder, task.encoder.to(device).eval(), device)
+    task = _task(recipe, tiles, binary=binary, positive=positive, seed=seed, means=means)
+    dates = () if positive is None or callable(positive) else positive
+    given: dict[str, Any] = {"seed": seed, "work": work, "report": progress, "means": means}
+    train(task, recipe, tiles, dates=dates, **given)
+    return finished(task.encoder, recipe, tiles, progress, means)
 
 
-def _exported(
-    encoder: nn.Module, recipe: Recipe, tiles: SheetTiles, progress: Progress
-) -> NetworkEmbedder:
-    """ONNX embedder in the recipe's precision if that is accurate enough on tiles of the map."""
+def finished(
+    encoder: nn.Module, recipe: Recipe, tiles: SheetTiles, progress: Progress, means: Means
+) -> TrainedNetwork:
+    """Trained encoder with its ONNX embedder, checked on tiles of the map."""
     progress("export", 1.0)
     taken = np.unique(np.linspace(0, len(tiles) - 1, CALIBRATION_TILES).astype(np.intp))
     others = np.setdiff1d(np.arange(len(tiles)), taken)
@@ -161,7 +421,8 @@ def _exported(
         f"trained encoder {tried:.4f}, at least {made.least_cosine:g} required",
         1.0,
     )
-    return made.embedder
+    device = device_of(means)
+    return TrainedNetwork(made.embedder, encoder.to(device).eval(), device)
 
 
 def _task(
@@ -173,7 +434,6 @@ def _task(
     seed: int,
     means: Means,
 ) -> Task:
-    """Training task of a recipe, with initial weights drawn from the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if isinstance(recipe, AutoEncoderRecipe):
@@ -196,89 +456,40 @@ def train(
     work: Path | None,
     report: Progress,
     means: Means,
-    world: World,
     dates: Sequence[SheetTiles] = (),
 ) -> list[float]:
     """Mean loss of each epoch, after training `task.model` in place from any checkpoint.
 
-    `dates`: sheets of the positives, part of the key of a checkpoint. With several processes all
-    read the checkpoint, so `work` must be a shared folder.
+    `dates`: sheets of the positives, part of the key of a checkpoint.
     """
-    device = device_of(means, world)
+    device = device_of(means)
     mixed = mixed_precision(means, device)
     log.info("training on %s in %s, contiguous tensors (NCHW)", device, mixed or torch.float32)
     task.model.to(device)
     scaler = torch.amp.GradScaler(device.type, enabled=mixed == torch.float16)
-    state = TrainingState(task.model, recipe, fused=means.fused, scaler=scaler)
-    known_by = fingerprint(recipe, tiles, dates, seed, means, world)
-    store = CheckpointStore(work, known_by, means.save_every_s)
-    store.load(state, device, recipe.epochs)
-    run = wrapped(task.model, device, world)
-    feed = _Feed(task, recipe.batch, seed, len(tiles), device, mixed, means, world)
-    writer = store if world.rank == 0 else None
-    if writer:
-        writer.clear()
-    pauses = _Pauses(state, tiles, recipe.epochs, feed.per_epoch, report, writer)
+    state = TrainingState(task.model, recipe, scaler)
+    feed = _Feed(task, recipe.batch, seed, len(tiles), device, mixed, means)
+    checkpoints = Checkpoints(
+        state,
+        tiles,
+        fingerprint(recipe, tiles, dates, seed, means),
+        work=work,
+        epochs=recipe.epochs,
+        batches=feed.per_epoch,
+        every_s=means.save_every_s,
+        report=report,
+    )
+    checkpoints.load(device)
     # By default convolutions on a GPU are not deterministic.
-    with torch.backends.cudnn.flags(enabled=True, deterministic=True):
+    with _kept_memory(), torch.backends.cudnn.flags(enabled=True, deterministic=True):
         while len(state.history) < recipe.epochs:
             task.model.train()
-            loss = _epoch(feed, run, state, pauses)
-            state.end_epoch(mean_over_processes(loss, world, device))
-            pauses.after_epoch()
+            loss = _epoch(feed, state, checkpoints)
+            state.end_epoch(float(loss))
+            checkpoints.after_epoch()
         _settle(feed)
     task.model.eval()
     return state.history
-
-
-class _Pauses:
-    """Reports progress and writes checkpoints; `writer` is None where another process writes."""
-
-    def __init__(
-        self,
-        state: TrainingState,
-        tiles: SheetTiles,
-        epochs: int,
-        batches: int,
-        report: Progress,
-        writer: CheckpointStore | None,
-    ) -> None:
-        self._state, self._tiles = state, tiles
-        self._epochs, self._batches = epochs, batches
-        self._report, self._writer = report, writer
-        self._progress_s = self._start_s = time.monotonic()
-        self._start = self._share()
-
-    def after_batch(self) -> None:
-        """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
-        epoch, done = len(self._state.history), len(self._state.losses)
-        if done == self._batches:
-            return
-        if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
-            at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
-            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
-        if self._writer:
-            self._writer.after_batch(self._state, self._tiles)
-
-    def after_epoch(self) -> None:
-        """Report the mean loss, and write if due."""
-        history = self._state.history
-        done = len(history)
-        self._say(f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}")
-        if self._writer:
-            self._writer.after_epoch(self._state, self._tiles, last=done == self._epochs)
-
-    def _share(self) -> float:
-        """Share of the training that is done."""
-        batches = len(self._state.history) * self._batches + len(self._state.losses)
-        return batches / (self._epochs * self._batches)
-
-    def _say(self, text: str) -> None:
-        """Report with the time left, at the speed since this process began."""
-        self._progress_s, share = time.monotonic(), self._share()
-        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
-        left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
-        self._report(f"{text}{left}", share)
 
 
 def _duration(seconds: float) -> str:
@@ -291,8 +502,6 @@ def _duration(seconds: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Feed:
-    """Makes batches and moves them to the device."""
-
     task: Task
     batch: int
     seed: int
@@ -300,17 +509,14 @@ class _Feed:
     device: torch.device
     precision: torch.dtype | None
     means: Means
-    world: World
 
     @property
     def per_epoch(self) -> int:
-        """Number of batches of an epoch."""
         return math.ceil(self.count / self.batch)
 
     def batches(self, epoch: int, first: int = 0, end: int | None = None) -> Iterator[list[Tensor]]:
-        """Tensors of each batch of this process, from number `first` up to `end`, exclusive."""
-        rank, size = self.world.rank, self.world.size
-        plan = epoch_batches(self.count, self.batch, self.seed, epoch, rank=rank, processes=size)
+        """Tensors of each batch, from number `first` up to `end`, exclusive."""
+        plan = epoch_batches(self.count, self.batch, self.seed, epoch)
         workers = workers_of(self.means, self.device)
         for tensors in made_ahead(partial(self._made, epoch), plan[first:end], workers):
             yield [each.to(self.device, non_blocking=True) for each in tensors]
@@ -322,33 +528,28 @@ class _Feed:
         return [each.pin_memory() for each in made] if self.device.type == "cuda" else made
 
     def mixed(self) -> torch.autocast:
-        """Autocast context for mixed precision."""
         wanted, kind = self.precision is not None, self.precision or torch.bfloat16
         return torch.autocast(self.device.type, kind, enabled=wanted)
 
 
-def _epoch(feed: _Feed, run: nn.Module, state: TrainingState, pauses: _Pauses) -> Tensor:
-    """Mean loss of one epoch; a resumed epoch starts after its finished batches.
-
-    With several processes, all resume with the losses of the first one.
-    """
+def _epoch(feed: _Feed, state: TrainingState, checkpoints: Checkpoints) -> Tensor:
+    """Mean loss of one epoch; a resumed epoch starts after its finished batches."""
     one = torch.ones((), device=feed.device)
     for tensors in feed.batches(len(state.history), len(state.losses)):
         state.optimizer.zero_grad(set_to_none=True)
         with feed.mixed():
-            loss = feed.task.backward(run, *tensors, scale=state.scaler.scale(one))
+            loss = feed.task.backward(*tensors, scale=state.scaler.scale(one))
         state.losses.append(loss)
         state.scaler.step(state.optimizer)
         state.scaler.update()
-        pauses.after_batch()
+        checkpoints.after_batch()
     return torch.stack(state.losses).double().mean()
 
 
 def _settle(feed: _Feed) -> None:
     """Recompute the means and variances of batch norms for the final weights.
 
-    Running averages lag some ten steps behind, and a small area has few steps in an epoch. With
-    several processes the statistics of the first one are used.
+    Running averages lag some ten steps behind, and a small area has few steps in an epoch.
     """
     model = feed.task.model
     norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm2d)]
@@ -363,6 +564,3 @@ def _settle(feed: _Feed) -> None:
                 model(part)
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
-    if feed.world.size > 1:
-        for values in model.buffers():
-            distributed.broadcast(values, 0)

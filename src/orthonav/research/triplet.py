@@ -7,7 +7,6 @@ without its last dense layer; its 512 channels averaged over the left and the ri
 tile are the 1024 numbers. The loss is FaceNet's (Schroff et al., CVPR 2015).
 """
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,14 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.parallel import DistributedDataParallel
 
 from orthonav.core.tiles.network import TripletRecipe
 from orthonav.research.tiles import SheetTiles
 
 BLOCKS = (3, 4, 6, 3)
 """Blocks of two convolutions in each of the four stages: ResNet34."""
-SMALLEST_TILE_PX = 32
 
 Positive = Callable[[np.random.Generator, NDArray[np.uint8]], NDArray[Any]]
 """Function from grey levels (S, S) uint8 to a tile of another date, (S, S) or (C, S, S): uint8 in
@@ -58,16 +55,10 @@ class ResNet34(nn.Module):
     """Encoder of tiles (N, C, S, S) into vectors (N, 16 * width).
 
     `width` is the number of channels of the first stage, 64 in ResNet34; it doubles three times.
-    Raises `ValueError` for a tile below 32 px or an impossible width.
     """
 
     def __init__(self, *, tile_px: int = 256, channels: int = 1, width: int = 64) -> None:
         super().__init__()
-        if tile_px < SMALLEST_TILE_PX or channels < 1 or width < 1:
-            raise ValueError(
-                f"tile must be at least {SMALLEST_TILE_PX} px, channels and width above 0, "
-                f"got {tile_px}, {channels}, {width}"
-            )
         self.tile_px, self.channels, self.dims = tile_px, channels, 16 * width
         self.stem = nn.Sequential(
             nn.Conv2d(channels, width, 7, 2, 3, bias=False),
@@ -183,7 +174,7 @@ class Triplets:
         else:
             np.multiply(made, valid, out=out)
 
-    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
         """The triplet loss, after adding its gradients times `scale`.
 
         A batch larger than `chunk` is embedded twice (Gao et al. 2021, arXiv 2101.06983): first
@@ -192,7 +183,7 @@ class Triplets:
         """
         both, apart = tensors
         if len(both) <= self.chunk:
-            loss = self._loss(run(both), apart)
+            loss = self._loss(self.model(both), apart)
             torch.autograd.backward(loss * scale)
             return loss.detach()
         parts = torch.split(both, self.chunk)
@@ -200,11 +191,8 @@ class Triplets:
             embedded = torch.cat([self.model(part) for part in parts])
         loss = self._loss(embedded.requires_grad_(), apart)
         (wanted,) = torch.autograd.grad(loss * scale, embedded)
-        for number, (part, gradient) in enumerate(
-            zip(parts, torch.split(wanted, self.chunk), strict=True), start=1
-        ):
-            with _unshared(run, number < len(parts)):
-                torch.autograd.backward(run(part), gradient)
+        for part, gradient in zip(parts, torch.split(wanted, self.chunk), strict=True):
+            torch.autograd.backward(self.model(part), gradient)
         return loss.detach()
 
     def _loss(self, embedded: Tensor, apart: Tensor) -> Tensor:
@@ -217,11 +205,3 @@ class Triplets:
             margin=self.recipe.margin,
             semi_hard=self.recipe.mining == "semihard",
         )
-
-
-def _unshared(run: nn.Module, wanted: bool) -> contextlib.AbstractContextManager[None]:
-    """With several processes: do not average gradients while this lasts."""
-    if wanted and isinstance(run, DistributedDataParallel):
-        held: contextlib.AbstractContextManager[None] = run.no_sync()
-        return held
-    return contextlib.nullcontext()

@@ -43,7 +43,7 @@ class SuperPointDetector:
 
     def __call__(self, grey: Grey) -> tuple[Array, Array, Array]:
         """Points (N, 2) from the outer corner, radii (N,) and unit descriptors (N, 256)."""
-        from orthonav.research.superpoint import SuperPoint  # only here is PyTorch needed
+        from orthonav.research.pretrained import SuperPoint  # only here is PyTorch needed
 
         points, descriptors = SuperPoint(self.weights, max_points=self.most).describe(grey)
         radii = np.full(len(points), SUPERPOINT_RADIUS_PX, dtype=np.float32)
@@ -68,7 +68,6 @@ class _Sample:
         self._count = 0
 
     def put(self, rows: NDArray[Any]) -> None:
-        """Add rows (N, ..)."""
         self._rows.append(rows)
         self._tickets.append(self._random.random(len(rows)))
         self._count += len(rows)
@@ -76,7 +75,6 @@ class _Sample:
             self._draw()
 
     def rows(self) -> NDArray[Any]:
-        """The sample, in the order of arrival."""
         self._draw()
         return self._rows[0]
 

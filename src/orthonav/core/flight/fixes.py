@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
-from orthonav.core.records import Evidence, Fix, NoFix, ViewResult
+from orthonav.core.records import Fix, NoFix, ViewResult
 
 KEYS = (
     "frame",  # name of the image in the flight folder
@@ -59,13 +59,10 @@ TRACK_KEYS = (
 STATES = ("searching", "tracking", "coasting", "lost")
 _NULL_IN_FIX = {"reason": None, "detail": None}
 _NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:11])
-MAX_LINE_BYTES = 2**20
-"""Limit of a line; the evidence of a view takes about 1000 bytes."""
-MAX_RESULTS = 1_000_000
-"""Limit of lines: as many as a flight folder may have views."""
+MAX_LINE_BYTES = 2**20  # limit of a line; the evidence of a view takes about 1000 bytes
+MAX_RESULTS = 1_000_000  # limit of lines: as many as a flight folder may have views
 _TIME_LIMIT_S = 2**63 / 1e9
-FIRST_BYTES = 2**16
-"""Longest first line that is read."""
+FIRST_BYTES = 2**16  # longest first line that is read
 View = TypeVar("View", bound=RecordedView)
 
 
@@ -140,8 +137,7 @@ def read_identity(path: Path) -> Identity:
     return Identity()
 
 
-UNKNOWN = Identity()
-"""Of a run whose map and flight are not stated."""
+UNKNOWN = Identity()  # of a run whose map and flight are not stated
 
 
 def result_to_json(result: ViewResult) -> str:
@@ -177,15 +173,22 @@ def result_from_json(line: str) -> ViewResult:
     except (ValueError, RecursionError) as error:
         raise FlightError(f"not a JSON object, cut off or damaged? ({error})") from error
     if not isinstance(values, dict):
-        raise FlightError(f"expected a JSON object, got {_kind(values)}")
-    return ViewResult(
-        frame=_text(values, "frame"),
-        time_ns=_time_ns(values),
-        outcome=_outcome(values),
-        latency_ms=_number(values, "latency_ms"),
-        state=_state(values),
-        accepted=_accepted(values),
-    )
+        raise FlightError(f"expected a JSON object, got {values!r:.40}")
+    state, confident = values.get("state"), values.get("confident")
+    try:
+        _checked(values, "state", f"one of {STATES}", state is None or state in STATES)
+        is_mark = confident is None or isinstance(confident, bool)
+        _checked(values, "confident", "true or false", is_mark)
+        return ViewResult(
+            frame=_checked(values, "frame", "text", isinstance(values["frame"], str)),
+            time_ns=_time_ns(values),
+            outcome=_outcome(values),
+            latency_ms=_number(values, "latency_ms"),
+            state=state,
+            accepted=confident,
+        )
+    except KeyError as error:
+        raise FlightError(f"key {error.args[0]} is missing") from error
 
 
 def write_results(path: Path, results: Iterable[ViewResult], identity: Identity = UNKNOWN) -> None:
@@ -271,54 +274,38 @@ def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
     return [[_or_none(value) for value in row] for row in cov]
 
 
-def _state(values: Mapping[str, Any]) -> str | None:
-    state = values.get("state")
-    if state is not None and state not in STATES:
-        raise FlightError(f"state: expected one of {', '.join(STATES)}, got {state!r:.40}")
-    return state
-
-
-def _accepted(values: Mapping[str, Any]) -> bool | None:
-    """Whether a fix is marked as confident; None in files of earlier versions, without the mark."""
-    confident = values.get("confident")
-    if confident is not None and not isinstance(confident, bool):
-        raise FlightError(f"confident: expected true or false, got {_kind(confident)}")
-    return confident
-
-
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
-    status = _text(values, "status")
-    evidence = _evidence(values)
+    status, evidence = values["status"], values["evidence"]
+    _checked(values, "evidence", "an object", isinstance(evidence, dict))
+    evidence = MappingProxyType(
+        {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
+    )
     if status == "no_fix":
-        detail = "" if values.get("detail") is None else _text(values, "detail")
-        return NoFix(reason=_text(values, "reason"), detail=detail, evidence=evidence)
-    if status != "fix":
-        raise FlightError(f"status: expected 'fix' or 'no_fix', got {status!r:.40}")
+        reason = _checked(values, "reason", "text", isinstance(values["reason"], str))
+        return NoFix(reason=reason, detail=str(values.get("detail") or ""), evidence=evidence)
+    _checked(values, "status", "'fix' or 'no_fix'", status == "fix")
     confidence = _number(values, "confidence")
-    if not (math.isnan(confidence) or 0.0 <= confidence <= 1.0):
-        raise FlightError(f"confidence: expected 0 to 1, got {confidence:g}")
+    _checked(values, "confidence", "0 to 1", math.isnan(confidence) or 0.0 <= confidence <= 1.0)
+    ground = None
+    if GROUND_KEYS[0] in values:
+        ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
     return Fix(
         lat_deg=_angle(values, "lat_deg", 90.0),
         lon_deg=_angle(values, "lon_deg", 180.0),
-        cov_en_m2=_covariance(values, "cov_en_m2"),
+        cov_en_m2=_numbers(values, "cov_en_m2", (2, 2), [[None] * 2] * 2),
         confidence=confidence,
         radius_m=_number(values, "radius_m"),
         heading_deg=_number(values, "heading_deg"),
         agl_m=_number(values, "agl_m"),
         evidence=evidence,
-        ground_latlon_deg=_ground(values),
-        ground_cov_en_m2=_known_covariance(values, GROUND_KEYS[2]),
+        ground_latlon_deg=ground,
+        ground_cov_en_m2=_numbers(values, GROUND_KEYS[2], (2, 2))
+        if values.get(GROUND_KEYS[2]) is not None
+        else None,
         pitch_deg=_number(values, "pitch_deg") if "pitch_deg" in values else math.nan,
         roll_deg=_number(values, "roll_deg") if "roll_deg" in values else math.nan,
-        pose_cov=_pose_covariance(values),
+        pose_cov=_pose_covariance(values) if values.get(POSE_KEYS[2]) is not None else None,
     )
-
-
-def _ground(values: Mapping[str, Any]) -> tuple[float, float] | None:
-    """What the middle of the picture shows; None where a line does not say."""
-    if GROUND_KEYS[0] not in values:
-        return None
-    return _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
 
 
 def _seconds(time_ns: int) -> str:
@@ -329,8 +316,7 @@ def _seconds(time_ns: int) -> str:
 
 def _time_ns(values: Mapping[str, Any]) -> int:
     seconds = _number(values, "time_s")
-    if not abs(seconds) < _TIME_LIMIT_S:  # NaN too
-        raise FlightError(f"time_s: expected seconds that fit 64 bits of ns, got {seconds:g}")
+    _checked(values, "time_s", "seconds that fit 64 bits of ns", abs(seconds) < _TIME_LIMIT_S)
     return int(Decimal(values["time_s"]).scaleb(9).to_integral_value())
 
 
@@ -339,93 +325,57 @@ def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _value(values: Mapping[str, Any], key: str) -> Any:
-    if key not in values:
-        raise FlightError(f"key {key} is missing")
-    return values[key]
-
-
-def _text(values: Mapping[str, Any], key: str) -> str:
-    value = _value(values, key)
-    if not isinstance(value, str):
-        raise FlightError(f"{key}: expected text, got {_kind(value)}")
-    return value
+def _checked(values: Mapping[str, Any], key: str, expected: str, sound: bool) -> Any:
+    if not sound:
+        raise FlightError(f"{key}: expected {expected}, got {values[key]!r:.40}")
+    return values.get(key)
 
 
 def _number(values: Mapping[str, Any], key: str) -> float:
-    return _as_float(_value(values, key), key)
+    return _as_float(values[key], key)
 
 
 def _as_float(value: Any, name: str) -> float:
     if value is None:
         return math.nan
-    if isinstance(value, bool) or not isinstance(value, int | Decimal):
-        raise FlightError(f"{name}: expected a number or null, got {_kind(value)}")
     try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
+        number = math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, OverflowError):
+        number = math.nan
     if not math.isfinite(number):
-        raise FlightError(f"{name}: expected a finite number or null, got one beyond float64")
+        raise FlightError(f"{name}: expected a finite number or null, got {value!r:.40}")
     return number
 
 
 def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
-    angle = _number(values, key)
-    if not abs(angle) <= limit_deg:  # NaN too: a fix has a position
-        raise FlightError(f"{key}: a fix needs -{limit_deg:g} to {limit_deg:g}, got {angle:g}")
+    angle = _number(values, key)  # not NaN: a fix has a position
+    _checked(values, key, f"-{limit_deg:g} to {limit_deg:g}", abs(angle) <= limit_deg)
     return angle
 
 
-def _covariance(values: Mapping[str, Any], key: str) -> NDArray[np.float64]:
-    rows = _value(values, key)
-    if rows is None:
-        rows = [[None, None], [None, None]]
-    if not isinstance(rows, list) or [_length(row) for row in rows] != [2, 2]:
-        raise FlightError(f"{key}: expected two rows of two numbers")
-    cov = np.array([[_as_float(value, key) for value in row] for row in rows])
-    cov.setflags(write=False)
-    return cov
+def _numbers(
+    values: Mapping[str, Any], key: str, shape: tuple[int, ...], otherwise: Any = None
+) -> NDArray[np.float64]:
+    """The numbers of a list, or of a list of lists, of this shape; NaN for null."""
+    rows = otherwise if values[key] is None else values[key]
+    flat = rows if isinstance(rows, list) else []
+    if len(shape) == 2:
+        sound = [len(row) if isinstance(row, list) else 0 for row in flat] == [shape[1]] * shape[0]
+        flat = list(chain.from_iterable(flat)) if sound else []
+    _checked(values, key, f"numbers in lists of {shape}", len(flat) == math.prod(shape))
+    numbers = np.array([_as_float(value, key) for value in flat]).reshape(shape)
+    numbers.setflags(write=False)
+    return numbers
 
 
-def _known_covariance(values: Mapping[str, Any], key: str) -> NDArray[np.float64] | None:
-    """The same; None where a line does not say."""
-    return None if values.get(key) is None else _covariance(values, key)
-
-
-def _pose_covariance(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """The covariance (6, 6) of the camera; None where a line does not say."""
-    key = POSE_KEYS[2]
-    numbers = values.get(key)
-    if numbers is None:
-        return None
-    if _length(numbers) != 21:
-        raise FlightError(f"{key}: expected null or 21 numbers")
-    upper = np.array([_as_float(value, key) for value in numbers])
-    if np.isnan(upper).any():
-        raise FlightError(f"{key}: expected 21 numbers, got null among them")
+def _pose_covariance(values: Mapping[str, Any]) -> NDArray[np.float64]:
+    upper = _numbers(values, POSE_KEYS[2], (21,))
+    _checked(values, POSE_KEYS[2], "21 numbers", not np.isnan(upper).any())
     cov = np.zeros((6, 6))
     cov[np.triu_indices(6)] = upper
     cov += np.triu(cov, 1).T
     cov.setflags(write=False)
     return cov
-
-
-def _length(row: Any) -> int:
-    return len(row) if isinstance(row, list) else -1
-
-
-def _evidence(values: Mapping[str, Any]) -> Evidence:
-    evidence = _value(values, "evidence")
-    if not isinstance(evidence, dict):
-        raise FlightError(f"evidence: expected an object, got {_kind(evidence)}")
-    named = {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
-    return MappingProxyType(named)
-
-
-def _kind(value: Any) -> str:
-    names = {dict: "an object", list: "a list", str: "text", bool: "true or false"}
-    return "null" if value is None else names.get(type(value), "a number")
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -31,8 +31,7 @@ MISMATCH_M = 20.0
 and positions of take-off explain less, a wrong datum more."""
 LARGEST_STD_M = 10_000.0
 """A position with a larger standard deviation is unknown: a map is at most 50 km across."""
-MIN_VIEWS = 20
-"""Fewer confident views say nothing about the terrain."""
+MIN_VIEWS = 20  # fewer confident views say nothing about the terrain
 OFF_M = 25.0
 """Heights by the views and by the terrain that differ by more on the whole are named: barometers
 explain less, a wrong datum more."""
@@ -40,12 +39,9 @@ SPREAD_M, SPREAD_SHARE = 3.0, 0.02
 """So is a difference whose robust standard deviation is more, in metres and as a share of the
 height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
 (`benchmarks.terrain_flight` at d63ac91)."""
-MAX_VIEWS = 2000
-"""Only so many of the latest confident views are kept."""
-HOLES_SHARE = 0.1
-"""So are holes below more than this share of the confident views."""
-_LOST = ("searching", "lost")
-"""States of a track that has no position."""
+MAX_VIEWS = 2000  # only so many of the latest confident views are kept
+HOLES_SHARE = 0.1  # so are holes below more than this share of the confident views
+_LOST = ("searching", "lost")  # states of a track that has no position
 log = logging.getLogger(__name__)
 
 
@@ -149,9 +145,7 @@ class FlownHeights:
         longitude and standard deviation (m) of the take-off position."""
         self._terrain, self._area_deg = terrain, area_deg
         self._use_prior = use_prior
-        known = None
-        if take_off is not None:
-            known = ground_around(terrain, take_off[:2], take_off[2])
+        known = take_off and ground_around(terrain, take_off[:2], take_off[2])
         self._heights = GroundHeights(terrain, known or self._whole, geoid)
         self._checked = known is None
         self._last: tuple[int, Place, float] | None = None
@@ -162,14 +156,17 @@ class FlownHeights:
         the terrain does not give it: level ground is not assumed."""
         if is_measured(telemetry):
             return telemetry
-        self._check(telemetry)
+        off_m = math.nan if self._checked else self._heights.mismatch_m(telemetry)
+        if math.isfinite(off_m):
+            self._checked = True
+            warn_of_mismatch(off_m)
         self._newest = telemetry
         place, std_m = self._place(telemetry)
         below = None if place is None else ground_around(self._terrain, place, std_m)
         below = below or self._whole
-        made = telemetry
-        if below is not None:
-            made = self._heights.above(telemetry, below, place or self._middle)
+        lat, lon = self._area_deg
+        middle = float(lat.mean()), float(lon.mean())
+        made = (below and self._heights.above(telemetry, below, place or middle)) or telemetry
         return replace(telemetry, agl_m=math.nan) if made is telemetry else made
 
     def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
@@ -195,7 +192,6 @@ class FlownHeights:
         return math.nan if below is None else below.height_m
 
     def _place(self, telemetry: Telemetry) -> tuple[Place | None, float]:
-        """Expected position and its standard deviation per axis."""
         found: list[tuple[float, Place | None]] = []
         prior = telemetry.prior if self._use_prior else None
         if prior is not None:
@@ -205,21 +201,9 @@ class FlownHeights:
         std_m, place = min(found, default=(math.inf, None))
         return (place, std_m) if std_m <= LARGEST_STD_M else (None, math.inf)
 
-    def _check(self, telemetry: Telemetry) -> None:
-        """Warn once where heights above sea and above take-off disagree over the terrain."""
-        off_m = math.nan if self._checked else self._heights.mismatch_m(telemetry)
-        if math.isfinite(off_m):
-            self._checked = True
-            warn_of_mismatch(off_m)
-
     @cached_property
     def _whole(self) -> Ground | None:
         return ground_over(self._terrain, *self._area_deg)
-
-    @property
-    def _middle(self) -> Place:
-        lat, lon = self._area_deg
-        return float(lat.mean()), float(lon.mean())
 
 
 def _aged(time_ns: int, place: Place, std_m: float, telemetry: Telemetry) -> tuple[float, Place]:

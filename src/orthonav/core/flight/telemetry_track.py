@@ -17,10 +17,8 @@ from orthonav.core.records import Prior, Telemetry
 Array = NDArray[np.float64]
 DAY_NS = 86_400 * 10**9
 """Samples farther than this from the median time are damaged, or of a clock that was not set."""
-LATEST_NS = 2**62
-"""Latest valid time (the year 2116): leaves room for offsets in 64 bits."""
-GAP_NS = 2_000_000_000
-"""Longest gap that is interpolated: an aircraft may turn and climb meanwhile."""
+LATEST_NS = 2**62  # latest valid time (the year 2116): leaves room for offsets in 64 bits
+GAP_NS = 2_000_000_000  # longest gap that is interpolated: an aircraft may turn and climb meanwhile
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +142,6 @@ def altitude_series(position: TimeSeries | None) -> TimeSeries | None:
 def _sorted(
     time_ns: NDArray[np.int64], values: Array, sound: NDArray[np.bool_]
 ) -> TimeSeries | None:
-    """A series of the valid samples within a day of their median time."""
     if not sound.any():
         return None
     near = np.abs(time_ns - np.median(time_ns[sound])) < DAY_NS
@@ -160,30 +157,21 @@ class RecordedTrack:
     """Quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known."""
     heights: tuple[TimeSeries, ...] = ()
     """Metres above ground, as measured; of several series the more accurate first."""
-    home: TimeSeries | None = None
-    """Metres above the place of take-off."""
-    amsl: TimeSeries | None = None
-    """Metres above mean sea level."""
-    hae: TimeSeries | None = None
-    """Metres above the ellipsoid of WGS 84."""
+    home: TimeSeries | None = None  # metres above the place of take-off
+    amsl: TimeSeries | None = None  # metres above mean sea level
+    hae: TimeSeries | None = None  # metres above the ellipsoid of WGS 84
     position: TimeSeries | None = None
     """Latitude and longitude in degrees, and the altitude in metres, whose reference differs."""
-    velocity: TimeSeries | None = None
-    """East and north, m/s."""
-    yaw_std: TimeSeries | None = None
-    """Reported standard deviation of the heading, degrees."""
-    agl_std: TimeSeries | None = None
-    """Reported standard deviation of the height, metres."""
-    tilt_std: TimeSeries | None = None
-    """Reported standard deviation of pitch and roll, degrees."""
+    velocity: TimeSeries | None = None  # east and north, m/s
+    yaw_std: TimeSeries | None = None  # reported standard deviation of the heading, degrees
+    agl_std: TimeSeries | None = None  # reported standard deviation of the height, metres
+    tilt_std: TimeSeries | None = None  # reported standard deviation of pitch and roll, degrees
     tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
     """The same by the kind of the source, where none was reported."""
     prior: TimeSeries | None = None
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
-    origin_ns: int = 0
-    """Time at which a recording without a clock begins."""
-    warnings: tuple[str, ...] = ()
-    """Doubts about the log, for people."""
+    origin_ns: int = 0  # time at which a recording without a clock begins
+    warnings: tuple[str, ...] = ()  # doubts about the log, for people
 
     @cached_property
     def altitude(self) -> TimeSeries | None:

@@ -8,8 +8,7 @@ positive roll makes it look left.
 
 Lenses in the camera plane, as OpenCV writes them. Brown (1966), "Decentering distortion of lenses":
 three radial and two tangential numbers. Fisheye: Kannala and Brandt (2006), "A generic camera model
-and calibration method", with four numbers of the angle off the optical axis.
-"""
+and calibration method", with four numbers of the angle off the optical axis."""
 
 import math
 from collections.abc import Sequence
@@ -25,12 +24,10 @@ from orthonav.core.errors import CameraError
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
-FOV_STD = 0.05
-"""Of a focal length by a stated field of view, as a share of it."""
+FOV_STD = 0.05  # of the focal length by a stated field of view, relative
 _STEPS = 50
 _CLOSE = 1e-9
 _EXACT = 1e-14
-"""Largest step at which the iteration of all points has converged."""
 _BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
 _HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 _BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -45,8 +42,7 @@ class Camera:
     (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
-    for a calibrated camera. Raises `CameraError` on values no camera has.
-    """
+    for a calibrated camera. Raises `CameraError` on values no camera has."""
 
     width_px: int
     height_px: int
@@ -86,8 +82,7 @@ class Camera:
     def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
         """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
 
-        Stated fields of view are often those of the lens or of another mode: good to 5 %.
-        """
+        Stated fields of view are often those of the lens or of another mode: good to 5 %."""
         if not 0 < fov_deg < 180:
             raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
         focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
@@ -104,8 +99,7 @@ class Camera:
     ) -> "Camera":
         """A camera by the matrix (3, 3) and the distortion of OpenCV's calibration.
 
-        `size_px`: width and height of the images that it was calibrated with.
-        """
+        `size_px`: width and height of the images that it was calibrated with."""
         k = np.asarray(matrix, np.float64)
         if k.shape != (3, 3):
             raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
@@ -118,25 +112,23 @@ class Camera:
     def from_file(cls, path: Path | str) -> "Camera":
         """The camera of a `flight.json`, or of a calibration of OpenCV, ROS or Kalibr.
 
-        Raises `MissingFileError`, `CameraError` or `MissingExtraError`.
-        """
+        Raises `MissingFileError`, `CameraError` or `MissingExtraError`."""
         from orthonav.core.geo.camera_files import read_camera_file  # the readers make cameras
 
         return read_camera_file(Path(path))
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether straight lines stay straight, so that one homography does it."""
         return self.model == "brown" and not self.distortion
 
     @property
     def matrix(self) -> Array:
-        """`px_from_camera`, (3, 3): pixel-is-area coordinates from camera axes, no distortion."""
+        """`px_from_camera`, (3, 3), without distortion."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of what it sees straight ahead, in metres for each metre away."""
+        """Width and height seen straight ahead, per metre of distance."""
         return self.width_px / self.fx_px, self.height_px / self.fy_px
 
     def gsd_m(self, agl_m: float) -> float:
@@ -147,8 +139,7 @@ class Camera:
         """The camera for images of this size.
 
         Raises `CameraError` where the aspect ratio differs: then the image is an unknown crop, not
-        a scaled version of the same view.
-        """
+        a scaled version of the same view."""
         if (self.width_px, self.height_px) == (width_px, height_px):
             return self
         apart = abs(self.height_px * width_px - height_px * self.width_px)
@@ -175,7 +166,7 @@ class Camera:
 
 @lru_cache(maxsize=64)
 def enu_from_camera(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
-    """Rotation (3, 3) from camera axes to east, north, up; not to be written to."""
+    """Rotation (3, 3), shared: not to be written to."""
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     ned_from_body = _rotation(2, yaw) @ _rotation(1, pitch) @ _rotation(0, roll)
     rotation = np.asarray(_ENU_FROM_NED @ ned_from_body @ _BODY_FROM_CAMERA)
@@ -184,11 +175,9 @@ def enu_from_camera(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
 
 
 def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
-    """Heading (0..360), pitch and roll in degrees of a rotation (3, 3) from camera axes.
+    """Heading (0..360), pitch and roll in degrees: the inverse of `enu_from_camera`.
 
-    The inverse of `enu_from_camera`. At a pitch of 90 or -90 only the sum or the difference of
-    heading and roll is determined; the roll is then 0.
-    """
+    At a pitch of +-90 only heading plus or minus roll is determined; the roll is then 0."""
     ned_from_body = _ENU_FROM_NED.T @ enu_from_camera @ _BODY_FROM_CAMERA.T
     pitch = math.asin(min(1.0, max(-1.0, -ned_from_body[2, 0])))
     if math.hypot(ned_from_body[0, 0], ned_from_body[1, 0]) < 1e-9:
@@ -200,7 +189,6 @@ def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
 
 
 def _rotation(axis: int, angle_rad: float) -> Array:
-    """Right-handed rotation (3, 3) about coordinate axis 0, 1 or 2."""
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     first, second = [i for i in range(3) if i != axis]
     rotation = np.eye(3)
@@ -211,30 +199,20 @@ def _rotation(axis: int, angle_rad: float) -> Array:
 
 
 def camera_from_en(yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float) -> Array:
-    """Homography (3, 3) from flat ground to camera axes.
-
-    Takes ground points (east, north, 1) in metres from the point below the camera; gives camera
-    axes up to scale, the third positive in front of the camera.
-    """
+    """Homography (3, 3) to camera axes from flat ground (east, north, 1), m from below it."""
     ground = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -agl_m]])
     return np.asarray(enu_from_camera(yaw_deg, pitch_deg, roll_deg).T @ ground)
 
 
 def counted_from_centres(homography: Array) -> Array:
-    """A homography (3, 3) between pixel-is-area pictures, as OpenCV wants it.
-
-    Ours counts from the outer corner of the first pixel, OpenCV from its centre.
-    """
+    """A pixel-is-area homography (3, 3) for OpenCV, which counts from the first pixel's centre."""
     return np.asarray(np.linalg.inv(_HALF_PIXEL) @ homography @ _HALF_PIXEL)
 
 
 def axis_on_ground_en_m(
     yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> tuple[float, float]:
-    """Where the optical axis meets flat ground, metres east and north of the camera.
-
-    Infinite where the axis points at or above the horizon.
-    """
+    """Where the optical axis meets flat ground, m from below; infinite at or above the horizon."""
     axis = enu_from_camera(yaw_deg, pitch_deg, roll_deg)[:, 2]
     if axis[2] >= -1e-9:
         return math.inf, math.inf
@@ -243,10 +221,7 @@ def axis_on_ground_en_m(
 
 
 def distort(camera: Camera, xy: Array) -> Array:
-    """Distorted camera-plane coordinates `(..., 2)` of ideal ones, as OpenCV's models give them.
-
-    Points beyond the radius where the model stops growing (it folds back there) become NaN.
-    """
+    """Distorted camera-plane coordinates `(..., 2)`; NaN where the model folds back."""
     if camera.is_pinhole:
         return xy
     if camera.model == "fisheye":
@@ -255,10 +230,7 @@ def distort(camera: Camera, xy: Array) -> Array:
 
 
 def undistort(camera: Camera, xy: Array) -> Array:
-    """Ideal camera-plane coordinates `(..., 2)` of distorted ones: the inverse of `distort`.
-
-    Points that no ideal point is distorted to become NaN.
-    """
+    """The inverse of `distort`; NaN where there is none."""
     if camera.is_pinhole:
         return xy
     if camera.model == "fisheye":
@@ -277,11 +249,9 @@ def seen_px(camera: Camera, rays: Array) -> Array:
 def footprint_en_m(
     camera: Camera, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> Array:
-    """Ground positions (4, 2) of the image corners, metres from the point below the camera.
+    """Ground positions (4, 2), m from below the camera, of the corners clockwise from top left.
 
-    Order: top left, top right, bottom right, bottom left; distortion is left out. Raises
-    `CameraError` where a corner looks at or above the horizon.
-    """
+    Without distortion. Raises `CameraError` where a corner looks at or above the horizon."""
     corners = np.array(
         [
             [0, 0, 1.0],
@@ -300,18 +270,12 @@ def footprint_en_m(
 def ground_en_m(
     camera: Camera, px: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> Array:
-    """Where image points (N, 2) lie on flat ground (N, 2), metres from the point below the camera.
-
-    NaN where a point looks at or above the horizon, or where the lens cannot be undone.
-    """
+    """Flat ground (N, 2), m from below the camera, at image points (N, 2); NaN above it."""
     return met_by_rays_en_m(camera_rays(camera, px), yaw_deg, pitch_deg, roll_deg, agl_m)
 
 
 def camera_rays(camera: Camera, px: Array) -> Array:
-    """Rays (N, 3) in camera axes, 1 along the optical axis, through image points (N, 2).
-
-    NaN where the lens cannot be undone.
-    """
+    """Rays (N, 3), 1 along the optical axis, of image points (N, 2); NaN beyond the lens model."""
     plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
     return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
 
@@ -319,17 +283,13 @@ def camera_rays(camera: Camera, px: Array) -> Array:
 def met_by_rays_en_m(
     rays: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> Array:
-    """Where rays (N, 3) in camera axes meet flat ground (N, 2), metres from the point below.
-
-    NaN where a ray points at or above the horizon.
-    """
+    """Flat ground (N, 2), m from below the camera; NaN for rays at or above the horizon."""
     enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
     down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
     return np.asarray(enu[:, :2] * (agl_m / down))
 
 
 def _brown_distort(distortion: tuple[float, ...], xy: Array) -> Array:
-    """Distorted points (..., 2) of ideal ones; NaN from the radius where the model folds back."""
     k1, k2, _, _, k3 = (*distortion, 0.0)[:5]
     out, r2 = _brown(distortion, xy), (xy**2).sum(axis=-1)
     out[r2 >= _fold_r2(k1, k2, k3)] = np.nan
@@ -337,7 +297,7 @@ def _brown_distort(distortion: tuple[float, ...], xy: Array) -> Array:
 
 
 def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
-    """Ideal points (..., 2) of distorted ones, by Newton's method; NaN if there is none."""
+    """By Newton's method; NaN if there is none."""
     k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
     ideal = np.array(xy, dtype=np.float64)
     with np.errstate(all="ignore"):
@@ -367,7 +327,6 @@ def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
 
 
 def _fisheye_distort(distortion: tuple[float, ...], xy: Array) -> Array:
-    """Distorted points (..., 2) of ideal ones; NaN from the angle where the model folds back."""
     radius = np.hypot(xy[..., 0], xy[..., 1])
     angle = np.arctan(radius)
     polynomial = _angles(distortion)
@@ -378,7 +337,6 @@ def _fisheye_distort(distortion: tuple[float, ...], xy: Array) -> Array:
 
 
 def _fisheye_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
-    """Ideal points (..., 2) of distorted ones; NaN if there is none in front of the camera."""
     radius = np.hypot(xy[..., 0], xy[..., 1])
     polynomial = _angles(distortion)
     slope, end = polynomial.deriv(), min(_fold_angle(polynomial), math.pi / 2)
@@ -413,20 +371,19 @@ def _brown(distortion: tuple[float, ...], xy: Array) -> Array:
 
 @lru_cache(maxsize=16)
 def _fold_r2(k1: float, k2: float, k3: float) -> float:
-    """Squared radius at which the radial model stops growing; infinite if it never does."""
+    """Squared radius at which the radial model stops growing, or infinity."""
     inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # of 1 / r2: the leading 1 keeps it sound
     largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)
     return float(1 / largest) if largest > 1e-12 else math.inf
 
 
 def _angles(distortion: tuple[float, ...]) -> np.polynomial.Polynomial:
-    """Distance from the image centre as a polynomial of the angle from the optical axis."""
+    """Image radius as a polynomial of the angle from the optical axis."""
     k1, k2, k3, k4 = distortion or (0.0,) * 4
     return np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
 
 
 def _fold_angle(polynomial: np.polynomial.Polynomial) -> float:
-    """Angle in radians at which the fisheye model stops growing; infinite if it never does."""
     _, k1, k2, k3, k4 = polynomial.coef[1::2]
     inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])  # of 1 / angle squared, as above
     largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)

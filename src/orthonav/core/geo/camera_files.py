@@ -1,8 +1,4 @@
-"""Camera files of other programs.
-
-OpenCV, ROS and Kalibr measure the principal point from the centre of the first pixel, orthonav
-from its outer corner, which adds half a pixel.
-"""
+"""Camera files of other programs: OpenCV, ROS and Kalibr count from the first pixel's centre."""
 
 import json
 import re
@@ -45,8 +41,7 @@ def read_camera_file(path: Path) -> Camera:
     """The camera of a `flight.json`, or of a file of OpenCV (YAML, JSON), ROS or Kalibr (YAML).
 
     `FILE#cam1` selects one camera of a Kalibr chain. Raises `MissingFileError`, `CameraError` or
-    `MissingExtraError`.
-    """
+    `MissingExtraError`."""
     path, name = _name_apart(Path(path))
     path = require_file(path, "camera file")
     if path.stat().st_size > MAX_BYTES:
@@ -81,10 +76,6 @@ def read_camera_file(path: Path) -> Camera:
 def camera_from_numbers(
     size_px: Sequence[int], matrix: Sequence[float], distortion: Sequence[float], model: str
 ) -> Camera:
-    """A camera from width and height, fx, fy, cx, cy in OpenCV's convention, and a model's name.
-
-    Raises `CameraError` for models that orthonav does not have.
-    """
     fx, fy, cx, cy = (float(number) for number in matrix)
     numbers = tuple(float(number) for number in distortion)
     if model in _FISHEYE:
@@ -111,11 +102,7 @@ def _yaml(text: str) -> Any:
 
 
 def _check_events(yaml: Any, text: str) -> None:
-    """Raises `CameraError` for YAML that could exhaust memory or time, before it is built.
-
-    Aliases of aliases expand exponentially, nesting recurses as deep as the stack, and numbers
-    with colons take time with the square of their length.
-    """
+    """Refuses YAML whose aliases, nesting or numbers with colons could exhaust memory or time."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
         if getattr(event, "anchor", None) is not None:
@@ -139,7 +126,6 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
 
 
 def _plain(plain: Any, name: str | None = None) -> Camera:
-    """A camera of ROS or Kalibr; of several the one of that name."""
     if not isinstance(plain, Mapping):
         raise TypeError(f"a mapping was expected, got {type(plain).__name__}")
     cameras = [name for name in plain if str(name).startswith("cam") and str(name)[3:].isdecimal()]

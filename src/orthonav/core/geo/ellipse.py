@@ -5,17 +5,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-_ROUNDING = 1e-9
-"""Negative eigenvalues up to this share of the largest one are rounding errors."""
+_ROUNDING = 1e-9  # negative eigenvalues up to this share of the largest are rounding errors
 
 
 def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:
-    """One-sigma error ellipse of a (2, 2) covariance of east and north.
+    """Semi-major and semi-minor axis (1 sigma), and direction of the major one, 0..180 deg from
+    north.
 
-    Returns the semi-major and the semi-minor axis (square root of the unit of the covariance) and
-    the direction of the major axis in degrees clockwise from north, 0 to 180. All are NaN where the
-    covariance is not finite or has a negative eigenvalue.
-    """
+    NaN where the (2, 2) covariance is not finite or has a negative eigenvalue."""
     cov = np.asarray(cov_en, dtype=np.float64)
     if not np.isfinite(cov).all():
         return math.nan, math.nan, math.nan

@@ -1,12 +1,9 @@
 """The local plane of a sheet: azimuthal-equidistant on WGS84, in closed form.
 
-The plane keeps true distance and true azimuth from its centre, like GDAL's
-`+proj=aeqd +lat_0=.. +lon_0=.. +datum=WGS84`. That projection is defined by geodesics; here the
-geodesic is replaced by the chord of the normal section through the centre, which differs by less
-than 1.5 mm within 36 km of it (the corner of the largest sheet), so no iteration is needed.
-Sources: Bomford, *Geodesy*, 4th ed., section 2.1 (normal sections, chord and arc); Bowring (1976),
-"Transformation from spatial to geographical coordinates" (inverse).
-"""
+Like GDAL's `+proj=aeqd +lat_0=.. +lon_0=.. +datum=WGS84`, but by the chord of the normal section
+instead of the geodesic: within 36 km of the centre they differ by less than 1.5 mm.
+Sources: Bomford, *Geodesy*, 4th ed., section 2.1; Bowring (1976), "Transformation from spatial to
+geographical coordinates" (inverse)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,8 +17,7 @@ from orthonav.core.geo.swapped import swapped_hint
 WGS84_A_M = 6378137.0
 WGS84_F = 1 / 298.257223563
 WGS84_E2 = WGS84_F * (2 - WGS84_F)
-MAX_SHEET_M = 50_000.0
-"""Largest extent of a sheet; the plane is then accurate to millimetres."""
+MAX_SHEET_M = 50_000.0  # largest extent of a sheet: accurate to millimetres
 
 Array = NDArray[np.float64]
 
@@ -30,8 +26,7 @@ Array = NDArray[np.float64]
 class LocalFrame:
     """A local plane `(east_m, north_m)` centred on `lat_deg, lon_deg` (WGS84).
 
-    Raises `AreaError` where the centre is not a place on Earth or lies within 0.1 deg of a pole.
-    """
+    Raises `AreaError` for a centre that is no place on Earth or within 0.1 deg of a pole."""
 
     lat_deg: float
     lon_deg: float
@@ -46,7 +41,6 @@ class LocalFrame:
 
     @property
     def proj4(self) -> str:
-        """The same plane for PROJ and GDAL."""
         return (
             f"+proj=aeqd +lat_0={float(self.lat_deg)!r} +lon_0={float(self.lon_deg)!r} "
             "+datum=WGS84 +units=m +no_defs"
@@ -54,7 +48,6 @@ class LocalFrame:
 
     @property
     def wkt(self) -> str:
-        """The same plane in well-known text (WKT 1), for files beside images."""
         return (
             'PROJCS["sheet of an orthonav map",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",'
             f"{WGS84_A_M:.0f},{1 / WGS84_F:.9f}]],PRIMEM["
@@ -65,11 +58,7 @@ class LocalFrame:
         )
 
     def en_from_latlon(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
-        """Local `(..., 2)` east and north in metres of latitudes and longitudes of shape `(...)`.
-
-        Accurate within `MAX_SHEET_M` of the centre; farther away errors grow with the cube of
-        the distance (about 0.2 m at 300 km), which is harmless for telling "outside" from "inside".
-        """
+        """Local `(..., 2)`; beyond `MAX_SHEET_M` errors grow with the cube (0.2 m at 300 km)."""
         lat = np.radians(np.asarray(lat_deg, dtype=np.float64))
         lon = np.radians(np.asarray(lon_deg, dtype=np.float64))
         enu = (_ecef(lat, lon) - self._origin_ecef) @ self._enu_from_ecef.T
@@ -81,7 +70,7 @@ class LocalFrame:
         return np.stack([distance * np.sin(azimuth), distance * np.cos(azimuth)], axis=-1)
 
     def latlon_from_en(self, positions_en_m: ArrayLike) -> tuple[Array, Array]:
-        """Latitudes and longitudes (deg, longitude in -180..180) of local `(..., 2)` positions."""
+        """Degrees, longitude in -180..180, of local `(..., 2)`."""
         positions = np.asarray(positions_en_m, dtype=np.float64)
         east, north = positions[..., 0], positions[..., 1]
         distance = np.hypot(east, north)
@@ -96,7 +85,7 @@ class LocalFrame:
         return _latlon_from_ecef(enu @ self._enu_from_ecef + self._origin_ecef)
 
     def _section_radius_m(self, azimuth: Array) -> Array:
-        """Radius of curvature of the normal section at `azimuth` (Euler's formula)."""
+        """Euler's formula."""
         sin2 = np.sin(np.radians(self.lat_deg)) ** 2
         prime = WGS84_A_M / np.sqrt(1 - WGS84_E2 * sin2)
         meridian = prime * (1 - WGS84_E2) / (1 - WGS84_E2 * sin2)
@@ -121,11 +110,7 @@ class LocalFrame:
 
 
 def distances_m(from_latlon_deg: ArrayLike, to_latlon_deg: ArrayLike) -> Array:
-    """Distances (N,) in metres between places (N, 2) in degrees, along the ellipsoid.
-
-    The chord turned into the arc of a normal section at the middle latitude: right to a millionth
-    up to 300 km, to a few thousandths up to some 5,000 km.
-    """
+    """(N,) between places (N, 2) in degrees: right to 1e-6 up to 300 km, to 0.5 % beyond."""
     start = np.radians(np.asarray(from_latlon_deg, dtype=np.float64).reshape(-1, 2))
     end = np.radians(np.asarray(to_latlon_deg, dtype=np.float64).reshape(-1, 2))
     chord = _ecef(end[:, 0], end[:, 1]) - _ecef(start[:, 0], start[:, 1])
@@ -141,7 +126,6 @@ def distances_m(from_latlon_deg: ArrayLike, to_latlon_deg: ArrayLike) -> Array:
 
 
 def _ecef(lat: ArrayLike, lon: ArrayLike) -> Array:
-    """Earth-centred `(..., 3)` metres of a point on the ellipsoid, angles in radians."""
     lat, lon = np.asarray(lat, dtype=np.float64), np.asarray(lon, dtype=np.float64)
     prime = WGS84_A_M / np.sqrt(1 - WGS84_E2 * np.sin(lat) ** 2)
     return np.stack(
@@ -155,7 +139,7 @@ def _ecef(lat: ArrayLike, lon: ArrayLike) -> Array:
 
 
 def _latlon_from_ecef(ecef: Array) -> tuple[Array, Array]:
-    """Latitude and longitude in degrees of points near the ellipsoid (Bowring 1976)."""
+    """Bowring (1976)."""
     x, y, z = ecef[..., 0], ecef[..., 1], ecef[..., 2]
     polar_b = WGS84_A_M * (1 - WGS84_F)
     axis_distance = np.hypot(x, y)

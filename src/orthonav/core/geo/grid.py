@@ -15,11 +15,9 @@ MAX_TILE_PX = 4096
 class TileGrid:
     """Overlapping square tiles on the pixel raster of a sheet, north up.
 
-    The raster's outer north-west corner lies at `west_m, north_m` in the sheet; the tile of grid
-    row i and column j covers pixel rows `i * stride_px` to `i * stride_px + tile_px` (columns
-    alike). Every point of the extent it was made for lies within half a stride, per axis, of a
-    tile centre.
-    """
+    The raster's outer north-west corner lies at `west_m, north_m`; tile i, j starts at pixel row `i
+    * stride_px`, column `j * stride_px`. Every point of the extent lies within half a stride of a
+    tile centre, per axis."""
 
     west_m: float
     north_m: float
@@ -38,11 +36,7 @@ class TileGrid:
         tile_px: int,
         overlap: float,
     ) -> "TileGrid":
-        """Grid whose tile centres cover `extent_en_m` (west, south, east, north, metres).
-
-        `overlap` is the share of its width that a tile has in common with its neighbour.
-        Raises `AreaError` for impossible numbers or an empty extent.
-        """
+        """Over west, south, east, north (m); `overlap` of neighbours. Raises `AreaError`."""
         west, south, east, north = extent_en_m
         if not (np.isfinite(gsd_m) and gsd_m > 0):
             raise AreaError(f"ground resolution must be above 0 m per pixel, got {gsd_m}")
@@ -71,27 +65,23 @@ class TileGrid:
 
     @property
     def stride_m(self) -> float:
-        """Distance between neighbouring tile centres in metres."""
         return self.stride_px * self.gsd_m
 
     @property
     def tile_m(self) -> float:
-        """Width of a tile in metres."""
         return self.tile_px * self.gsd_m
 
     @property
     def width_px(self) -> int:
-        """Columns of the raster that all tiles together cover."""
         return (self.cols - 1) * self.stride_px + self.tile_px
 
     @property
     def height_px(self) -> int:
-        """Rows of the raster that all tiles together cover."""
         return (self.rows - 1) * self.stride_px + self.tile_px
 
     @property
     def extent_en_m(self) -> tuple[float, float, float, float]:
-        """West, south, east and north of that raster, metres in the sheet."""
+        """West, south, east, north."""
         return (
             self.west_m,
             self.north_m - self.height_px * self.gsd_m,
@@ -100,7 +90,7 @@ class TileGrid:
         )
 
     def tiles_rc(self, centres_en_m: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
-        """Grid rows and columns (N, 2) of tile centres (N, 2): inverse of `centres_en_m`."""
+        """Grid rows and columns (N, 2) of tile centres (N, 2)."""
         centres = np.asarray(centres_en_m, dtype=np.float64)
         half_m = self.tile_m / 2
         rows = (self.north_m - half_m - centres[:, 1]) / self.stride_m
@@ -109,7 +99,7 @@ class TileGrid:
             return np.rint(np.stack([rows, cols], axis=1)).astype(np.intp)
 
     def centres_en_m(self, tiles_rc: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Local `(N, 2)` centres in metres of tiles given as `(N, 2)` grid rows and columns."""
+        """Centres (N, 2) of grid rows and columns (N, 2)."""
         tiles = np.asarray(tiles_rc, dtype=np.float64)
         half_m = self.tile_m / 2
         return np.stack(

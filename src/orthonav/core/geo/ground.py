@@ -11,23 +11,17 @@ from orthonav.core.geo.frames import LocalFrame
 
 Array = NDArray[np.float64]
 TerrainHeights = Callable[[Array, Array], Array]
-"""Function of latitudes and longitudes (deg) of one shape: heights above mean sea level (m), NaN
-where they are unknown."""
+"""Of latitudes and longitudes (deg): heights above mean sea level (m), NaN where unknown."""
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Heights of the ground above mean sea level: the Dead Sea is at -430 m, Mount Everest at 8,849."""
+"""Heights above mean sea level: the Dead Sea is at -430 m, Mount Everest at 8,849."""
 SIGHT_STEPS = 512
-"""Points along a line of sight at which it is compared with the ground."""
 DEEPEST_M = 1000.0
 _RINGS = 5
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground below a position that is known to some metres.
-
-    `height_m`: its mean height above mean sea level. `std_m`: standard deviation of that height
-    over the possible positions. `known`: share of them whose height is known, above 0.
-    """
+    """Heights above mean sea level around a position; `known`: share above 0 that has one."""
 
     height_m: float
     std_m: float
@@ -35,7 +29,7 @@ class Ground:
 
 
 def ground_over(terrain: TerrainHeights, lat_deg: Array, lon_deg: Array) -> Ground | None:
-    """The ground at equally probable positions; None where no height is known."""
+    """At equally probable positions; None where no height is known."""
     heights = terrain(lat_deg, lon_deg)
     known = heights[np.isfinite(heights)]
     if not known.size:
@@ -47,11 +41,7 @@ def ground_over(terrain: TerrainHeights, lat_deg: Array, lon_deg: Array) -> Grou
 def ground_around(
     terrain: TerrainHeights, place_deg: tuple[float, float], std_m: float
 ) -> Ground | None:
-    """The ground at a position (latitude, longitude) with a standard deviation per axis.
-
-    The position is spread evenly over a disc of that standard deviation. None where no height is
-    known.
-    """
+    """Over a disc around `place_deg` (latitude, longitude); None where unknown."""
     if std_m <= 0:
         return ground_over(terrain, np.array([place_deg[0]]), np.array([place_deg[1]]))
     lat, lon = LocalFrame(*place_deg).latlon_from_en(2 * std_m * _DISC)
@@ -66,9 +56,7 @@ def bilinear(
 ) -> Array:
     """Heights at fractional samples (0, 0 is the first); NaN beyond half a sample outside.
 
-    `samples` gives heights by rows and columns within `shape`. A position between samples of which
-    one is unknown is unknown.
-    """
+    `samples` gives heights by rows and columns; beside an unknown one all is unknown."""
     rows, cols = shape
     with np.errstate(invalid="ignore"):
         inside = (col >= -0.5) & (col <= cols - 0.5) & (row >= -0.5) & (row <= rows - 0.5)
@@ -83,13 +71,10 @@ def bilinear(
 
 
 def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:
-    """Metres east and north of a camera (2,) where a line of sight first meets the ground.
+    """Metres east and north (2,) where a line of sight first meets the ground, else NaN.
 
-    `slope_en` (2,): how far it goes for each metre that it descends. `height_m`: of the camera,
-    `ground_m`: of the ground at metres east and north of the camera (N, 2), over the same level.
-    The ground is sought down to `DEEPEST_M` below that under the camera. NaN where it is not met,
-    or behind unknown ground.
-    """
+    `slope_en` (2,): its run per metre of descent. `ground_m`: heights at (N, 2) east and north of
+    the camera, over the same level as `height_m`, down to `DEEPEST_M` below."""
     below_m = float(ground_m(np.zeros((1, 2)))[0])
     drops = np.linspace(0.0, height_m - below_m + DEEPEST_M, SIGHT_STEPS)
     above = height_m - drops - ground_m(drops[:, None] * slope_en)

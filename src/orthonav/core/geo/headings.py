@@ -7,12 +7,10 @@ RADIANS = (
     "all headings are within -2 pi to 2 pi, as in radians; check the unit of the heading column"
 )
 _FEWEST = 4
-_VARIED = 2.0
-"""Least range of the values: headings in degrees that vary by so little rarely lie around 0."""
+_VARIED = 2.0  # headings in degrees that vary by less rarely lie around 0
 
 
 def seem_radians(yaw_deg: Sequence[float]) -> bool:
-    """Whether values that are given as degrees look like radians: varied, and none beyond 2 pi."""
     known = [value for value in yaw_deg if math.isfinite(value)]
     if len(known) < _FEWEST:
         return False

@@ -6,7 +6,7 @@ HINT = "latitude and longitude seem to be swapped"
 
 
 def swapped_bounds_hint(bounds_deg: tuple[float, float, float, float]) -> str:
-    """`swapped_hint` of the corner of west, south, east, north that is farthest from 0, 0."""
+    """Of the corner that is farthest from 0, 0."""
     west, south, east, north = bounds_deg
     return swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
 
@@ -14,11 +14,7 @@ def swapped_bounds_hint(bounds_deg: tuple[float, float, float, float]) -> str:
 def swapped_hint(
     lat_deg: float, lon_deg: float, contains: Callable[[float, float], bool] | None = None
 ) -> str:
-    """`HINT` after a semicolon where swapping explains an invalid position, else nothing.
-
-    `contains` says whether a position (latitude, longitude in degrees) lies in the expected area;
-    without it only the range of a latitude, -90 to 90, is considered.
-    """
+    """`HINT` where swapping explains an invalid position, one outside `contains`, else nothing."""
 
     def fits(lat: float, lon: float) -> bool:
         in_range = abs(lat) <= 90 and abs(lon) <= 360

@@ -1,12 +1,8 @@
 """The camera of a placed view: position, height, heading, pitch and roll from the picture.
 
-The reported pitch and roll are only a prior: mounts lean by degrees, and so does the horizon of an
-autopilot. Each block of the view says how well it fits the map when it is moved a little aside
-(`orthonav.core.register.blocks`). The camera is where the blocks fit best together, moved as one
-camera moves them, and where the telemetry allows: the maximum of a posterior, found by Newton's
-method. Ground that changed fits nowhere and counts little (a mixture with outliers). Then the view
-is orthorectified with what was found, one level finer, and fitted again.
-"""
+Blocks of the view say how well they fit the map a little aside (`orthonav.core.register.blocks`).
+The camera is the maximum of their posterior with the telemetry, by Newton's method; changed ground
+is an outlier of a mixture. Then the view is orthorectified one level finer, and fitted again."""
 
 import math
 from collections.abc import Sequence
@@ -25,41 +21,31 @@ from orthonav.core.register.template import BLOCKS, ViewTemplates
 from orthonav.core.register.window import Reference
 
 STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-"""Steps of the numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
-GROUND_STEP_M = 2.0
-"""The same of a point along the ground: about the noise of a terrain model over its slope."""
+"""Of numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
+GROUND_STEP_M = 2.0  # of a point along the ground: the noise of a terrain model over its slope
 BLURS_PX = (2.0, 1.0, 0.0, 0.0)
-"""Gaussian blur of the correlations at each step of an ascent from no correction: wide peaks first,
-so that a view off by several pixels is not caught by chance."""
-SHARP_PX = (0.7, 0.0)
-"""The same from a correction by the peaks of `SAMPLE` blocks, or from one close by."""
+"""Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
+SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
 SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
-"""So many such corrections are tried, where the blocks' own peaks are known to so many pixels: a
-view can be off by more than an ascent overcomes (RANSAC, Fischler and Bolles 1981)."""
-FINAL_STEPS = 2
-"""Steps after the information of the blocks was compared with the scatter of their slopes."""
-LONGEST_STEP_PX = 3.0
-"""A step moves no block farther."""
-PIXELS_PER_NUMBER = 5.0
-"""Pixels that hold one independent number. Only the odds of outliers depend on it."""
-LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9
-"""Limits of the mean correlation that a right block is expected to have."""
+"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC)."""
+FINAL_STEPS = 2  # after the blocks' information was compared with the scatter of their slopes
+LONGEST_STEP_PX = 3.0  # of any block, per step
+PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
+LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9  # limits of the mean correlation of a right block
 CORRELATED, CORRELATED_PX = 2.0, 60.0
-"""Errors of levels and of dates are not independent: the variance is at least so many times what
-the scatter between blocks implies, and more where blocks are smaller than what their errors reach
-over, in pixels of the map (docs/decisions/camera.md)."""
+"""Errors of levels and dates correlate: least excess of the variance over the scatter of blocks,
+and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
 MIN_BLOCKS = 8
-"""Fewer blocks do not show an attitude."""
 WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
-"""Standard deviations of a camera of which nothing is reported: metres and degrees."""
+"""Standard deviations of a camera of which nothing is reported."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Resection:
-    """A correction (6,) of metres east, north, up and degrees of heading, pitch and roll, and the
-    covariance (6, 6) of what it corrects: `correction`, `covariance` by blocks and telemetry,
-    `alone`, `alone_covariance` by the blocks alone, as far as they show it (`WEAK`)."""
+    """Corrections (6,), m east, north, up, deg heading, pitch, roll, and covariances (6, 6).
+
+    `alone`: by the blocks without telemetry, as far as they show it (`WEAK`)."""
 
     correction: Array
     covariance: Array
@@ -74,14 +60,11 @@ def resected(
     block_px: float,
     close: bool = False,
 ) -> Resection | None:
-    """The camera under which the blocks of a view fit the map best.
+    """The camera under which the blocks of a view fit the map best; None where too few are seen.
 
-    `seen`: for each level of the map, all with the same reach, the blocks, and how far (N, 2, 6)
-    what they show moves over the window by metres and degrees of the camera, pixels of the level
-    right and down. `prior`: expected correction (6,) and its information (6, 6). `block_px`:
-    side of a block, pixels of level 0. `close`: whether the camera is known to a pixel or two. None
-    where too few blocks are seen.
-    """
+    `seen`: per level the blocks and how far (N, 2, 6) each moves, pixels right and down, by the
+    camera. `prior`: correction (6,) and information (6, 6). `close`: the camera is known to a pixel
+    or two."""
     correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
     blocks = _Blocks.of(seen, correlated)
     if blocks is None:
@@ -112,8 +95,7 @@ def resected(
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Blocks (L * N) of all levels: correlations (L * N, S, S), pixels (L * N,), and their moves
-    (L * N, 2, 6) by the camera. `correlated`: see `CORRELATED`."""
+    """Of all levels: correlations (L * N, S, S), pixels (L * N,), moves (L * N, 2, 6)."""
 
     levels: int
     correlated: float
@@ -123,7 +105,6 @@ class _Blocks:
 
     @classmethod
     def of(cls, seen: Sequence[tuple[BlockScores, Array]], correlated: float) -> "_Blocks | None":
-        """None where fewer than `MIN_BLOCKS` count at every level."""
         moved = np.concatenate([each for _, each in seen])
         known = np.isfinite(moved).all(axis=(1, 2))
         pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
@@ -153,7 +134,6 @@ class _Blocks:
 
     @property
     def seen(self) -> int:
-        """Blocks that count at any level."""
         return int((self.pixels.reshape(self.levels, -1) > 0).any(axis=0).sum())
 
     def climbed(self, start: Array, blurs_px: Sequence[float], prior: tuple[Array, Array]) -> Array:
@@ -164,7 +144,6 @@ class _Blocks:
         return correction
 
     def best(self, corrections: Array, prior: tuple[Array, Array]) -> Array:
-        """The one of corrections (S, 6) with the highest posterior."""
         mean, information = prior
         moved = (self.moved.reshape(-1, 6) @ corrections.T).T.reshape(len(corrections), -1, 2)
         here = _values(self.correlations, moved)
@@ -178,7 +157,7 @@ class _Blocks:
         return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
 
     def _usual(self, correlations: Array) -> Array:
-        """Correlation (.., L * N) that a right block is expected to have: the mean of its level."""
+        """Mean correlation (.., L * N) of the level."""
         by_level = (*correlations.shape[:-1], self.levels, -1)
         weighted = (correlations * self.pixels).reshape(by_level).sum(axis=-1)
         pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
@@ -187,14 +166,13 @@ class _Blocks:
         return np.repeat(usual, len(self.pixels) // self.levels, axis=-1)
 
     def _weights(self, usual: Array) -> Array:
-        """Log likelihood ratio (L * N,) of blocks, per unit of their correlation, between a pair of
-        Gaussians of the `usual` correlation and of none."""
+        """Log likelihood ratio (L * N,) per unit of correlation, of a right block against none."""
         return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
 
     def stepped(
         self, correction: Array, blur_px: float, excess: float, prior: tuple[Array, Array]
     ) -> Array:
-        """The correction after one step of Newton's method; the blocks say less by `excess`."""
+        """One step of Newton's method; the blocks say less by `excess`."""
         mean, information = prior
         curvature, slopes = self.system(correction, blur_px)
         pull = slopes.sum(axis=0) / excess + information @ (mean - correction)
@@ -203,8 +181,7 @@ class _Blocks:
         return np.asarray(correction + step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9)))
 
     def system(self, correction: Array, blur_px: float = 0.0) -> tuple[Array, Array]:
-        """Curvature (6, 6) of the log likelihood at a correction, and its slope (N, 6) by each
-        block, its levels added up."""
+        """Curvature (6, 6) of the log likelihood, and its slope (N, 6) by each block."""
         here, slope, curvature = _quadratic(
             _blurred(self.correlations, blur_px), self.moved @ correction
         )
@@ -219,7 +196,6 @@ class _Blocks:
 
 
 def _blurred(correlations: Array, blur_px: float) -> Array:
-    """Correlations (N, S, S) blurred by a Gaussian."""
     if blur_px == 0:
         return correlations
     at = np.arange(correlations.shape[1])
@@ -229,11 +205,9 @@ def _blurred(correlations: Array, blur_px: float) -> Array:
 
 
 def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
-    """Surfaces (N, S, S) at displacements (N, 2), x and y: their values (N,), slopes (N, 2) and
-    curvatures (N, 2, 2), not negative.
+    """Values (N,), slopes (N, 2), curvatures (N, 2, 2) >= 0 of surfaces (N, S, S) at (N, 2) x, y.
 
-    By the quadratic through the pixels around; beyond the surface all are 0.
-    """
+    By the quadratic through the pixels around; 0 beyond the surface."""
     reach = surfaces.shape[1] // 2
     inside = (np.abs(moved_px) <= reach).all(axis=1)
     held = np.clip(moved_px, 1 - reach, reach - 1)
@@ -258,8 +232,7 @@ def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
 
 
 def _values(surfaces: Array, moved_px: Array) -> Array:
-    """Values (.., N) of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else
-    0."""
+    """Of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else 0."""
     reach = surfaces.shape[-1] // 2
     nearest = np.rint(np.minimum(np.maximum(moved_px, -reach), reach)).astype(int) + reach
     values = surfaces[np.arange(len(surfaces)), nearest[..., 1], nearest[..., 0]]
@@ -281,12 +254,8 @@ def _positive(matrices: Array) -> Array:
 def moved_by_camera(
     camera: Camera, orientation: Orientation, ground_m: Array, slopes: Array
 ) -> Array:
-    """How far (N, 2, 6) what is seen at an image point moves over the ground, metres east and
-    north, by metres and degrees of the camera.
-
-    `ground_m` (N, 3): the ground seen, east, north, above sea; `slopes` (N, 2): its rise per metre
-    east and north. NaN where it cannot be seen.
-    """
+    """Metres (N, 2, 6) by which an image point moves over the ground per unit of the camera; NaN
+    where not seen. `ground_m` (N, 3): east, north, above sea; `slopes` (N, 2): its rise."""
     by_ground = []
     for axis in range(2):
         step = np.zeros((len(ground_m), 3))
@@ -311,24 +280,17 @@ def moved_by_camera(
 
 
 FIRST_REACH_PX, REACH_PX = 7, 4
-"""Blocks are moved so far, pixels of each level, by the first fit and by those after it. 7 px of
-the final level are what 10 deg of tilt make at the rim of a view 65 deg wide."""
-FITS = 3
-"""The view is fitted at most so many times,"""
-SMALL_SHARE = 0.2
-"""until a correction is below this share of its standard deviations."""
+"""Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
+FITS = 3  # at most,
+SMALL_SHARE = 0.2  # until a correction is below this share of its standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFound:
-    """The camera of a view.
+    """The camera of a view; `agl_m`: above the ground below it; `alone`: without telemetry.
 
-    - `orientation`: position and attitude; `agl_m`: height above the ground below it.
-    - `covariance` (6, 6): of metres east, north and up, degrees of heading, pitch and roll.
-    - `alone`, `alone_covariance`: the same by the view alone, without heading, height and tilt of
-      the telemetry; what the view does not show has standard deviations of `resection.WEAK`.
-    - `middle_en_m`: ground that the middle of the picture shows, metres east and north;
-      `middle_covariance` (2, 2) of that, m2, None beside unknown ground.
+    - covariances (6, 6): m east, north, up, deg heading, pitch, roll; `WEAK` where not shown.
+    - `middle_en_m`, `middle_covariance` (2, 2): ground in the middle of the picture, None: unknown.
     """
 
     orientation: Orientation
@@ -341,8 +303,7 @@ class CameraFound:
 
 
 def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> CameraFound | None:
-    """The camera of a view whose window lies at `pose`, its height counted from the mean ground of
-    that window; None where the reported tilt is exact or too few blocks are seen."""
+    """Of a view at `pose`; None where the tilt is exact or too few blocks are seen."""
     if tilt_std_deg(seen.view.telemetry) == 0:
         return None
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
@@ -377,7 +338,6 @@ def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> Came
 
 
 def tilt_std_deg(telemetry: Telemetry) -> float:
-    """Standard deviation of reported pitch and roll, stated or usual."""
     stated = telemetry.tilt_std_deg
     return DEFAULT_TILT_STD_DEG if stated is None else stated
 
@@ -385,8 +345,7 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
 def _fitted(
     seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> Resection | None:
-    """A correction of `orientation`, under which the view is rectified: the first at the final
-    level and a coarser one, others one level finer too."""
+    """A correction: the first at the final level and a coarser one, then one finer too."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)
@@ -414,7 +373,7 @@ def _fitted(
 def _templates(
     seen: ViewOverGround, pose: Pose, level: int, orientation: Orientation, *, first: bool
 ) -> ViewTemplates | None:
-    """The view rectified under an orientation; over level ground the first is the search's."""
+    """Rectified under an orientation; over level ground the first is the search's."""
     if first and seen.relief.is_level and not is_oblique(seen.view.view):
         return seen.view.templates
     return seen.templates_at(pose, level, orientation)
@@ -423,8 +382,7 @@ def _templates(
 def _middle_covariance(
     seen: ViewOverGround, orientation: Orientation, covariance: Array
 ) -> Array | None:
-    """Covariance (2, 2), m2, of the ground that the middle of a view shows; None where unknown
-    ground is next to it."""
+    """Of the ground (2, 2), m2, that the middle of a view shows; None beside unknown ground."""
     columns = []
     for step in np.diag(STEPS):
         ahead, behind = (seen.sight_en_m(orientation.moved(sign * step)) for sign in (1, -1))
@@ -434,7 +392,7 @@ def _middle_covariance(
 
 
 def _prior(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:
-    """Expected correction (6,) of an orientation by telemetry, and its information (6, 6)."""
+    """Expected correction (6,) by telemetry, and its information (6, 6)."""
     telemetry, prior = seen.view.telemetry, seen.view.prior
     expected, std = 0.0, prior.log_scale_std
     if prior.scale_map is not None:

@@ -1,8 +1,7 @@
 """How likely a fix is right: a probability from scores, and acceptance by a threshold.
 
-Weights of registration are those of real imagery of two dates (`python -m benchmarks.trust`),
-scores of chance those of the map; weights of tiles are learnt when the map is built.
-"""
+Weights of registration are from real imagery of two dates (`python -m benchmarks.trust`), chance
+scores from the map; weights of tiles are learnt when the map is built."""
 
 import math
 from collections.abc import Mapping
@@ -24,31 +23,22 @@ FEATURES = (
     "log_alone_phase",
     "log_alone_gradients",
 )
-ALONE = 2
-"""The last so many say whether the view fits nowhere near as well, the others whether it fits."""
+ALONE = 2  # the last two features say whether the view fits nowhere near as well
 CHANCES = ("total", "look", "fine")
 CUT_SHORT = 0.89
-"""Largest confidence of a view whose search ended early (`--budget-ms`) before a place stood out:
-its rivals were not all looked for. Below `orthonav.core.records.CONFIDENT`."""
+"""Limit where `--budget-ms` ended the search before a place stood out. Below `CONFIDENT`."""
 USUAL_BIASES = -6.68, -8.0
 USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
-"""What separates right from wrong, fitted to 1,734 views (docs/decisions/confidence.md). The
-benchmark of trust shows how weights fitted in this way judge scenes left out."""
-STAND_IN = 0.7
-"""Share of the chance value that stands in for a rival where a narrow search found none."""
-LEAST_DEVIATIONS = 1.0
-"""Least height above the ground nearby, in standard deviations, that makes a difference."""
-USUAL_DETAIL = 1.4
-"""Stands in for the detail ratio of views too small to be finished at a finer level."""
+"""Fitted to 1,734 views (docs/decisions/confidence.md)."""
+STAND_IN = 0.7  # of the chance value: stands in for a rival where none was found
+LEAST_DEVIATIONS = 1.0  # least height above the ground nearby that counts, in standard deviations
+USUAL_DETAIL = 1.4  # for views too small to be finished one level finer
 
 
 @dataclass(frozen=True)
 class Chances:
-    """Scores of the best place of a view that is not on the map, over the whole map.
-
-    `total`: the levels it is judged and finished at; `look`: the first of them; `fine`: with one
-    more.
-    """
+    """Scores of the best wrong place over the map: at the judged and final level, the judged one,
+    and with one finer."""
 
     total: float
     look: float
@@ -59,59 +49,51 @@ class Chances:
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
     def of_strength(self, evidence: Mapping[str, float]) -> float:
-        """The strength that chance gives a view with this evidence: of one level or of two."""
+        """By chance, of one level or of two."""
         return self.look if math.isnan(evidence["detail_ratio"]) else self.total
 
 
 USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
-"""Chance values for a map on which none were measured: those of generated landscapes."""
+"""Of generated landscapes, for maps on which none were measured."""
 
 
 @dataclass(frozen=True)
 class RegisteredConfidence:
     """P(right) = P(the view fits) P(it fits nowhere near as well).
 
-    Each is a logistic regression. The second has the last two `FEATURES`, the first has the others:
-    a strong fit cannot outweigh ground that repeats. What each feature shows wrong:
+    Each is a logistic regression, so that a strong fit cannot outweigh ground that repeats. What
+    each feature shows wrong:
 
-    - `log_strength`: score over that of chance. Views that show nothing of the map.
-    - `log_peak_ratio`: score over that of the strongest rival. Ground that exists more than once.
-      Where the view was doubtful enough to be judged one level finer too, it is the mean with and
-      without it: on blurred views the finer level alone is overconfident.
+    - `log_strength`: score over chance. Views that show nothing of the map.
+    - `log_peak_ratio`: score over that of the strongest rival: ground that repeats. In doubt, the
+      mean with and without a finer level: on blurred views that one alone is overconfident.
     - `log_look_ratio`: the same among all candidates, at a coarser level.
-    - `log_detail_ratio`: score at the finest level over that at the coarser one. Chance matches
-      lose more in detail.
+    - `log_detail_ratio`: finest over coarser score. Chance matches lose more in detail.
     - `log_local_phase`: phase correlation over that a little aside, in standard deviations. Views
-      that share shapes with the place, but not their detail.
-    - `log_alone_phase`, `log_alone_gradients`: the same number, and gradients over those a little
-      aside, in standard deviations. Rows, lattices, single roads.
+      with the place's shapes, but not its detail.
+    - `log_alone_phase`, `log_alone_gradients`: the same at the finest level. Rows, lattices, single
+      roads.
 
-    A share of chance stands in for a rival where none was found, so that a narrow search does not
-    appear as certainty. Weights are never negative: more evidence never means less confidence.
-    """
+    Weights are never negative: more evidence never means less confidence."""
 
     biases: tuple[float, float]
     weights: tuple[float, ...]
     chances: Chances
 
     def __call__(self, evidence: Mapping[str, float]) -> float:
-        """Probability in 0..1 that the fix is right."""
         found = self.of(features_of(evidence, self.chances))
         return min(found, CUT_SHORT) if evidence.get("cut_short") else found
 
     def of(self, features: NDArray[np.float64]) -> float:
-        """The same, by features (7,)."""
         fits = self.biases[0] + float(np.dot(self.weights[:-ALONE], features[:-ALONE]))
         alone = self.biases[1] + float(np.dot(self.weights[-ALONE:], features[-ALONE:]))
         return probability(fits) * probability(alone)
 
     @classmethod
     def usual(cls, chances: Chances) -> "RegisteredConfidence":
-        """With the usual weights, and a map's own scores of chance."""
         return cls(USUAL_BIASES, USUAL_WEIGHTS, chances)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for a manifest."""
         return {
             "biases": list(self.biases),
             "weights": dict(zip(FEATURES, self.weights, strict=True)),
@@ -120,7 +102,6 @@ class RegisteredConfidence:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "RegisteredConfidence":
-        """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
         try:
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
             first, second = plain["biases"]
@@ -139,7 +120,7 @@ class RegisteredConfidence:
 
 
 def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
-    """Features (7,) of the evidence of a registered view, see `RegisteredConfidence`."""
+    """Features (7,) of `RegisteredConfidence`."""
     strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
     detail, chance = evidence["detail_ratio"], chances.of_strength(evidence)
     if math.isnan(detail):
@@ -158,29 +139,19 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
 
 
 USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)
-"""For a map without views to learn from."""
-
-
 TILE_FEATURES = ("score", "margin")
-USUAL_SHIFT = 0.42
-"""Standard deviation of the bias from map to map, under the weights of `USUAL_TILES`."""
-LIMIT = 60.0
-"""Largest logit: beyond, the probability is 0 or 1 to all digits of a float."""
+USUAL_SHIFT = 0.42  # of the bias from map to map, under `USUAL_TILES`
+LIMIT = 60.0  # Beyond, the probability is 0 or 1 in floating point
 
 
 @dataclass(frozen=True)
 class LogisticConfidence:
-    """P(right) = 1 / (1 + exp(-(bias + weights . evidence))).
-
-    `weights` belong to the evidence named in `TILE_FEATURES`: the best score, and its lead over the
-    best score elsewhere. Weights are never negative: more evidence never means less confidence.
-    """
+    """P(right) = 1 / (1 + exp(-(bias + weights . evidence))), of `TILE_FEATURES`; weights >= 0."""
 
     bias: float
     weights: tuple[float, ...]
 
     def __call__(self, evidence: Mapping[str, float]) -> float:
-        """Probability in 0..1 that the fix is right."""
         total = self.bias + sum(
             weight * evidence[name]
             for name, weight in zip(TILE_FEATURES, self.weights, strict=True)
@@ -188,12 +159,10 @@ class LogisticConfidence:
         return probability(total)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for a manifest."""
         return {"bias": self.bias, "weights": dict(zip(TILE_FEATURES, self.weights, strict=True))}
 
     @classmethod
     def from_plain(cls, plain: Any) -> "LogisticConfidence":
-        """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
         try:
             numbers = [
                 float(plain["bias"]),
@@ -209,37 +178,28 @@ class LogisticConfidence:
 
 
 USUAL_TILES = LogisticConfidence(-3.42 - USUAL_SHIFT, (5.87, 12.08))
-"""Of tiles of whitened gradients: fitted to the trials of 22 maps of nine scenes, and lower by one
-standard deviation (docs/decisions/confidence.md)."""
+"""Fitted to 22 maps of nine scenes, one standard deviation lower (docs/decisions/confidence.md)."""
 
 
 def probability(logit: float) -> float:
-    """The logistic function, cut off where it is 0 or 1 to all digits that matter."""
     return 1 / (1 + math.exp(-min(max(logit, -LIMIT), LIMIT)))
 
 
 def logit(likely: float, least: float) -> float:
-    """Logarithm of the odds of a probability that is taken as `least` to 1 - `least`."""
+    """Log odds of a probability limited to `least` .. 1 - `least`."""
     inside = min(max(likely, least), 1 - least)
     return math.log(inside / (1 - inside))
 
 
-CRITERIA = {
-    "confidence": (0.01, 1.0),
-    "peak_ratio": (1.0, 1000.0),
-    "lowe_ratio": (1.0, 1000.0),
-}
-"""Thresholds that make sense, by criterion. The best of two scores is no less than the other."""
+CRITERIA = {"confidence": (0.01, 1.0), "peak_ratio": (1.0, 1000.0), "lowe_ratio": (1.0, 1000.0)}
+"""Sensible thresholds: best over second best is at least 1."""
 
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Fixes whose `criterion` is below `threshold` are withheld.
+    """Withholds fixes whose `criterion` is below `threshold`.
 
-    `confidence`: the calibrated probability; `peak_ratio`: best over its strongest rival;
-    `lowe_ratio`: best over second best tile, the criterion of Di Piazza et al. 2024 (threshold
-    1.13), which only tile search has.
-    """
+    `lowe_ratio`: best over second best tile (Di Piazza et al. 2024: 1.13), of tile search only."""
 
     criterion: str
     threshold: float
@@ -265,7 +225,6 @@ class Acceptance:
         return cls(name, threshold)
 
     def __call__(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        """The outcome, or `NoFix` where the number is below the threshold or unknown."""
         if isinstance(outcome, NoFix) or self.accepts(outcome):
             return outcome
         value = self._value(outcome)
@@ -274,7 +233,6 @@ class Acceptance:
         return NoFix("low_confidence", detail, outcome.evidence)
 
     def accepts(self, outcome: Fix | NoFix) -> bool:
-        """Whether there is a fix whose number is known and not below the threshold."""
         return isinstance(outcome, Fix) and self._value(outcome) >= self.threshold
 
     def _value(self, fix: Fix) -> float:
@@ -289,10 +247,8 @@ def within(
     radius_m: float,
     middle: NDArray[np.float64] | None = None,
 ) -> float:
-    """Probability that a state lies within a radius of `middle` (2,), its own mean where None.
-
-    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
-    """
+    """Probability of being within a radius of `middle` (2,), None: the mean; exact for a round
+    Gaussian, else a distance from it counts as variance."""
     variance = float(covariance[0, 0] + covariance[1, 1]) / 2
     away = 0.0 if middle is None else math.dist(mean[:2], middle)
     if away > radius_m + 3 * math.sqrt(variance):

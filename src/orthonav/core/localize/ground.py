@@ -1,8 +1,7 @@
-"""A sheet with its ground, level or not, and a view over it: from a pose to what the camera sees.
+"""A sheet with its ground, level or not, and a view over it.
 
-The pose of a candidate says where the middle of the view's window lies, its heading, and that the
-camera is `agl_m * exp(log_scale)` above the mean ground of that window.
-"""
+A pose says where the middle of the view's window lies, its heading, and that the camera is
+`agl_m * exp(log_scale)` above the mean ground of that window."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -29,33 +28,24 @@ from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import GreyPyramid, Reference
 
-MAP_NODES = 256
-"""Nodes across the map of expected scales, at most."""
-SLOPE_M = 10.0
-"""Slopes are those over twice this distance."""
-LARGEST_STD = 0.3
-"""Largest standard deviation of the scales searched: three are scales of 0.41 to 2.46."""
+MAP_NODES = 256  # of expected scales across the map, at most
+SLOPE_M = 10.0  # half the base over which slopes are measured
+LARGEST_STD = 0.3  # of scales searched: three are 0.41 to 2.46
 Array = NDArray[np.float64]
 
 
 class Terrain(Protocol):
-    """Heights of the ground."""
-
     def at_en_m(self, points_en_m: ArrayLike) -> Array:
-        """Heights (...) above sea level at points (..., 2), metres east and north; NaN where
-        unknown."""
+        """Heights (...) above sea at points (..., 2); NaN where unknown."""
 
 
 class LevelTerrain:
-    """Ground of one height, 0: that of maps without a terrain."""
-
     def at_en_m(self, points_en_m: ArrayLike) -> Array:
-        """Zeros (...) at points (..., 2)."""
         return np.zeros(np.shape(points_en_m)[:-1])
 
 
 class Relief:
-    """The ground of a sheet, for all views. Safe to share between threads."""
+    """The ground of a sheet; threads may share it."""
 
     def __init__(self, terrain: Terrain, grid: TileGrid) -> None:
         self.terrain, self.grid = terrain, grid
@@ -63,21 +53,20 @@ class Relief:
 
     @property
     def is_level(self) -> bool:
-        """Whether the ground is level, as without a terrain."""
         return isinstance(self.terrain, LevelTerrain)
 
     def en_m(self, map_px: Array) -> Array:
-        """Metres east and north (..., 2) of map coordinates at level 0."""
+        """Of map coordinates (..., 2) at level 0."""
         corner = np.array([self.grid.west_m, self.grid.north_m])
         return np.asarray(corner + map_px * [self.grid.gsd_m, -self.grid.gsd_m])
 
     def ground_m(self, map_px: Array) -> Array:
-        """Ground points (..., 3) east, north, above sea at map coordinates; NaN where unknown."""
+        """East, north, above sea (..., 3) of map coordinates; NaN where unknown."""
         points = self.en_m(map_px)
         return np.concatenate([points, self.terrain.at_en_m(points)[..., None]], axis=-1)
 
     def slopes(self, ground_m: Array) -> Array:
-        """Rise (N, 2) per metre east and north at ground points (N, 3)."""
+        """Rise (N, 2) per metre east and north at (N, 3)."""
         out = np.empty((len(ground_m), 2))
         for axis in range(2):
             step = np.zeros(2)
@@ -89,7 +78,7 @@ class Relief:
         return out
 
     def expected(self, view: PreparedView) -> PosePrior:
-        """The prior of a view with the scale expected at each place, by its height above sea."""
+        """The view's prior, with scales by the height above sea at each place."""
         telemetry, prior = view.telemetry, view.prior
         below, agl_m = telemetry.below, telemetry.agl_m
         if below is None:
@@ -113,8 +102,7 @@ class Relief:
         )
 
     def _mean_heights(self, side_px: float) -> tuple[NDArray[np.float32], float]:
-        """Mean heights of the ground under windows of about a side at nodes over the sheet, and
-        the distance of these in pixels of level 0."""
+        """Under windows at nodes over the sheet, and the spacing of these, pixels of level 0."""
         key = round(math.log2(max(side_px, 1.0)))
         if key not in self._means:
             size = self.grid.width_px, self.grid.height_px
@@ -133,16 +121,13 @@ class Relief:
         return self._means[key]
 
 
-REFERENCE_NODES = 9
-"""Nodes across and down a window whose mean height is its reference."""
-MIN_KNOWN = 0.5
-"""Windows of which less is known are registered on level ground."""
-LEVEL_PX = 0.2
-"""Relief that displaces no ground of a window by more (pixels of the final level) is left out."""
+REFERENCE_NODES = 9  # across a window, for its mean height
+MIN_KNOWN = 0.5  # windows of which less is known are registered on level ground
+LEVEL_PX = 0.2  # relief that displaces less (pixels of the final level) is left out
 
 
 class SearchedSheet:
-    """A sheet and its imagery, made ready for all views. Safe to share between threads."""
+    """A sheet and its imagery, made ready for all views; threads may share it."""
 
     def __init__(
         self,
@@ -156,11 +141,10 @@ class SearchedSheet:
         plan: SearchPlan = DEFAULT_PLAN,
         terrain: TerrainLayer | None = None,
     ) -> None:
-        """`confidence`: None before it is learnt; no place is proven then. `radius_m`: the error
-        that it is about. `floor_px`: standard deviation with which maps of two dates agree, in
-        pixels of level 0. Without `propose`, candidates come from searches by FFT only; without
-        `terrain` the ground is level.
-        """
+        """`confidence`: None before it is learnt: no place is proven. `radius_m`: its error.
+
+        `floor_px`: standard deviation with which maps of two dates agree, pixels of level 0.
+        Without `propose` candidates come from FFT only; without `terrain` the ground is level."""
         self.sheet, self.grid = sheet, sheet.grid
         self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
         self.reference = Reference(layer)
@@ -171,18 +155,15 @@ class SearchedSheet:
 
     @property
     def pyramid(self) -> GreyPyramid:
-        """The grey levels of the sheet at all its resolutions."""
         return self.reference.pyramid
 
     def px_of(self, place_en_m: Array) -> tuple[float, float]:
-        """Pixels of level 0, x and y, of a place (2,): the inverse of `Relief.en_m`."""
+        """The inverse of `Relief.en_m`."""
         (east, north), grid = place_en_m, self.grid
         return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
 
 
 class ViewOverGround:
-    """One view over the ground of a sheet."""
-
     def __init__(self, relief: Relief, view: PreparedView) -> None:
         self.relief, self.view = relief, view
         valid = view.templates.valid
@@ -197,8 +178,7 @@ class ViewOverGround:
     def templates_at(
         self, pose: Pose, level: int, orientation: Orientation | None = None
     ) -> ViewTemplates | None:
-        """The view orthorectified on the terrain under a pose, at a level; None where less than
-        half of the window is known. `orientation`: of the camera; None: that of the pose."""
+        """The view orthorectified under a pose; None where less than half of it is known."""
         orientation = orientation or self.orientation(pose)
         if orientation is None:
             return None
@@ -212,7 +192,7 @@ class ViewOverGround:
         return ViewTemplates(*orthorectified(picture, orientation, ground, shape), level)
 
     def orientation(self, pose: Pose) -> Orientation | None:
-        """Where the camera is under a pose; None where less than half of its ground is known."""
+        """Of the camera under a pose; None where less than half of its ground is known."""
         reference_m = self.reference_m(pose)
         if math.isnan(reference_m):
             return None
@@ -224,13 +204,13 @@ class ViewOverGround:
         return Orientation(position, attitude)
 
     def reference_m(self, pose: Pose) -> float:
-        """Mean height of the ground of the window; NaN where less than half of it is known."""
+        """Mean height under the window; NaN where less than half is known."""
         heights = self.relief.ground_m(pose.map_px(self._reference_px))[:, 2]
         known = np.isfinite(heights)
         return float(heights[known].mean()) if known.mean() >= MIN_KNOWN else math.nan
 
     def is_level(self, pose: Pose) -> bool:
-        """Whether relief displaces no ground of the window by a visible amount."""
+        """Whether relief displaces the window by less than is visible."""
         if self.relief.is_level:
             return True
         ground = self.relief.ground_m(pose.map_px(self._reference_px))
@@ -244,14 +224,14 @@ class ViewOverGround:
         return bool(shift_m.max() < LEVEL_PX * pixel_m)
 
     def moved_px(self, one: Pose, other: Pose) -> float:
-        """How far a window moved at its rim, pixels of level 0."""
+        """At the rim of the window, pixels of level 0."""
         half = self.view.side_px / 2
         corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
         moved = one.map_px(corners) - other.map_px(corners)
         return float(np.hypot(*moved.T).max())
 
     def below_camera(self, pose: Pose) -> Pose:
-        """The pose of a window, with its height counted from the ground below the camera."""
+        """With the height counted from the ground below the camera."""
         camera_px, orientation = self.view.camera_px, self.orientation(pose)
         if orientation is None:
             return pose
@@ -265,16 +245,14 @@ class ViewOverGround:
         return replace(turned, x_px=float(x), y_px=float(y))
 
     def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
-        """Where the middle of the picture looks on the terrain; the middle of the window of `pose`
-        where that is unknown."""
+        """Ground in the middle of the picture; that of the window where unknown."""
         found = self.sight_en_m(orientation)
         if not np.isfinite(found).all():
             found = self.relief.en_m(np.array([pose.x_px, pose.y_px]))
         return float(found[0]), float(found[1])
 
     def sight_en_m(self, orientation: Orientation) -> Array:
-        """Metres east and north (2,) of the terrain that the middle of the picture shows; NaN where
-        that is unknown."""
+        """Ground (2,) in the middle of the picture, NaN where unknown."""
         camera = self.view.picture_at(self.view.levels.final).camera
         px = np.array([camera.width_px / 2 - camera.cx_px, camera.height_px / 2 - camera.cy_px])
         plane = undistort(camera, px / [camera.fx_px, camera.fy_px])

@@ -1,4 +1,4 @@
-"""The front of this package: a map, the method that places views on it, and the fix of a view."""
+"""A map, the method that places views on it, and the fix of a view."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,19 +28,14 @@ from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, Vi
 from orthonav.core.register.pose import Pose
 from orthonav.core.tiles.position import PositionRule
 
-ERROR_VARIANCE = 1.5
-"""Of errors over what their covariance says, for the confidence: errors of a camera have heavier
-tails than a Gaussian (docs/decisions/camera.md)."""
-WIDEST_M = 2e7
-"""Half of the Earth's circumference: a position known no better may be anywhere."""
+ERROR_VARIANCE = 1.5  # their tails are heavier than a Gaussian's (docs/decisions/camera.md)
+WIDEST_M = 2e7  # half the Earth's circumference
 
 
 class Localizer:
-    """Places views on one map. Cheap to make, safe to share between threads once warm.
+    """Places views on one map; threads may share it once warm.
 
-    `tiles` places views by their embedding, `registration` by registration on the map's imagery;
-    `registration` is None where the map has no layer for it, or where it was not wanted.
-    """
+    `registration` is None where the map has no layer for it, or it was switched off."""
 
     def __init__(
         self,
@@ -52,16 +47,13 @@ class Localizer:
         level_ground: bool = False,
         plan: SearchPlan | None = None,
     ) -> None:
-        """Take an opened map; raises `MapFileError` if this program cannot fly it.
+        """Raises `MapFileError` where this program cannot fly the map, `MissingExtraError` for
+        onnxruntime.
 
-        Without `registration`, or where the map has no registration layer, views are localized by
-        their tiles only; `position` is then the rule by which scores of tiles become a position.
-        Without `flying`, maps whose representation is too slow to fly are accepted too: for
-        experiments with maps of one's own, because such a representation loads networks from this
-        machine. With `level_ground` the terrain of the map is not used for registration: for views
-        that were simulated over level ground. Raises `MissingExtraError` where the map's encoder
-        needs onnxruntime and it is not installed.
-        """
+        Without `registration`, or a layer for it, tiles place the views, by the rule `position`.
+        Without `flying`, representations too slow to fly are accepted: only for maps of one's own,
+        because networks are loaded from this machine. `level_ground`: without the map's terrain,
+        for simulated views."""
         if len(opened.manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {opened.path}")
         self.opened = opened
@@ -78,17 +70,15 @@ class Localizer:
 
     @property
     def sheet(self) -> SheetInfo:
-        """The map's only sheet."""
         return self.tiles.sheet
 
     @property
     def grid(self) -> TileGrid:
-        """The tile grid of the sheet."""
         return self.tiles.sheet.grid
 
     @property
     def radius_m(self) -> float:
-        """The error that the confidence of tile fixes is about, m."""
+        """The error that the confidence of tile fixes is about."""
         return self.tiles.radius_m
 
     def locate(
@@ -98,8 +88,7 @@ class Localizer:
 
         `prior` limits the search to three standard deviations around it. With `heading_known`
         false all headings are tried and the reported heading may be NaN. Any fault of a view makes
-        a `NoFix`.
-        """
+        a `NoFix`."""
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused
@@ -126,8 +115,7 @@ class Localizer:
 
         `heading_deg` None: all headings are tried. `prior`: searched within three of its standard
         deviations; None: on the whole map. Raises `FlightError` for what is no image and
-        `CameraError` where image and camera have different aspect ratios.
-        """
+        `CameraError` where image and camera have different aspect ratios."""
         view = View.of(
             image,
             camera,
@@ -143,8 +131,6 @@ class Localizer:
 
 
 class RegistrationLocalizer(SearchedSheet):
-    """Places views on one sheet by registration. Safe to share between threads."""
-
     @classmethod
     def of_map(
         cls,
@@ -154,12 +140,9 @@ class RegistrationLocalizer(SearchedSheet):
         *,
         level_ground: bool = True,
     ) -> "RegistrationLocalizer | None":
-        """A localizer for the only sheet of a map; None where the map has no registration layer.
+        """For the only sheet of a map; None without a registration layer.
 
-        Unless `level_ground`, views are placed on the map's terrain, where it has one.
-
-        Raises `MapFileError` where the manifest's registration is damaged.
-        """
+        Raises `MapFileError` where the manifest's registration is damaged."""
         layer = GreyLayer.of(opened)
         if layer is None:
             return None
@@ -184,7 +167,6 @@ class RegistrationLocalizer(SearchedSheet):
         )
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
-        """The position from which a view was taken; `check_view` has accepted the view."""
         search = self.search(view, prior, heading_known)
         if isinstance(search, NoFix):
             return search
@@ -194,7 +176,7 @@ class RegistrationLocalizer(SearchedSheet):
     def search(
         self, view: View, prior: Prior | None = None, heading_known: bool = True
     ) -> Search | NoFix:
-        """The search for the place of a view within `prior`; `NoFix` where it shows too little."""
+        """`NoFix` where the view shows too little."""
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
@@ -203,11 +185,9 @@ class RegistrationLocalizer(SearchedSheet):
         return Search(self, prepared, prior)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
-        """The view rectified and made ready for registration; `NoFix` where it shows too little."""
         return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
 
     def fix(self, search: Search, best: Place, telemetry: Telemetry) -> Fix:
-        """The fix of a view with this telemetry at the best place that its search found."""
         camera, ground, pose = search.camera(best), search.ground, best.fit.pose
         orientation, middle_en_m = ground.orientation(pose), None
         if camera is not None:
@@ -250,7 +230,7 @@ class RegistrationLocalizer(SearchedSheet):
         )
 
     def _confidence_within(self, best: Place, found: "_Exterior", radius_m: float) -> float:
-        """Of the camera: its place is right, and its error is within the radius."""
+        """That the place is right and the error within the radius."""
         if self.confidence is None:
             return math.nan
         covariance = ERROR_VARIANCE * found.cov_en_m2
@@ -259,7 +239,7 @@ class RegistrationLocalizer(SearchedSheet):
     def _by_camera(
         self, view: PreparedView, camera: CameraFound, telemetry: Telemetry
     ) -> "_Exterior":
-        """Position, height and attitude from the blocks of the view."""
+        """From the blocks of the view."""
         heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
         _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
         floor_m2, covariance = np.eye(2) * self.floor_m(view) ** 2, camera.covariance.copy()
@@ -283,7 +263,7 @@ class RegistrationLocalizer(SearchedSheet):
         )
 
     def _by_similarity(self, view: PreparedView, best: Place, telemetry: Telemetry) -> "_Exterior":
-        """Position, height and heading under the reported pitch and roll."""
+        """Under the reported pitch and roll."""
         pose, covariance = best.pose, best.fit.covariance
         assert covariance is not None
         spread = self.camera_covariance(view, pose, covariance)
@@ -305,21 +285,20 @@ class RegistrationLocalizer(SearchedSheet):
         )
 
     def floor_m(self, view: PreparedView) -> float:
-        """Standard deviation with which maps of two dates agree at the final level of a view, m."""
+        """Agreement of maps of two dates at the view's final level."""
         # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
         return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Metres east and north (2,) of the camera where a view's window lies at `pose`."""
+        """Of the camera (2,)."""
         return self.relief.en_m(pose.map_px(view.camera_px))
 
     def seen_from(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Where the camera of a view at `pose` is (4,): metres east and north, heading (rad) and
-        log scale."""
+        """Of the camera (4,): m east and north, heading (rad), log scale."""
         return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
 
     def pose_of(self, view: PreparedView, seen_from: NDArray[np.float64]) -> Pose:
-        """Where a view's window lies if the camera is at (4,): the inverse of `seen_from`."""
+        """The inverse of `seen_from`."""
         x, y = self.px_of(seen_from[:2])
         turn, log_scale = seen_from[2:].tolist()
         moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
@@ -328,8 +307,7 @@ class RegistrationLocalizer(SearchedSheet):
     def camera_covariance(
         self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Covariance (4, 4) of the camera's east and north (m), heading (rad) and log scale, by
-        that of its window's pose."""
+        """Of `seen_from`, by the covariance of the pose."""
         moved = pose.linear @ view.camera_px
         camera_from_pose = np.eye(4)
         camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
@@ -341,7 +319,7 @@ class RegistrationLocalizer(SearchedSheet):
 
 @dataclass(frozen=True, eq=False)
 class _Exterior:
-    """What a fix says of the camera; see `Fix`. `stds` go into its evidence."""
+    """What a fix says of the camera; `stds` go into its evidence."""
 
     place_en_m: NDArray[np.float64]
     attitude_deg: tuple[float, float, float]

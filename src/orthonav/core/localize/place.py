@@ -1,10 +1,9 @@
 """The places of a view: judged, placed on the terrain, finished, and compared with their rivals.
 
-Candidates are refined from coarse to fine and most are dropped early. The best few are finished: on
-the ground as it is, where the view is orthorectified on the terrain under the pose of a candidate
-and registered again until it stays where it is; or on level ground, where that is as good. Scores
-of the best of them over those of its strongest rival say how far it stands out.
-"""
+Candidates are refined from coarse to fine, most are dropped early. The best few are finished: the
+view is orthorectified on the terrain under each pose and registered again until it stays, or on
+level ground where that is as good. Scores over those of the strongest rival say how far it stands
+out."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -25,44 +24,28 @@ from orthonav.core.register.template import Levels, ViewTemplates
 from orthonav.core.register.window import Reference
 
 KEPT_TO_JUDGED = 200
-"""Candidates that pass from the coarse level to the judged one, at most
-(docs/decisions/registration.md)."""
-KEPT_TO_FINISH = 3
-"""Places that are finished: the best and its rivals."""
-KEPT_TO_FINEST = 12
-"""So many of them are compared one level finer, at most, where they are in doubt."""
+"""From the coarse level to the judged one, at most (docs/decisions/registration.md)."""
+KEPT_TO_FINISH = 3  # the best and its rivals
+KEPT_TO_FINEST = 12  # compared one level finer, at most, where they are in doubt
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
-"""Candidates below these shares of the best score are dropped, after one step and after all steps
-of a level (docs/decisions/registration.md)."""
-MIN_HOPEFUL = 4
-"""So many stay whatever their score, for the scores need rivals."""
+"""Shares of the best score to stay, after one step and all (docs/decisions/registration.md)."""
+MIN_HOPEFUL = 4  # so many stay anyway: the scores need rivals
 FIRST_STEPS = 1
-FULL_STEPS = 4
-"""Steps of refinement before and after the first of these decisions."""
-COVARIANCE_STEPS = 3
-"""Steps of the best place once more, with its covariance."""
+FULL_STEPS = 4  # before and after the first of these decisions
+COVARIANCE_STEPS = 3  # of the best place once more, with its covariance
 FINER_STEPS = 2
-"""Steps of refinement of a place one level finer."""
 ROUGH_STEP_PX = 0.1
-"""Candidates that are only compared need no smaller steps."""
-EXCLUSION_SHARE = 0.25
-"""A rival lies farther from the best than this share of the view's side."""
+EXCLUSION_SHARE = 0.25  # A rival lies farther from the best than this share of the view's side
 MAX_RATIO = 10.0
-"""Limit of the ratios in the scores."""
 RIVAL_SHARE = 0.75
-"""Candidates whose score on the terrain at the judged level is below this share of the best one are
-finished on level ground: what fits by chance fits as well there, and it costs half."""
-AGAIN_PX = 1.0
-"""A window that moved by more (pixels of the level, at its rim) is orthorectified again."""
-ROUNDS = 3
-"""At most so many times at the final level."""
-AROUND = 6
-"""Places whose surroundings are searched on the terrain, where no place stands out."""
-NEAR_REACH = 0.2
-"""They are searched so far, as a share of the view's side,"""
+"""Weaker ones are finished on level ground: chance fits as well there, at half the cost."""
+AGAIN_PX = 1.0  # A window moved by more (pixels of the level, at its rim) is orthorectified again,
+ROUNDS = 3  # at most so often
+AROUND = 6  # places whose surroundings are searched on the terrain, where none stands out,
+NEAR_REACH = 0.2  # as a share of the view's side,
 NEAR_TURNS_RAD, NEAR_SCALES = (-0.1, 0.0, 0.1), (-0.09, 0.0, 0.09)
-"""and under these headings and log scales around those of level ground."""
+"""and with these added to heading and log scale."""
 Given = TypeVar("Given")
 Made = TypeVar("Made")
 
@@ -71,20 +54,18 @@ Made = TypeVar("Made")
 class Place:
     """A place where a view may have been taken, and what is known of it so far.
 
-    - `judged`: its fit at the judged level. `level_score`: the score there on level ground, where
-      `judged` is on the terrain; `terrain`: the view orthorectified there.
-    - `twin`: the same place on the terrain, `around`: the best place around it there; None where
-      it was not asked for or level ground is as good. `tried`, `searched`: whether they were.
-    - `final`: its fit at the final level, by `templates`. With its covariance where it is the best.
-    - `total`: its scores at both levels added up. `again`: that at the judged level once it was
-      finished on the terrain. `gain`: this over the one on level ground; None: finished there.
-    - `score`: `total` less the cost of its prior. `finer`: score one level finer, NaN where that
-      was not needed; `fine`: both added up.
-    - `scores`: of the best place, the numbers behind a fix, as `docs/reference/formats.md` lists
-      them. `rivals`: the other finished places, best first, near ones too.
-    - `below_camera`: over relief its pose, with the height counted from the ground below the camera
-      instead of the mean ground of the window.
-    """
+    - `judged`: its fit at the judged level; `level_score`: on level ground, where `judged` is on
+      the terrain; `terrain`: the view orthorectified there.
+    - `twin`: the same on the terrain, `around`: the best around it there; None: level ground is as
+      good, or not asked for (`tried`, `searched`).
+    - `final`: its fit at the final level, by `templates`; with covariance for the best.
+    - `total`: scores of both levels added. `again`: the judged one after finishing on the terrain,
+      `gain`: over the one on level ground; None: finished there.
+    - `score`: `total` less the cost of its prior. `finer`: one level finer, NaN: not needed;
+      `fine`: sum.
+    - `scores`: of the best place, see `docs/reference/formats.md`. `rivals`: other finished places,
+      best first, near ones too.
+    - `below_camera`: the pose with the height counted from the ground below the camera."""
 
     judged: Fit
     level_score: float | None = None
@@ -107,21 +88,20 @@ class Place:
 
     @property
     def fit(self) -> Fit:
-        """The fit at the finest level so far."""
         return self.final or self.judged
 
     @property
     def pose(self) -> Pose:
-        """Where it is, its height counted from the ground below the camera."""
+        """With the height counted from the ground below the camera."""
         return self.below_camera or self.fit.pose
 
     def apart_px(self, other: "Place") -> float:
-        """Distance from another place, pixels of level 0."""
+        """In pixels of level 0."""
         return self.fit.pose.distance_px(other.fit.pose)
 
 
 class Placer:
-    """Judges and finishes the places of one view. Not to be shared between threads."""
+    """Judges and finishes the places of one view, in one thread."""
 
     def __init__(
         self,
@@ -133,8 +113,7 @@ class Placer:
         pool: Executor | None = None,
         ground: ViewOverGround | None = None,
     ) -> None:
-        """`pool`: threads that share the candidates; `ground`: None for level ground and views that
-        are not compared one level finer than the final one."""
+        """`pool` shares candidates; without `ground` it is level, and no level is finer."""
         self.templates, self.levels, self.prior = templates, levels, prior
         self.reference, self._pool, self._view_over_ground = reference, pool, ground
         self.is_level = ground is None or ground.relief.is_level
@@ -150,25 +129,21 @@ class Placer:
         return EXCLUSION_SHARE * self.templates.side_px
 
     def _value(self, fit: Fit) -> float:
-        """Score of a fit, less the cost of its prior."""
+        """Less the cost of its prior."""
         return fit.score - self.prior.cost(fit.pose)
 
     def refiner(self, level: int, templates: ViewTemplates | None = None) -> Refiner:
-        """The refiner of the view at one of its levels."""
         made = (templates or self.templates).at(level, self.levels.recipe(level))
         return Refiner(made, self.reference)
 
     def shared(self, function: Callable[[Given], Made], given: Sequence[Given]) -> list[Made]:
-        """What a function makes of each, in order; by all threads, where there are some."""
+        """In order; by all threads, where there are some."""
         return list((self._pool.map if self._pool else map)(function, given))
 
     # Judging
 
     def judge(self, poses: Sequence[Pose], level: int, known: Sequence[Place] = ()) -> list[Place]:
-        """Candidates found at `level`, refined down to the judged level, best first.
-
-        Those far below the best are dropped; at the judged level the best `known` one counts too.
-        """
+        """Refined down to the judged level, best first; the best `known` place counts too."""
         fits: list[Fit] = []
         for at in range(level, self.levels.judged - 1, -1):
             is_last = at == self.levels.judged
@@ -179,13 +154,12 @@ class Placer:
         return [Place(each) for each in fits]
 
     def direct(self, poses: Sequence[Pose]) -> list[Place]:
-        """Candidates found at the final level, with their scores at the judged one: refined there
-        they would be lost again."""
+        """Found at the final level, scored at the judged one: refined there they would be lost."""
         refiner = self.refiner(self.levels.judged)
         return [Place(refiner.place(each, 0)) for each in poses]
 
     def standing(self, places: Sequence[Place]) -> tuple[float, float]:
-        """Score of the best judged place, and of its strongest rival."""
+        """Of the best judged place, and of its strongest rival."""
         values = [self._value(each.judged) for each in places]
         best = max(range(len(places)), key=lambda number: values[number])
         middle = places[best].judged.pose
@@ -199,7 +173,7 @@ class Placer:
     def _compared(
         self, refiner: Refiner, poses: Sequence[Pose], known: Sequence[Place]
     ) -> list[Fit]:
-        """Candidates refined at one level, best first; those without hope only a little."""
+        """Best first; those without hope are refined only a little."""
         ranked = self._ranked(self._refined_all(refiner, poses, FIRST_STEPS))
         least, at_least = 0.0, MIN_HOPEFUL
         if known:
@@ -209,7 +183,6 @@ class Placer:
         return self._ranked(self._refined_all(refiner, hopeful, FULL_STEPS) + ranked[count:])
 
     def _refined_all(self, refiner: Refiner, poses: Sequence[Pose], steps: int) -> list[Fit]:
-        """Candidates after so many steps at most, in their order."""
         refiner.prepare()
         return self.shared(lambda pose: refiner.place(pose, steps, ROUGH_STEP_PX), poses)
 
@@ -225,7 +198,7 @@ class Placer:
         return min(max(enough, at_least), len(ranked))
 
     def _apart(self, ranked: Sequence[Fit], apart_px: float, count: int) -> list[int]:
-        """Numbers of the first `count` fits that are farther than this from each other."""
+        """Numbers of the first `count` fits that are farther apart."""
         chosen: list[int] = []
         for number, each in enumerate(ranked):
             if len(chosen) == count:
@@ -237,12 +210,8 @@ class Placer:
     # On the terrain
 
     def on_terrain(self, places: Sequence[Place], at_most: int) -> list[Place]:
-        """The best judged places that lie apart, at most `at_most`, on the terrain at the judged
-        level where they are better there, and the others as they were.
-
-        The surroundings of the first `AROUND` are searched: where relief displaces much, the right
-        one may be far down the list of those on level ground, and off by more than refinement
-        follows.
+        """The best judged places that lie apart, on the terrain where they are better there; the
+        first `AROUND` with their surroundings, for relief displaces more than refinement follows.
         """
         if self.is_level:
             return list(places)
@@ -258,15 +227,13 @@ class Placer:
         return found
 
     def _best_apart(self, places: Sequence[Place], count: int) -> list[int]:
-        """Numbers of the best judged places that lie apart."""
         order = sorted(range(len(places)), key=lambda number: -self._value(places[number].judged))
         ranked = [places[number].judged for number in order]
         apart_px = EXCLUSION_SHARE * self._ground.view.side_px
         return [order[number] for number in self._apart(ranked, apart_px, count)]
 
     def _twin(self, place: Place) -> Place | None:
-        """A place refined on the terrain at the judged level, once; None where level ground is as
-        good."""
+        """A place refined on the terrain, once; None where level ground is as good."""
         if not place.tried:
             place.tried, pose = True, place.judged.pose
             if not self._ground.is_level(pose):
@@ -280,8 +247,7 @@ class Placer:
         return refiner.place(pose, FULL_STEPS, ROUGH_STEP_PX)
 
     def _best_around(self, place: Place) -> Place | None:
-        """`_twin`, or a better place by a search around it at the coarse level: far off nadir,
-        relief displaces a view by more than refinement follows."""
+        """`_twin`, or a better place by a search around it at the coarse level."""
         twin = self._twin(place)
         if twin is None or place.searched:
             return place.around
@@ -318,12 +284,9 @@ class Placer:
         kept: int = KEPT_TO_FINISH,
         finer: bool = False,
     ) -> Place:
-        """The best of judged places, found by one or more searches of `candidates` in all.
-
-        The best `kept` of them are refined at the final level, and all `direct` ones, which were
-        found there. With `finer` the best `KEPT_TO_FINEST` of those are compared one level finer as
-        well. `places` must not be empty.
-        """
+        """The best of judged places, found by searches of `candidates` in all: the best `kept` and
+        all `direct` ones at the final level, with `finer` the best `KEPT_TO_FINEST` one level
+        finer."""
         ranked = sorted(places, key=lambda each: -self._value(each.judged))
         chosen = self._apart([each.judged for each in ranked], self._exclusion_px, kept)
         apart = [ranked[number] for number in chosen]
@@ -349,11 +312,8 @@ class Placer:
         )
 
     def _finish(self, place: Place) -> None:
-        """Refine a place at the final level, once: on the terrain, or on level ground where that is
-        as good, or where less than half of the ground is known.
-
-        Only a place that is not far below the best one before it is worth its terrain.
-        """
+        """At the final level, once: on the terrain, unless level ground is as good, too little is
+        known, or it is far below the best one before."""
         if place.final is not None:
             return
         first = None
@@ -378,7 +338,6 @@ class Placer:
             place.total = place.final.score + again.score
 
     def _finish_on_terrain(self, place: Place, pose: Pose) -> None:
-        """From a pose on the terrain."""
         levels = self.levels
         for _ in range(ROUNDS):
             made = self._ground.templates_at(pose, levels.final)
@@ -402,7 +361,7 @@ class Placer:
         place.gain = again / max(on_level, 1e-6)
 
     def _finer_score(self, place: Place) -> float:
-        """Score one level finer than the final one, made once."""
+        """One level finer than the final one, once."""
         if math.isnan(place.finer):
             level, made = self.levels.final - 1, None
             if place.gain is not None:
@@ -418,19 +377,18 @@ class Placer:
         return ViewTemplates(made.grey, made.valid, level)
 
     def _with_covariance(self, pose: Pose, templates: ViewTemplates | None = None) -> Fit:
-        """A fit once more, at the final level, with its covariance."""
+        """At the final level, once more."""
         refiner = self.refiner(self.levels.final, templates)
         return refiner.place(pose, COVARIANCE_STEPS, with_covariance=True)
 
     def covariance_at(self, pose: Pose) -> NDArray[np.float64]:
-        """Covariance (4, 4) of the fit near a pose, on level ground."""
+        """Of the fit (4, 4) near a pose, on level ground."""
         found = self._with_covariance(pose).covariance
         assert found is not None
         return found
 
     def below_camera(self, best: Place) -> Place:
-        """A best place that knows its height, and those of its rivals, above the ground below the
-        camera."""
+        """With heights, of its rivals too, counted from the ground below the camera."""
         for each in (best, *best.rivals):
             if each.gain is not None:
                 each.below_camera = self._ground.below_camera(each.fit.pose)
@@ -439,8 +397,7 @@ class Placer:
     def _scores(
         self, finalists: Sequence[Place], judged: Sequence[Place], final: Fit
     ) -> dict[str, float]:
-        """The numbers behind the first of finished places, `final` with its covariance, among all
-        judged ones."""
+        """The numbers behind the first finished place, `final` with its covariance."""
         best, cost, fit = finalists[0], self.prior.cost, finalists[0].fit
         far = [each for each in finalists if each.apart_px(best) > self._exclusion_px]
         others = [
@@ -487,7 +444,7 @@ class Placer:
 
 
 def _weight(place: Place, best: Place) -> float:
-    """Score of a finished place, at most as far below that of the best as with the finer level."""
+    """At most as far below that of the best as with the finer level."""
     if math.isnan(place.fine) or best.fine <= 0:
         return place.score
     return min(place.score, best.score * place.fine / best.fine)

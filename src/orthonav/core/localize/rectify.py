@@ -1,8 +1,6 @@
 """Rectifying a view: as if the camera had looked straight down, at the map's resolution.
 
-Over flat ground, north up or heading up, or over a terrain, whose height is known at every node of
-the window. Rolling shutter is ignored.
-"""
+Over flat ground, north up or heading up, or over a terrain. Rolling shutter is ignored."""
 
 import math
 from dataclasses import dataclass, replace
@@ -25,29 +23,24 @@ from orthonav.core.geo.camera import (
 from orthonav.core.records import Telemetry, View
 
 NODE_PX = 4
-"""Heights and projections are computed at every so many pixels of the window, between them
-interpolated: at most one and a half postings of a usual terrain layer."""
+"""Spacing of heights and projections: at most one and a half postings of a usual terrain."""
 MAX_COARSER = 3.0
-"""Ground seen more coarsely than this, as a multiple of the window's pixel and of the finest ground
-of the view, does not count: it adds less than relief and haze take away."""
-SIGHT_STEPS = 48
-"""Points along a line of sight, at most, at which the ground may hide what lies behind."""
-CLEAR_M = 0.5
-"""Ground may rise so far above a line of sight: the error of interpolation."""
+"""Coarser ground, over the window's pixel and the view's finest ground, does not count."""
+SIGHT_STEPS = 48  # of a line of sight, at most
+CLEAR_M = 0.5  # error of interpolation
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Orientation:
-    """Where a camera was: `position_m` (3,) metres east and north in the sheet and above mean sea
-    level; `attitude_deg` (3,): heading, pitch and roll (`orthonav.core.geo.camera`)."""
+    """`position_m` (3,): east, north, above sea; `attitude_deg` (3,): heading, pitch, roll."""
 
     position_m: Array
     attitude_deg: Array
 
     def moved(self, step: Array) -> "Orientation":
-        """This orientation after a step (6,): metres and degrees."""
+        """By metres and degrees (6,)."""
         return Orientation(self.position_m + step[:3], self.attitude_deg + step[3:])
 
     def seen_px(self, camera: Camera, ground_m: Array) -> Array:
@@ -57,7 +50,7 @@ class Orientation:
 
 
 def node_px(shape: tuple[int, int]) -> Array:
-    """Pixel coordinates (h, w, 2) of the nodes of a window, x and y."""
+    """Of the nodes (h, w, 2) of a window, x and y."""
     rows, cols = (np.arange(0.5, side + 2 * NODE_PX, NODE_PX) for side in shape)
     return np.stack(np.meshgrid(cols, rows), axis=-1)
 
@@ -65,11 +58,9 @@ def node_px(shape: tuple[int, int]) -> Array:
 def orthorectified(
     view: View, orientation: Orientation, nodes_m: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], Mask]:
-    """Grey and valid (H, W) of a window of ground as a camera saw it; grey 0 where not valid.
+    """Grey and valid (H, W) of a window of ground; grey 0 where not valid.
 
-    `nodes_m` (h, w, 3): metres east, north and above sea of the nodes (`node_px`) of a window of
-    `shape`; NaN where the height is unknown.
-    """
+    `nodes_m` (h, w, 3): east, north, above sea at `node_px`; NaN where unknown."""
     index = orientation.seen_px(view.camera, nodes_m) - 0.5
     usable = np.isfinite(index).all(axis=-1) & _fine(view, index)
     usable &= ~hidden(nodes_m, orientation.position_m)
@@ -86,7 +77,7 @@ def orthorectified(
 
 
 def _fine(view: View, index: Array) -> Mask:
-    """Which nodes (h, w) of a window with image points (h, w, 2) are seen finely enough."""
+    """Which nodes (h, w), with image points (h, w, 2), are seen finely enough."""
     with np.errstate(invalid="ignore"):
         (down_x, right_x), (down_y, right_y) = (
             np.gradient(index[..., axis], NODE_PX) for axis in (0, 1)
@@ -99,10 +90,7 @@ def _fine(view: View, index: Array) -> Mask:
 
 
 def hidden(nodes_m: Array, position_m: Array) -> Mask:
-    """Which ground points (h, w, 3) of a window the ground of that window hides from a camera.
-
-    Lines of sight are followed within the window only, towards the camera.
-    """
+    """Which ground points (h, w, 3) of a window its own ground hides from the camera."""
     offset = nodes_m[..., :2] - position_m[:2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
     above = position_m[2] - nodes_m[..., 2]
@@ -121,7 +109,6 @@ def hidden(nodes_m: Array, position_m: Array) -> Mask:
 
 
 def _behind(nodes_m: Array, position_m: Array, sight: Array) -> Mask:
-    """The same, by following every line of sight."""
     origin = nodes_m[0, 0, :2]
     axes = np.stack([nodes_m[0, 1, :2] - origin, nodes_m[1, 0, :2] - origin], axis=1)
     to_camera = np.linalg.solve(axes, position_m[:2] - origin)
@@ -145,22 +132,17 @@ def _behind(nodes_m: Array, position_m: Array, sight: Array) -> Mask:
 
 
 MAX_REACH = 2.0
-MAX_NEAR_NADIR_DEG = 45.0
-"""Views farther off nadir are used in part."""
-NEAR_CELLS = 32
-"""Cells along both sides of a picture in which it is found out how finely it sees the ground."""
+MAX_NEAR_NADIR_DEG = 45.0  # views farther off nadir are used in part
+NEAR_CELLS = 32  # along both sides of a picture, to find how finely it sees the ground
 EDGE_PX = 1e-6
-NODE_ERROR_PX = 0.02
-"""The lens is computed at every `NODE_PX` only where that makes no more difference than this."""
+NODE_ERROR_PX = 0.02  # the lens is computed at every `NODE_PX` where that errs by no more
 
 
 @dataclass(frozen=True, eq=False)
 class RectifiedView:
-    """A view as a vertical, north-up or heading-up picture at one ground resolution.
+    """A vertical picture (H, W), north up or heading up; grey 0 where not valid.
 
-    `grey` (H, W) uint8 and `valid` (H, W) bool, grey 0 where not valid; `offset_en_m` where the
-    centre of the window lies, metres east and north of the camera.
-    """
+    `offset_en_m`: centre of the window, metres east and north of the camera."""
 
     grey: NDArray[np.uint8]
     valid: NDArray[np.bool_]
@@ -168,26 +150,22 @@ class RectifiedView:
 
 
 def is_oblique(view: View) -> bool:
-    """Whether a view is far off nadir, or its picture does not hold its principal point: its part
-    near enough is then rectified (`near_part`)."""
+    """Far off nadir, or cropped so that the principal point is missing: see `near_part`."""
     camera = view.camera
     inside = 0 <= camera.cx_px <= camera.width_px and 0 <= camera.cy_px <= camera.height_px
     return not inside or off_nadir_deg(view.telemetry) > MAX_NEAR_NADIR_DEG
 
 
 def off_nadir_deg(telemetry: Telemetry) -> float:
-    """Angle between the optical axis and straight down, degrees."""
+    """Of the optical axis."""
     up = enu_from_camera(0.0, telemetry.pitch_deg, telemetry.roll_deg)[2, 2]
     return math.degrees(math.acos(max(-1.0, min(1.0, -float(up)))))
 
 
 @dataclass(frozen=True)
 class NearPart:
-    """The part of a view that is seen finely enough, on flat ground, for a heading of 0.
-
-    `low_m`, `high_m`: its box, metres east and north of the camera. `area_m2`: what of the box is
-    seen. `finest_m`: side of the finest pixel on the ground.
-    """
+    """The part of a view seen finely enough, on flat ground, for a heading of 0: its box `low_m`,
+    `high_m`, east and north, what is seen of it, and its finest pixel."""
 
     low_m: Array
     high_m: Array
@@ -196,8 +174,7 @@ class NearPart:
 
 
 def near_part(view: View, gsd_m: float) -> NearPart | None:
-    """The part of a view that is not much coarser than its finest one and than `gsd_m`; None where
-    it sees no ground."""
+    """Not much coarser than the finest part and than `gsd_m`; None where no ground is seen."""
     camera, telemetry = view.camera, view.telemetry
     cells = [np.linspace(0, side, NEAR_CELLS + 1) for side in (camera.width_px, camera.height_px)]
     px = np.stack(np.meshgrid(*cells), axis=-1).reshape(-1, 2)
@@ -218,7 +195,7 @@ def near_part(view: View, gsd_m: float) -> NearPart | None:
 
 
 def downsampled(view: View, gsd_m: float) -> View:
-    """The view averaged down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
+    """Averaged by whole numbers towards `gsd_m`, so that resampling cannot alias."""
     camera, agl_m = view.camera, view.telemetry.agl_m
     pixel_m = camera.gsd_m(agl_m)
     if is_oblique(view) and (near := near_part(view, gsd_m)) is not None:
@@ -236,10 +213,7 @@ def downsampled(view: View, gsd_m: float) -> View:
 
 
 def rectify(view: View, *, gsd_m: float, size_px: int) -> RectifiedView:
-    """A square of `size_px` pixels, north up, around the point where the optical axis meets ground.
-
-    The axis must point below the horizon. Pixels that the camera did not see are not valid.
-    """
+    """A square, north up, where the optical axis, which must descend, meets the ground."""
     telemetry = view.telemetry
     attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     offset = np.array(axis_on_ground_en_m(*attitude))
@@ -248,13 +222,10 @@ def rectify(view: View, *, gsd_m: float, size_px: int) -> RectifiedView:
 
 
 def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> RectifiedView:
-    """Rectify what the camera sees, its own heading up, sides whole multiples of `multiple_px`.
+    """What the camera sees, its own heading up, sides whole multiples of `multiple_px`.
 
-    What is left over of the sides is cut off, so that a vertical view has no pixels not seen.
-    Where the view reaches far out to one side (it tilts), no more than `MAX_REACH` times the half
-    sides of a vertical view are kept on either side of the optical axis. The `offset_en_m` is that
-    of a heading of 0.
-    """
+    Remainders are cut off, so that a vertical view has no pixels not seen; a tilted one is kept to
+    `MAX_REACH` times the half sides of a vertical one. `offset_en_m` is that of a heading of 0."""
     camera, telemetry = view.camera, view.telemetry
     pitch_deg, roll_deg, agl_m = telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     if is_oblique(view):
@@ -277,7 +248,6 @@ def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> Rectifie
 
 
 def _rectify_near(view: View, gsd_m: float, multiple_px: int) -> RectifiedView:
-    """The part of a view that is seen finely enough, its own heading up."""
     telemetry, near = view.telemetry, near_part(view, gsd_m)
     if near is None:
         empty = np.zeros((multiple_px, multiple_px), np.uint8)
@@ -301,7 +271,7 @@ def _window(
     gsd_m: float,
     shape: tuple[int, int],
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Grey and valid of the window of ground about `middle_en_m`, metres from the camera."""
+    """Of the window of ground about `middle_en_m`, metres from the camera."""
     height, width = shape
     west, north = middle_en_m + np.array([-width, height]) * gsd_m / 2
     en_from_window = np.array([[gsd_m, 0, west], [0, -gsd_m, north], [0, 0, 1]])
@@ -316,7 +286,7 @@ def _window(
 def _warped(
     view: View, camera_from_window: Array, shape: tuple[int, int], corners: Array
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The fast path: no distortion, no horizon, so one homography does it."""
+    """Without distortion and horizon: one homography."""
     size = shape[1], shape[0]
     px_from_window = view.camera.matrix @ camera_from_window
     matrix = counted_from_centres(px_from_window)
@@ -340,7 +310,7 @@ def _warped(
 def _remapped(
     view: View, camera_from_window: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The general path: every pixel through lens and horizon."""
+    """Every pixel through lens and horizon."""
     camera = view.camera
     height, width = shape
     # Seldom needed for every pixel: between nodes straight lines are exact enough.
@@ -364,10 +334,9 @@ def _remapped(
 
 
 def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
-    """Whether straight lines between nodes (H, W, 2) miss by less than `NODE_ERROR_PX` in the view.
+    """Whether lines between nodes (H, W, 2) miss by less than `NODE_ERROR_PX`.
 
-    Between every other node they miss by four times as much, which the skipped nodes show.
-    """
+    Between every other node they miss by four times as much, which the skipped nodes show."""
     odd = [side // 2 * 2 - 1 for side in index.shape[:2]]
     even = index[: odd[0] : 2, : odd[1] : 2]
     middle = (even[:-1, :-1] + even[1:, :-1] + even[:-1, 1:] + even[1:, 1:]) / 4
@@ -379,7 +348,7 @@ def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
 
 
 def _seen_px(camera: Camera, camera_from_window: Array, rows: Array, cols: Array) -> Array:
-    """Where the camera saw a grid of the window (H, W, 2), NaN where it saw nothing."""
+    """Of a grid of the window (H, W, 2), NaN where nothing is seen."""
     x, y = np.meshgrid(cols, rows)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera_from_window.T
     return seen_px(camera, rays)

@@ -1,8 +1,7 @@
 """The search for the place of one view: steps that find candidates, and when they are enough.
 
 `policy` says what is tried and what it costs; each step finds candidates in its way, `place` judges
-them. A search ends as soon as the best place stands out or is proven by its confidence.
-"""
+them. A search ends as soon as the best place stands out or is proven by its confidence."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,30 +21,19 @@ from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.search import (
-    PLACES_AT_ONCE,
-    Peak,
-    best_near,
-    largest_half_px,
-    search,
-)
-from orthonav.core.tiles.exact import rows_within
+from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
+from orthonav.core.tiles.position import rows_within
 
-SAME_PLACE_SHARE = 1 / 8
-"""Candidates from tiles closer together than this share of the view's side are one place."""
+SAME_PLACE_SHARE = 1 / 8  # closer candidates from tiles are one place
 WHOLE_WINDOW_PX = 8_000_000
-"""Up to so many pixels of the coarse level their surroundings are cut out of one window of the
-whole sheet (12 bytes each); of larger sheets a window is made for each."""
+"""Up to so many pixels of the coarse level one window of the whole sheet is cut (12 bytes each)."""
 
 
 @dataclass(frozen=True)
 class Step(ABC):
-    """One way to find candidates.
+    """One way to find candidates, at `level`; those of tiles are refined there first.
 
-    `level`: of the map at which they are found; those of tiles are refined there first.
-    `directions`: headings and log scales to try; `whole`: their number in all stages, which share
-    the cost. `count`: at most so many candidates are taken.
-    """
+    `directions`: to try, of `whole` in all stages, which share the cost. `count`: at most."""
 
     search: "Search"
     level: int
@@ -56,23 +44,22 @@ class Step(ABC):
 
     @property
     def cost_ms(self) -> float:
-        """Its estimated cost; infinite where it is impossible."""
+        """Infinite where it is impossible."""
         return self.whole_cost_ms() * len(self.directions) / self.whole
 
     @abstractmethod
     def whole_cost_ms(self) -> float:
-        """That of all stages."""
+        """Of all stages."""
 
     @abstractmethod
     def run(self) -> list[Peak]:
-        """The candidates it finds, best first."""
+        """Best first."""
 
 
 class FftStep(Step):
     """The best places of the sheet, or of what the prior allows, at a level."""
 
     def whole_cost_ms(self) -> float:
-        """Of an FFT of the area under each direction, and of places near by where it is far up."""
         cost_ms = self.search.fft_ms(self.level, self.whole)
         if self.level > self.search.levels.coarse:
             cost_ms += self.search.costs.nearby_ms * self.count
@@ -105,14 +92,13 @@ class TileStep(Step):
     from_tiles = True
 
     def whole_cost_ms(self) -> float:
-        """Of embedding the view under each direction and comparing all tiles."""
         made = self.search
         assert made.sheet.propose is not None
         tiles, dims = made.tiles, made.sheet.propose.embedder.dims
         return made.costs.tiles_ms(self.whole, tiles, dims) + made.costs.nearby_ms * self.count
 
     def run(self) -> list[Peak]:
-        """The tiles that no tile next to them exceeds."""
+        """Those that no tile next to them exceeds."""
         made, grid = self.search, self.search.sheet.grid
         assert made.sheet.propose is not None
         # Over a terrain the telemetry predicts another scale at every place.
@@ -133,11 +119,9 @@ class TileStep(Step):
 
 
 class Search:
-    """The search for one view on one sheet: the view, what is known of its place, and the places
-    found so far. To be run once."""
+    """The search for one view on one sheet, to be run once."""
 
     def __init__(self, sheet: SearchedSheet, view: PreparedView, prior: Prior | None) -> None:
-        """`prior`: None: anywhere on the sheet."""
         self.sheet, self.view, self.prior = sheet, view, prior
         self.plan, self.policy, self.costs = sheet.plan, sheet.plan.policy, sheet.plan.costs
         self.levels = view.levels
@@ -158,7 +142,7 @@ class Search:
         self.budget = Budget(self.plan.budget_ms)
 
     def run(self) -> Place | NoFix:
-        """The best place within the prior, its height counted from the ground below the camera."""
+        """With its height counted from the ground below the camera."""
         if not self.touches_map:
             return NoFix("outside_map", "the area of the prior is outside the map")
         best = self.best()
@@ -170,7 +154,7 @@ class Search:
         return NoFix("no_match", detail)
 
     def best(self) -> Place | None:
-        """The best place after all steps that had to be run; None where nothing was found."""
+        """None where nothing was found."""
         for step in self.steps():
             if early := self._proven_before(step):
                 return early
@@ -182,14 +166,13 @@ class Search:
         return self._concluded() if self.places else None
 
     def camera(self, place: Place) -> CameraFound | None:
-        """The camera of a finished place with its pitch and roll; None where the reported ones are
-        exact or the view does not show them."""
+        """None where the reported tilt is exact or the view does not show it."""
         return camera_found(self.ground, self.sheet.reference, place.fit.pose)
 
     # What is tried
 
     def steps(self) -> Iterator[Step]:
-        """The steps for the view, to be run in this order until the search ends."""
+        """To be run in this order until the search ends."""
         policy, levels, prior = self.policy, self.levels, self.view.prior
         judged = policy.directions(prior, policy.judged_steps)
         judged_ms, tried_all = self.fft_ms(levels.judged, len(judged)), False
@@ -220,7 +203,7 @@ class Search:
             yield step
 
     def _coarse_steps(self) -> list[Step]:
-        """The coarse level, or one level above it where that takes too long; and tiles."""
+        """The coarse level, or one above it where that takes too long; and tiles."""
         policy, level = self.policy, self.levels.coarse
         tried = [each for each, _ in policy.directions(self.view.prior, policy.coarse_steps)]
         coarse = FftStep(self, level, tried, policy.candidates, len(tried))
@@ -234,8 +217,7 @@ class Search:
         return [coarse, TileStep(self, level, tried, count, len(tried))]
 
     def _likely_first(self, step: Step) -> Iterator[Step]:
-        """A step under its likely directions, then under the others; at once where the heading is
-        known."""
+        """Likely directions first; all at once where the heading is known."""
         likely = step.whole
         if self.view.prior.turn_rad is None:
             rated = self.policy.directions(self.view.prior, self.policy.coarse_steps)
@@ -248,7 +230,7 @@ class Search:
 
     @cached_property
     def middle_px(self) -> tuple[float, float]:
-        """The middle of the view as the prior expects it, x and y at level 0."""
+        """Where the prior expects the view, x and y at level 0."""
         assert self.prior is not None
         view = self.view
         place = self.sheet.sheet.frame.en_from_latlon(self.prior.lat_deg, self.prior.lon_deg)
@@ -260,7 +242,7 @@ class Search:
 
     @cached_property
     def reach_px(self) -> float:
-        """How far from there it may lie, in pixels of level 0; infinite without a prior."""
+        """In pixels of level 0; infinite without a prior."""
         if self.prior is None:
             return math.inf
         view = self.view
@@ -271,7 +253,6 @@ class Search:
 
     @property
     def touches_map(self) -> bool:
-        """Whether any of the map lies where the prior allows the view to be."""
         if self.prior is None:
             return True
         (x, y), reach = self.middle_px, self.reach_px
@@ -279,8 +260,7 @@ class Search:
         return -reach < x < cols + reach and -reach < y < rows + reach
 
     def fft_ms(self, level: int, poses: int) -> float:
-        """Estimated cost of an FFT search at a level, of the sheet or of what the prior allows;
-        infinite where there is no such level."""
+        """Of the sheet or what the prior allows; infinite where there is no such level."""
         if level >= self.sheet.reference.levels:
             return math.inf
         rows, cols = self.sheet.reference.shape(level)
@@ -294,7 +274,6 @@ class Search:
 
     @cached_property
     def tiles(self) -> int:
-        """Number of tiles to compare with the view."""
         propose, rows = self.sheet.propose, self.tile_rows
         if propose is None or not propose.fits(self.view.side_px, self.policy.view_tiles):
             return 0
@@ -302,7 +281,7 @@ class Search:
 
     @cached_property
     def tile_rows(self) -> NDArray[np.intp] | None:
-        """Rows of the tiles that the prior allows, None for all."""
+        """Of the tiles that the prior allows, None for all."""
         if self.prior is None or self.sheet.propose is None:
             return None
         grid, (x, y) = self.sheet.grid, self.middle_px
@@ -313,11 +292,9 @@ class Search:
     # Candidates
 
     def nearby(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
-        """Candidates at the best place within `reach_px` (level 0) of each, at the coarse level,
-        under their log scale plus each of the policy's.
+        """At the best place within `reach_px` (level 0) of each, at the coarse level, best first.
 
-        Best first; of candidates that end at the same place the best one stays.
-        """
+        Of candidates that end at the same place the best one stays."""
         moved = sorted(self._moved(found, reach_px), key=lambda each: -each.score)
         places = np.array([complex(each.pose.x_px, each.pose.y_px) for each in moved])
         free, kept = np.ones(len(moved), np.bool_), []
@@ -329,7 +306,7 @@ class Search:
         return kept
 
     def allowed_nearby(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
-        """The promising ones of those that the prior allows."""
+        """The promising ones within the prior."""
         kept = self.promising(self.nearby(found, reach_px))
         if self.prior is None:
             return kept
@@ -341,7 +318,6 @@ class Search:
         ]
 
     def _moved(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
-        """Each candidate at the best place near by."""
         level, windows = self.levels.coarse, self.sheet.windows
         recipe, side_px = self.levels.recipe(level), self.view.templates.side_px
         template, whole = self.view.templates.at(level, recipe), None
@@ -364,7 +340,7 @@ class Search:
         return [each for some in self.placer.shared(moved, parts) for each in some]
 
     def promising(self, found: list[Peak]) -> list[Peak]:
-        """The first of candidates, best first: those that are not far weaker than the best."""
+        """Without those far weaker than the best."""
         least = self.policy.candidate_share
         enough = sum(each.score >= least * found[0].score for each in found)
         return found[: max(enough, self.policy.min_candidates)]
@@ -372,7 +348,6 @@ class Search:
     # When it ends
 
     def _take(self, step: Step) -> None:
-        """Run a step and judge what it finds."""
         found = [each.pose for each in step.run()]
         self.candidates += len(found)
         self.last = step
@@ -383,7 +358,6 @@ class Search:
             self.places += self.placer.judge(found, level, self.places)
 
     def _clear_after(self, step: Step) -> Place | None:
-        """The best place so far, if it stands out so far that the search ends with it."""
         policy, levels = self.policy, self.levels
         is_fine = step.from_tiles or step.level == levels.judged
         margin = policy.clear_at_judged if is_fine else policy.clear
@@ -401,13 +375,10 @@ class Search:
     def _proven_before(self, step: Step) -> Place | None:
         """The best place so far, if a trial before the next step proves it.
 
-        The best few are placed on the terrain, where there is one, and finished; where that proves
-        none, they are compared one level finer, if there is such a level. Where only a part of all
-        places was compared, or only a few on the terrain, the best must stand out too. There is no
-        trial before a step that costs less, except that of the final level: this one is run only
-        where all directions of the judged level are cheap, after them, so that the best need only
-        be as certain as at the end of all steps.
-        """
+        The best few are finished on the terrain; where that proves none, they are compared one
+        level finer. Where only a part of all places was compared, the best must stand out too. No
+        trial before a step that costs less, except the final level, before which all directions
+        were tried."""
         policy, last, levels = self.policy, self.last, self.levels
         if last is None or self.sheet.confidence is None or levels.final == levels.judged:
             return None
@@ -432,11 +403,7 @@ class Search:
         return None
 
     def _concluded(self) -> Place:
-        """The best place after all steps, none of which ended with one that stands out.
-
-        While it is not proven, more candidates are finished, and compared one level finer where
-        there is such a level.
-        """
+        """After all steps. While none is proven, more are finished and compared one level finer."""
         policy, levels, places = self.policy, self.levels, self.places
         if not self.placer.is_level and self.budget.allows(0.0):
             places = self.placer.on_terrain(places, policy.terrain_candidates)
@@ -456,7 +423,6 @@ class Search:
         return self.placer.finished(places, self.candidates, self.direct, kept=kept, finer=finer)
 
     def _is_clear(self, best: Place, margin: ClearMargin) -> bool:
-        """Whether a finished place stands out by a margin."""
         scores = best.scores
         return (
             scores["strength"] > margin.strength * self.chances.total
@@ -465,6 +431,5 @@ class Search:
         )
 
     def _is_proven(self, best: Place, doubt: float) -> bool:
-        """Whether a place has a confidence above 1 - `doubt`."""
         confidence = self.sheet.confidence
         return confidence is not None and confidence(best.scores) > 1 - doubt

@@ -1,9 +1,7 @@
 """Placing a view by its tile: embed it under a few headings, and find the most similar tile.
 
-As Di Piazza et al. 2024 do. Positions are good to a fraction of a tile; maps with a registration
-layer are placed by `registration` instead, which uses these tiles for candidates only
-(`TileProposer`).
-"""
+As in Di Piazza et al. 2024, to a fraction of a tile. Maps with a registration layer use the tiles
+for candidates only (`TileProposer`)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,23 +22,22 @@ from orthonav.core.register.search import Peak
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import Representation, embed_poses
 from orthonav.core.tiles.embed import ViewEmbedder, embedder_of
-from orthonav.core.tiles.exact import ExactIndex, rows_within
-from orthonav.core.tiles.position import PositionRule, TileNeighbours, offset_en_m, parabola_peak
+from orthonav.core.tiles.position import (
+    ExactIndex,
+    PositionRule,
+    TileNeighbours,
+    offset_en_m,
+    parabola_peak,
+    rows_within,
+)
 from orthonav.core.tiles.whitened import WhitenedEmbedder
 from orthonav.core.variants import variant_from_recipe
 
-MAX_RATIO = 10.0
-"""Ratios are cut off here; a rival at or below zero leaves the best without any rival."""
+MAX_RATIO = 10.0  # A rival at or below zero leaves the best without any
 
 
 def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
-    """Best score over second best (Di Piazza et al. 2024, section 4), up to `MAX_RATIO`.
-
-    `best` is the index of the score that counts as best, the highest where None; where another one
-    is higher the ratio is below 1.
-
-    With dense overlap the second best tile is nearly always the neighbour of the best.
-    """
+    """Best score over second best (Di Piazza et al. 2024, section 4), up to `MAX_RATIO`."""
     if scores.size < 2:
         return MAX_RATIO
     if best is None:
@@ -50,16 +47,11 @@ def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
 
 
 def rival_score(
-    scores: NDArray[np.float32],
-    centres_en_m: NDArray[np.float32],
-    best: int,
-    exclusion_m: float,
+    scores: NDArray[np.float32], centres_en_m: NDArray[np.float32], best: int, exclusion_m: float
 ) -> float:
-    """Best score among tiles farther than `exclusion_m` from the best tile.
+    """Best score farther than `exclusion_m` from the best tile.
 
-    The best score itself where there is no such tile: without a rival nothing is known of how
-    much the best stands out, and that must not appear as certainty.
-    """
+    The best score itself where there is none: that must not appear as certainty."""
     offset = centres_en_m - centres_en_m[best]
     elsewhere = np.einsum("ij,ij->i", offset, offset) > exclusion_m**2
     if not elsewhere.any():
@@ -68,7 +60,6 @@ def rival_score(
 
 
 def peak_ratio(best_score: float, rival: float) -> float:
-    """Best score over the best score elsewhere (`rival_score`), up to `MAX_RATIO`."""
     return _ratio(best_score, rival)
 
 
@@ -78,19 +69,12 @@ def _ratio(best: float, second: float) -> float:
     return min(MAX_RATIO, best / second) if second > 0 else MAX_RATIO
 
 
-BACKGROUND_TILES = 20_000
-"""Rivals are taken from about so many tiles of the whole map, evenly spread: enough for the best
-rival, and the search of a narrow prior stays fast."""
+BACKGROUND_TILES = 20_000  # of the whole map, evenly spread, for rivals; a narrow prior stays fast
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """The best tile for one view.
-
-    `tile`: its row. `shift_en_m`: offset of the position from the centre of that tile, east and
-    north (m). `query`: index of the best of the headings tried. `evidence`: that of
-    `TileMatcher.match`.
-    """
+    """The best tile (row) for a view, offset from its centre, heading index, and evidence."""
 
     tile: int
     shift_en_m: tuple[float, float]
@@ -108,10 +92,7 @@ class TileMatcher:
         embeddings: NDArray[np.float16],
         position: PositionRule = "peak",
     ) -> None:
-        """`position` says how scores become a position between the tiles.
-
-        Raises `MapFileError` where the centres are not those of the grid.
-        """
+        """Raises `MapFileError` where the centres are not those of the grid."""
         self._position: PositionRule = position
         self.index = ExactIndex(embeddings)
         self.grid = grid
@@ -123,11 +104,9 @@ class TileMatcher:
     def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
         """Best tile for queries (Q, D), one per heading, among `rows` (all where None).
 
-        Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
-        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
-        are sought beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
-        narrow prior leaves no rival of its own, and that must not appear as certainty.
-        """
+        Evidence: `score` (scalar product), `margin` (over the best farther than half a tile away),
+        `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals are sought beyond `rows`
+        too: a narrow prior leaves none, and that must not appear as certainty."""
         searched = None
         if rows is not None:
             searched = np.union1d(rows, self._background)
@@ -168,11 +147,7 @@ class TileMatcher:
 
 @dataclass(frozen=True, eq=False)
 class TileProposer:
-    """Embeds a view under many poses and finds the most similar tiles.
-
-    `grid`, `centres_en_m` (N, 2) and `index` are those of the sheet's tiles, `neighbours` the tiles
-    next to each; `representation` and `embedder` made the embeddings.
-    """
+    """Embeds a view under many poses and finds the most similar tiles of a sheet."""
 
     grid: TileGrid
     centres_en_m: NDArray[np.float32]
@@ -185,8 +160,7 @@ class TileProposer:
     def of(
         cls, tiles: TileMatcher, embedder: ViewEmbedder, representation: Representation
     ) -> "TileProposer | None":
-        """A proposer for whitened embeddings, None for others: those cannot embed a view under
-        many poses at once."""
+        """None for embeddings that cannot embed a view under many poses at once."""
         if not isinstance(embedder, WhitenedEmbedder):
             return None
         return cls(
@@ -194,8 +168,7 @@ class TileProposer:
         )
 
     def fits(self, side_px: float, view_tiles: tuple[float, float]) -> bool:
-        """Whether a view of this side (pixels of the map) is from the least to the largest of
-        `view_tiles` tiles wide."""
+        """Whether its side (pixels of the map) is within `view_tiles` tiles."""
         smallest, largest = view_tiles
         return smallest * self.grid.tile_px <= side_px <= largest * self.grid.tile_px
 
@@ -207,11 +180,8 @@ class TileProposer:
         rows: NDArray[np.intp] | None,
         count: int,
     ) -> list[Peak]:
-        """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
-
-        `poses` are headings (rad) and log scales; scores are those of the embeddings, times the
-        `weights` (Q,) of the poses. Up to `count` tiles, the best of those that no tile next to
-        them exceeds: neighbours show the same ground.
+        """Up to `count` tiles that no tile next to them exceeds, among `rows`, for a view
+        heading-up at the map's resolution under headings (rad) and log scales with `weights` (Q,).
         """
         queries = embed_poses(
             self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
@@ -235,12 +205,8 @@ class TileProposer:
 def peak_poses(
     poses: NDArray[np.float64], scores: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Headings and log scales (N, 2) where the scores (N, Q) of poses (Q, 2) on a grid have their
-    peak.
-
-    By a parabola along each, or those of the best pose where one of its neighbours is missing. The
-    best one has the highest score times its weight (Q,); weights do not move the parabola.
-    """
+    """Headings and log scales (N, 2) at the peak of scores (N, Q), by parabolas, or the best pose
+    beside a missing one; weights (Q,) choose it, but do not move it."""
     off = poses - poses[:, None]
     off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
     best, tiles = (scores * weights).argmax(axis=1), np.arange(len(scores))
@@ -263,18 +229,15 @@ def peak_poses(
 
 
 HEADING_SIGMAS = 1.5
-"""Headings are tried this far around the reported one, in its standard deviations: three headings
-6 deg apart at 5 deg, as docs/decisions/embedding.md measured."""
+"""Reach in standard deviations: three headings at 5 deg (docs/decisions/embedding.md)."""
 UNKNOWN_HEADING_STEP_DEG = 8.0
-"""Spacing of all headings where none is reported: embeddings find their tile up to 8 deg off
-(docs/decisions/evidence.md)."""
+"""Embeddings find their tile up to 8 deg off (docs/decisions/evidence.md)."""
 
 
 class TileLocalizer:
-    """Places views on the tiles of one map. Safe to share between threads."""
+    """Places views on the tiles of one map; threads may share it."""
 
     def __init__(self, opened: MapFile, *, position: PositionRule, flying: bool) -> None:
-        """See `Localizer`; raises `MapFileError` if this program cannot fly the map."""
         manifest = opened.manifest
         self.sheet = manifest.sheets[0]
         self.grid = self.sheet.grid
@@ -308,11 +271,9 @@ class TileLocalizer:
         self.radius_m = manifest.radius_m
 
     def proposer(self) -> TileProposer | None:
-        """What finds candidates for registration; None for embeddings that cannot."""
         return TileProposer.of(self.matcher, self.embedder, self.representation)
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
-        """The position from which a view was taken; `check_view` has accepted the view."""
         headings = self._headings_deg(view.telemetry, heading_known)
         smaller = downsampled(view, self.grid.gsd_m)
         rectified = [self.rectified(smaller, heading) for heading in headings]
@@ -328,12 +289,11 @@ class TileLocalizer:
         return self._fix(match, rectified[match.query], headings[match.query], view.telemetry)
 
     def rectified(self, view: View, heading_deg: float) -> RectifiedView:
-        """The view under a heading, in size and resolution of a tile."""
+        """In size and resolution of a tile."""
         turned = replace(view, telemetry=replace(view.telemetry, yaw_deg=heading_deg))
         return rectify(turned, gsd_m=self.grid.gsd_m, size_px=self.grid.tile_px)
 
     def embedded(self, views: list[RectifiedView]) -> NDArray[np.float32]:
-        """Embeddings (Q, D) of rectified views."""
         return np.stack(
             [
                 self.embedder.view(self.representation(view.grey, view.valid), view.valid)
@@ -344,7 +304,7 @@ class TileLocalizer:
     def _allowed(
         self, prior: Prior | None, offsets_en_m: list[NDArray[np.float64]]
     ) -> NDArray[np.intp] | None:
-        """Rows of tiles that the camera may see: around the prior, displaced by the tilt."""
+        """Around the prior, displaced by the tilt."""
         if prior is None:
             return None
         offset = np.mean(offsets_en_m, axis=0)
@@ -354,7 +314,7 @@ class TileLocalizer:
         return rows_within(self.centres_en_m, centre, radius_m)
 
     def _headings_deg(self, telemetry: Telemetry, heading_known: bool) -> list[float]:
-        """Headings to try: around the reported one as far as its error reaches, or all."""
+        """Around the reported one as far as its error reaches, or all."""
         if not heading_known:
             return [float(heading) for heading in np.arange(0, 360, UNKNOWN_HEADING_STEP_DEG)]
         std = telemetry.yaw_std_deg

@@ -1,7 +1,4 @@
-"""A view made ready for registration: checked, and rectified with its own heading up.
-
-Views that cannot be placed are refused before any search, each by a `NoFix` with its reason.
-"""
+"""A view checked and rectified with its own heading up. What cannot be placed becomes a `NoFix`."""
 
 import math
 from dataclasses import dataclass
@@ -33,10 +30,8 @@ from orthonav.core.register.template import Levels, ViewTemplates
 MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
 MIN_VIEW_PX = 24.0
-"""Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
-that views are finished at (docs/decisions/registration.md)."""
-MIN_TILT_COS = 0.5
-"""Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
+"""Of the map: a sixth of the size that views are finished at (docs/decisions/registration.md)."""
+MIN_TILT_COS = 0.5  # beyond 60 deg the footprint is cut off, not expected to grow
 MAX_COARSER = 4.0
 DARK_LEVEL = 16.0
 BRIGHT_LEVEL = 250.0
@@ -45,7 +40,6 @@ _SAMPLE_STEP_PX = 8
 
 
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
-    """Why a view cannot be placed on a map of resolution `gsd_m`; None if it can be tried."""
     refused = check_telemetry(view.telemetry, view.camera, gsd_m, heading_known)
     return refused or check_picture(view.grey)
 
@@ -53,10 +47,7 @@ def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
 def check_telemetry(
     telemetry: Telemetry, camera: Camera, gsd_m: float | None, heading_known: bool
 ) -> NoFix | None:
-    """Why a view with this telemetry cannot be rectified to `gsd_m`; None if it can.
-
-    Without `gsd_m` its size beside a map is not checked.
-    """
+    """Without `gsd_m` its size beside a map is not checked."""
     missing = [name for name in telemetry.missing() if heading_known or name != "yaw_deg"]
     if missing:
         return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
@@ -83,7 +74,7 @@ def check_telemetry(
 
 
 def footprint_side_m(telemetry: Telemetry, camera: Camera) -> float:
-    """Root of the area of flat ground that a view shows, as it is expected from the telemetry."""
+    """Root of the area of flat ground expected from the telemetry."""
     tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(math.radians(telemetry.roll_deg))
     # The area seen grows with the inverse cube of the cosine of the tilt.
     across, along = camera.extent
@@ -91,7 +82,7 @@ def footprint_side_m(telemetry: Telemetry, camera: Camera) -> float:
 
 
 def check_picture(grey: NDArray[np.uint8]) -> NoFix | None:
-    """Why a view (H, W) shows nothing: too dark, too bright, blank; None if it shows something."""
+    """Too dark, too bright, blank?"""
     sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
     counts = np.bincount(sample.reshape(-1), minlength=256)
     low, high = (_percentile(counts, percent) for percent in (1, 99))
@@ -108,7 +99,7 @@ def check_picture(grey: NDArray[np.uint8]) -> NoFix | None:
 
 
 def _percentile(counts: NDArray[np.intp], percent: float) -> float:
-    """As `np.percentile` of the levels that were counted, in a tenth of the time."""
+    """As `np.percentile`, in a tenth of the time."""
     upto = np.cumsum(counts)
     at = percent / 100 * (int(upto[-1]) - 1)
     below, above = np.searchsorted(upto, [math.floor(at), math.ceil(at)], side="right").tolist()
@@ -116,7 +107,6 @@ def _percentile(counts: NDArray[np.intp], percent: float) -> float:
 
 
 def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None:
-    """Why too little of a tile is seen; None if enough is."""
     share = float(view.valid.mean())
     if share < min_valid_share or share == 0:
         return NoFix(
@@ -128,10 +118,7 @@ def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None
 
 
 def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> NoFix | None:
-    """Why a rectified footprint shows too little; None if enough.
-
-    `pixel` is the size of its pixels in pixels of the map, `min_side_px` the least side, in those.
-    """
+    """`pixel`: size of its pixels in pixels of the map, the unit of `min_side_px`."""
     side = math.sqrt(cv2.countNonZero(view.valid.view(np.uint8))) * pixel
     if side < min_side_px:
         return _too_small(side, min_side_px)
@@ -150,27 +137,17 @@ def _is_uniform(view: RectifiedView) -> bool:
     return float(std[0, 0]) < MIN_STD / 2
 
 
-MIN_AGL_STD = 0.03
-"""Least standard deviation of the log scale that is searched, whatever the telemetry reports."""
+MIN_AGL_STD = 0.03  # of the log scale searched, whatever is reported
 MAX_AGL_STD = 0.15
-"""Largest one: three of them are scales of 0.64 to 1.57, about as far as scores of chance were
-measured to be alike (docs/decisions/registration.md)."""
+"""Three are 0.64 to 1.57, as far as chance was measured alike (docs/decisions/registration.md)."""
 NEAR_SHARE = 0.6
-"""The part of a view far off nadir is judged as one so many times smaller, thus mostly one level
-finer: it is no square, and on its coarse levels too little is left of it
-(docs/decisions/terrain.md)."""
+"""A part far off nadir is judged as one so many times smaller (docs/decisions/terrain.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedView:
-    """A view made ready for registration.
-
-    `view`: as the camera saw it. `gsd_m`: ground resolution of level 0 of the map. `levels`: levels
-    of the map at which it is searched, judged and finished. `templates`: it rectified at the final
-    level. `side_px`: root of the area seen, in pixels of level 0. `camera_px` (2,): the camera as
-    seen from the middle of the view, heading up, x to the right and y down, in pixels of level 0.
-    `prior`: expected heading and scale.
-    """
+    """A view made ready for registration. `side_px`: root of the area seen, `camera_px` (2,): of
+    the camera from the middle of the view, right and down; both in pixels of level 0."""
 
     view: View
     gsd_m: float
@@ -183,25 +160,20 @@ class PreparedView:
 
     @property
     def telemetry(self) -> Telemetry:
-        """What was reported with the view."""
         return self.view.telemetry
 
     def picture_at(self, level: int) -> View:
-        """The view averaged towards the ground resolution of a level, made once."""
+        """Averaged towards the resolution of a level, once."""
         if level not in self._pictures:
             self._pictures[level] = downsampled(self.view, self.gsd_m * 2**level)
         return self._pictures[level]
 
     def rectified_at(self, level: int) -> RectifiedView:
-        """The view rectified at the ground resolution of a level."""
         return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)
 
 
 def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> PreparedView | NoFix:
-    """The view rectified at the level where it is finished; `NoFix` where it shows too little.
-
-    `gsd_m` is the ground resolution of level 0 of the map, `map_levels` the number of its levels.
-    """
+    """`gsd_m`: of level 0 of the map."""
     camera, telemetry = view.camera, view.telemetry
     nominal_m = footprint_side_m(telemetry, camera)
     if is_oblique(view):
@@ -230,13 +202,12 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
 
 
 def _rectified(picture: View, gsd_m: float, levels: Levels, level: int) -> RectifiedView:
-    """A picture rectified at a level, its sides whole pixels of the coarse one."""
+    """Its sides are whole pixels of the coarse level."""
     multiple = 2 ** max(0, levels.coarse - level)
     return rectify_footprint(picture, gsd_m=gsd_m * 2**level, multiple_px=multiple)
 
 
 def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> PosePrior:
-    """Expected heading and scale of a view, by its telemetry and its camera's `focal_std`."""
     yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
     agl_std_m = telemetry.agl_std_m
     agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m

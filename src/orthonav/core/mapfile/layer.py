@@ -1,9 +1,7 @@
-"""The registration layer of a map: a grey pyramid of a sheet, read by windows.
+"""The registration layer of a map (`docs/map-format.md`): a grey pyramid, read by windows.
 
-Each level is divided into square chunks, each a grey JPEG with its own mask, see
-`docs/map-format.md`. Only the chunks that a window touches are decoded. Maps are untrusted files,
-so every length, size and offset is checked before it is used.
-"""
+Only the chunks (JPEG and mask) that a window touches are decoded. Maps are untrusted files, so
+every length, size and offset is checked before it is used."""
 
 import zlib
 from itertools import pairwise
@@ -12,42 +10,35 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
 from orthonav.core.mapfile.manifest import GreyInfo
-from orthonav.core.mapfile.reader import Blobs, MapFile
+from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
-CACHE_BYTES = 64 * 2**20
-"""Decoded chunks cached: 64 km2 at 1 m where no chunk has a mask."""
+CACHE_BYTES = 64 * 2**20  # 64 km2 at 1 m without masks
 MAX_PREVIEW_PX = 384
-"""Limit of the format (`docs/map-format.md`)."""
 MAX_CHUNK_BYTES_PER_PX = 4
-"""Sanity limit: an uncompressed chunk has 1."""
 _CHUNK_HEADER_BYTES = 4096
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
-_START_OF_FRAME = 0xC0
-"""Baseline JPEG: decoding takes one pass over the pixels."""
-_BEFORE_FRAME = (0xE0, 0xDB, 0xC4)
-"""Segments allowed before the frame: APP0, quantization tables, Huffman tables."""
+_START_OF_FRAME = 0xC0  # Baseline JPEG: decoding takes one pass over the pixels
+_BEFORE_FRAME = (0xE0, 0xDB, 0xC4)  # APP0, quantization tables, Huffman tables
 _DECODE = int(cv2.IMREAD_GRAYSCALE) | int(cv2.IMREAD_IGNORE_ORIENTATION)
 
 Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
-"""Grey (H, W), 0 where not valid, and valid (H, W) or None where all of it is; read-only."""
+"""Grey (H, W), 0 where not valid, and valid (H, W) or None where all is; read-only."""
 
 
 def part_names(sheet: int) -> dict[str, str]:
-    """Names of the parts of a sheet's layer, by kind of content."""
+    """Of a sheet, by kind of content."""
     kinds = ("bytes", "offsets", "mask_bytes", "mask_offsets")
     return {kind: f"sheet{sheet}/grey/{kind}" for kind in kinds}
 
 
 def level_shape(height_px: int, width_px: int, level: int) -> tuple[int, int]:
-    """Rows and columns of a level of a sheet of `height_px` x `width_px`."""
     return -(-height_px >> level), -(-width_px >> level)
 
 
 class ChunkTable:
-    """Division of the levels of a sheet into chunks, numbered level by level and row by row."""
+    """Chunks of the levels of a sheet, numbered level by level and row by row."""
 
     def __init__(self, height_px: int, width_px: int, levels: int, chunk_px: int) -> None:
         self.chunk_px = chunk_px
@@ -59,32 +50,27 @@ class ChunkTable:
 
     @property
     def count(self) -> int:
-        """Chunks of all levels together."""
         return self._first[-1]
 
     def number(self, level: int, chunk_row: int, chunk_col: int) -> int:
-        """Number of a chunk."""
         return self._first[level] + chunk_row * self._cols[level] + chunk_col
 
     def shape(self, level: int, chunk_row: int, chunk_col: int) -> tuple[int, int]:
-        """Rows and columns of a chunk; less than `chunk_px` at the end of the level."""
+        """Less than `chunk_px` at the end of the level."""
         rows, cols = self.shapes[level]
         side = self.chunk_px
         return min(side, rows - chunk_row * side), min(side, cols - chunk_col * side)
 
 
 class GreyLayer:
-    """Grey pyramid of one sheet.
+    """Grey pyramid of one sheet; threads may share it.
 
-    Pixel (0, 0) of level 0 lies at the north-west corner of the sheet's grid, at its `gsd_m`; a
-    pixel of level L covers 2**L x 2**L of them. `levels` is the number of levels. May be shared
-    between threads.
-    """
+    Pixel (0, 0) of level 0 lies at the north-west corner of the sheet's grid; a pixel of level L
+    covers 2**L x 2**L of level 0."""
 
     def __init__(
         self, opened: MapFile, sheet: int, info: GreyInfo, cache_bytes: int = CACHE_BYTES
     ) -> None:
-        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
         grid = opened.manifest.sheets[sheet].grid
         self.levels = info.levels
         self._path = opened.path
@@ -98,10 +84,7 @@ class GreyLayer:
     def of(
         cls, opened: MapFile, sheet: int = 0, *, cache_bytes: int = CACHE_BYTES
     ) -> "GreyLayer | None":
-        """The layer of a sheet; None if the map has none.
-
-        Decoded chunks are cached up to `cache_bytes`. Raises `MapFileError` if it is damaged.
-        """
+        """None if the map has none. Raises `MapFileError` if it is damaged."""
         sheets = opened.manifest.sheets
         if not 0 <= sheet < len(sheets):
             raise MapFileError(f"map has {len(sheets)} sheets, not sheet {sheet}: {opened.path}")
@@ -109,7 +92,6 @@ class GreyLayer:
         return None if info is None else cls(opened, sheet, info, cache_bytes)
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
         if not 0 <= level < self.levels:
             raise IndexError(f"level must be 0 to {self.levels - 1}, got {level}")
         return self._table.shapes[level]
@@ -117,11 +99,9 @@ class GreyLayer:
     def read(
         self, level: int, row: int, col: int, height: int, width: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of the window that begins at (row, col) of a level.
+        """Grey and valid of a window, also beyond the sheet: 0 and not valid, as without imagery.
 
-        It may reach beyond the sheet or lie outside it: pixels there, and pixels without imagery,
-        are 0 and not valid. Raises `MapFileError` if a chunk is damaged.
-        """
+        Raises `MapFileError` if a chunk is damaged."""
         rows, cols = self.shape(level)
         if height < 0 or width < 0:
             raise ValueError(f"window must have 0 or more rows and columns, got {height} x {width}")
@@ -134,8 +114,7 @@ class GreyLayer:
                 if chunk is None:
                     continue
                 inside = np.s_[
-                    top % side : top % side + bottom - top,
-                    left % side : left % side + right - left,
+                    top % side : top % side + bottom - top, left % side : left % side + right - left
                 ]
                 target = np.s_[top - row : bottom - row, left - col : right - col]
                 grey[target] = chunk[0][inside]
@@ -143,10 +122,7 @@ class GreyLayer:
         return grey, valid
 
     def jpeg(self, level: int, chunk_row: int, chunk_col: int) -> bytes | None:
-        """The stored JPEG of a chunk, checked; None unless all of the chunk is valid.
-
-        Raises `IndexError` if there is no such chunk, `MapFileError` if it is damaged.
-        """
+        """The JPEG of a chunk, checked; None unless all of it is valid. Raises `IndexError`."""
         rows, cols = self.shape(level)
         side = self._table.chunk_px
         if not (0 <= chunk_row * side < rows and 0 <= chunk_col * side < cols):
@@ -157,7 +133,7 @@ class GreyLayer:
         return self._jpegs.blob(self._table.number(level, chunk_row, chunk_col)).tobytes()
 
     def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
-        """A chunk, from the cache or decoded; None if none of its pixels is valid."""
+        """From the cache or decoded; None if no pixel is valid."""
         number = self._table.number(level, chunk_row, chunk_col)
         if self._jpegs.is_empty(number) and self._masks.is_empty(number):
             return None
@@ -183,10 +159,7 @@ def _cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
 
 
 def decode_chunk(jpeg: NDArray[np.uint8], mask: NDArray[np.uint8], shape: tuple[int, int]) -> Chunk:
-    """A chunk of `shape` from the bytes of its JPEG and of its mask (empty if all is valid).
-
-    Raises `MapFileError` if they are invalid.
-    """
+    """From the bytes of JPEG and mask (empty if all is valid); raises `MapFileError`."""
     grey = _decode_grey(jpeg, shape)
     valid = _decode_mask(mask, shape) if mask.size else None
     if valid is not None:
@@ -217,7 +190,7 @@ def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
 
 
 def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
-    """Bits, rows, columns and channels declared by a baseline JPEG; None for other data."""
+    """Bits, rows, columns and channels of a baseline JPEG; None for other data."""
     if not (data.startswith(_SOI) and data.endswith(_EOI)):
         return None
     at = len(_SOI)
@@ -233,7 +206,7 @@ def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
 
 
 def preview(opened: MapFile) -> NDArray[np.uint8]:
-    """The grey preview (rows, cols) of the first sheet. Raises `MapFileError` if it is invalid."""
+    """The grey preview (rows, cols) of the first sheet. Raises `MapFileError`."""
     data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
     found = jpeg_frame(data.tobytes())
     small = found is not None and max(found[1:3]) <= MAX_PREVIEW_PX

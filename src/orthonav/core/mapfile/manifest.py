@@ -1,8 +1,4 @@
-"""The manifest of a map: its sources, its recipe and a description of its parts.
-
-Version 1, see `docs/map-format.md`. Every value is checked on reading, because a map is an
-untrusted file.
-"""
+"""The manifest of a map (`docs/map-format.md`). Maps are untrusted: every value is checked."""
 
 import hashlib
 import json
@@ -22,27 +18,23 @@ MAX_SHEETS = 10_000
 MAX_LEVELS = 10
 MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
 MAX_TOP_PX = 8192
-"""Longer side of the coarsest level, which is read as a whole: that of ten levels of the largest
-sheet at 5 cm. Programs write at most 64 px."""
+"""Of the coarsest level, read as a whole: ten levels of the largest sheet at 5 cm. Usually 64."""
 CODEC = "jpeg"
 TERRAIN_CODEC = "delta-zlib"
-MAX_CODE = 65_535
-"""Greatest step of a height above the lowest one of its layer."""
+MAX_CODE = 65_535  # of heights above the lowest one of a layer
 MAX_POSTING_M = 1000.0
 MAX_NAME = 200
-MAX_DIGITS = 20
-"""More digits than any number in a map needs, and few enough to fit a float."""
+MAX_DIGITS = 20  # more than any number needs, few enough for a float
 MIN_HEADING_STEP_DEG = 0.5
 """Finer than any method needs; every heading tried takes an image in memory."""
 
 
 @dataclass(frozen=True)
 class GreyInfo:
-    """The registration layer of a sheet: a grey pyramid in square chunks of `chunk_px`.
+    """A grey pyramid in square chunks.
 
-    `chunk_px`: even, 16 to 1024. `levels`: 1 to 10. `quality`: JPEG quality, 1 to 100; chunks of
-    noise have less. `valid_px`: number of pixels of the finest level with imagery.
-    """
+    `chunk_px`: even, 16 to 1024. `levels`: 1 to 10. `quality`: of JPEG, 1 to 100, less for noise.
+    `valid_px`: pixels of the finest level with imagery."""
 
     chunk_px: int
     levels: int
@@ -51,16 +43,14 @@ class GreyInfo:
 
     @property
     def raw_bytes(self) -> int:
-        """Size of the imagery as uncompressed RGB at the working resolution."""
+        """As uncompressed RGB at the working resolution."""
         return 3 * self.valid_px
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for the manifest."""
         return {"codec": CODEC, **vars(self)}
 
     @classmethod
     def from_plain(cls, plain: Any, grid: TileGrid) -> "GreyInfo":
-        """Inverse of `to_plain` for a sheet with `grid`; raises `MapFileError`."""
         info = cls(**_fields(cls, plain))
         sane = (
             _get(plain, "codec", str) == CODEC
@@ -78,15 +68,12 @@ class GreyInfo:
 
 @dataclass(frozen=True)
 class TerrainInfo:
-    """The terrain layer of a sheet: heights of the ground at samples in the sheet's plane.
+    """Heights of the ground at samples in the sheet's plane.
 
-    `west_m`, `north_m`: outer north-west corner; sample (0, 0) lies half a posting to its
-    south-east. `posting_m`: distance of samples, 1 to 1000 m. `rows`, `cols`: their number.
-    `chunk_px`: samples along a side of a chunk, 16 to 1024. `low_m`, `high_m`: least and greatest
-    height above mean sea level, -500 to 9000. `unit_m`: metres per step, 0.01 to 10. `known`:
-    number of samples with a height. `name`: file it was made of. `datum`: what heights counted from
-    there.
-    """
+    `west_m`, `north_m`: outer north-west corner, half a posting from sample (0, 0). `posting_m`: 1
+    to 1000. `chunk_px`: samples, 16 to 1024. `low_m`, `high_m`: heights above mean sea level, -500
+    to 9000. `unit_m`: per step, 0.01 to 10. `known`: samples with a height. `name`, `datum`: of the
+    source."""
 
     west_m: float
     north_m: float
@@ -102,12 +89,10 @@ class TerrainInfo:
     datum: str
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for the manifest."""
         return {"codec": TERRAIN_CODEC, **vars(self)}
 
     @classmethod
     def from_plain(cls, plain: Any) -> "TerrainInfo":
-        """Inverse of `to_plain`; raises `MapFileError`."""
         info = cls(**_fields(cls, plain))
         most = 4 * MAX_SHEET_M
         sane = (
@@ -129,12 +114,7 @@ class TerrainInfo:
 
 @dataclass(frozen=True)
 class SheetInfo:
-    """One sheet of a map.
-
-    `frame`: its local plane. `grid`: its tile grid. `tiles`: number of tiles. `area_km2`: number of
-    tiles times stride squared. `grey`: its registration layer, None if it has none. `terrain`: its
-    terrain layer, None if it has none.
-    """
+    """`area_km2`: number of tiles times stride squared."""
 
     frame: LocalFrame
     grid: TileGrid
@@ -144,7 +124,6 @@ class SheetInfo:
     terrain: TerrainInfo | None = None
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for the manifest; maps without terrain do not name it."""
         terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}
         return {
             **terrain,
@@ -158,7 +137,6 @@ class SheetInfo:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "SheetInfo":
-        """Inverse of `to_plain`; raises `MapFileError` on impossible values."""
         raw = _get(plain, "grid", dict)
         grid = TileGrid(**_fields(TileGrid, raw))
         tiles = _get(plain, "tiles", int)
@@ -189,18 +167,12 @@ class Manifest:
     """Everything in a map except its arrays.
 
     - `recipe`: method, representation and embedding with their parameters.
-    - `sheets`: one for maps that fly.
-    - `imagery`: source files with dates and resolutions.
-    - `view`: requirements on a view and errors of a fix (`heading_step_deg`, `min_valid_share`,
-      `position_std_m`).
-    - `confidence`: logistic regression of the probability of a correct fix, None if not fitted.
-    - `radius_m`: error below which a fix is correct.
-    - `created_by`: program and version.
-    - `registration`: the same for registered views (`confidence`, `radius_m`, `position_floor_px`),
-      None without a registration layer.
+    - `sheets`: one for maps that fly. `imagery`: source files with dates and resolutions.
+    - `view`: `heading_step_deg`, `min_valid_share`, `position_std_m`.
+    - `confidence`: logistic regression, None if not fitted; `radius_m`: a fix within it is correct.
+    - `registration`: the same for registered views, None without a registration layer.
     - `parts`: array name to {dtype, shape, sha256}; filled in by `write_map`.
-    - `sha256`: digest of the manifest that was read, hexadecimal; empty for one that was not read.
-    """
+    - `sha256`: of the manifest that was read, hexadecimal; empty if none was."""
 
     recipe: dict[str, Any]
     sheets: tuple[SheetInfo, ...]
@@ -215,11 +187,10 @@ class Manifest:
 
     @property
     def area_km2(self) -> float:
-        """Area of all sheets."""
         return sum(sheet.area_km2 for sheet in self.sheets)
 
     def to_json(self) -> str:
-        """Canonical JSON, with the SHA-256 of everything else in `manifest_sha256`."""
+        """Canonical, with the SHA-256 of everything else in `manifest_sha256`."""
         plain = {
             "format": FORMAT,
             "schema": SCHEMA,
@@ -237,7 +208,7 @@ class Manifest:
 
     @classmethod
     def from_json(cls, text: str) -> "Manifest":
-        """Inverse of `to_json`; raises `MapFileError` or `MapVersionError`."""
+        """Raises `MapFileError` or `MapVersionError`."""
         if len(text) > MAX_MANIFEST_BYTES:
             raise MapFileError(f"manifest of the map is larger than {MAX_MANIFEST_BYTES} bytes")
         try:
@@ -278,7 +249,7 @@ class Manifest:
 
 
 def _view(plain: Any) -> dict[str, Any]:
-    """The validated `view` record; a fine heading step would exhaust memory."""
+    """A fine heading step would exhaust memory."""
     view: dict[str, Any] = _get(plain, "view", dict)
     if not MIN_HEADING_STEP_DEG <= _number(view, "heading_step_deg") <= 360:
         raise MapFileError(
@@ -312,7 +283,7 @@ def _get(plain: Any, name: str, kind: type) -> Any:
 
 
 def _fields(record: type, plain: Any) -> dict[str, Any]:
-    """The values of the fields of a record, each of its type; raises `MapFileError`."""
+    """Each of its type; raises `MapFileError`."""
     found = {}
     for each in fields(record):
         kind: Any = each.type

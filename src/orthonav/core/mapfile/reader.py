@@ -1,20 +1,20 @@
 """Opening a map: every byte is checked at the opening, and again whenever it is read later.
 
-The file stays open and is not memory-mapped: reading a mapping beyond the end of a file that was
-truncated ends the process (SIGBUS), as does a read error of a memory card. Parts are read with
-`pread` and compared with a digest of what the opening found, so a map that is truncated,
-rewritten or unreadable in flight raises `MapChangedError`.
-"""
+The file is not memory-mapped: a mapping of a truncated file or a failing card ends the process
+(SIGBUS). Parts are read with `pread` and compared with digests of the opening, so changes in flight
+raise `MapChangedError`."""
 
 import hashlib
 import json
 import os
 import re
+import threading
 import weakref
-from collections.abc import Iterator, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, Generic, TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,7 @@ from orthonav.core.mapfile.writer import METADATA_KEY
 
 MAX_HEADER_BYTES = 16 * 2**20
 MIN_FILE_BYTES = 10
-BLOCK_BYTES = 16 * 2**10
-"""Unit of verification of parts that are read in ranges: about one chunk of the registration
-layer (docs/map-format.md)."""
+BLOCK_BYTES = 16 * 2**10  # unit of verification of ranges, about one chunk (docs/map-format.md)
 _BLOCK_DIGEST_BYTES = 16
 _PIECE_BYTES = 64 * BLOCK_BYTES
 _IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|terrain/)bytes")
@@ -44,11 +42,7 @@ _DTYPES: dict[str, type[np.generic]] = {
 
 @dataclass(frozen=True)
 class _Part:
-    """Type and position of a part.
-
-    `first`, `nbytes`: position and size in the file. `sha256`: of the whole part, hexadecimal.
-    `blocks`: digests of its blocks, concatenated; empty for parts that are read whole.
-    """
+    """`sha256`: hexadecimal; `blocks`: digests concatenated, empty for parts read whole."""
 
     dtype: type[np.generic]
     shape: tuple[int, ...]
@@ -59,10 +53,7 @@ class _Part:
 
 
 class MapParts(Mapping[str, NDArray[Any]]):
-    """The parts of an open map by name; read from the file when asked for, read-only.
-
-    Reading raises `MapChangedError` if the bytes are not those of the opening.
-    """
+    """The parts of an open map by name, read when asked for; raises `MapChangedError`."""
 
     def __init__(self, path: Path, opened: "_OpenFile", parts: dict[str, _Part]) -> None:
         self._path, self._file, self._parts = path, opened, parts
@@ -82,11 +73,11 @@ class MapParts(Mapping[str, NDArray[Any]]):
         return len(self._parts)
 
     def described(self, name: str) -> _Part | None:
-        """Type and position of a part without reading it; None if there is none."""
+        """None if there is no such part."""
         return self._parts.get(name)
 
     def range(self, name: str, first: int, last: int) -> bytes:
-        """Bytes `first` to `last` (excluded) of a part that is read in ranges."""
+        """`first` to `last` (excluded)."""
         if first >= last:
             return b""
         part = self._parts[name]
@@ -102,8 +93,7 @@ class MapParts(Mapping[str, NDArray[Any]]):
     def change(self) -> str | None:
         """How the open file differs from the one that was opened; None as far as is known.
 
-        The size is compared now. Other changes are known once they were read, and remain.
-        """
+        The size is compared now. Other changes are known once they were read, and remain."""
         if self._change is None:
             size = self._file.size_now()
             if size != self._file.size:
@@ -133,8 +123,7 @@ class MapParts(Mapping[str, NDArray[Any]]):
 class MapFile:
     """An opened map, or one that was built and not yet written.
 
-    `arrays`: its parts, read-only; those of an opened map are read when asked for.
-    """
+    `arrays`: its parts, read-only; those of an opened map are read when asked for."""
 
     path: Path
     size_bytes: int
@@ -184,8 +173,7 @@ class MapFile:
     def range(self, name: str, first: int, last: int) -> bytes:
         """Bytes `first` to `last` (excluded) of a part that is read in ranges.
 
-        Raises `MapChangedError` if they are not those of the opening.
-        """
+        Raises `MapChangedError` if they are not those of the opening."""
         if isinstance(self.arrays, MapParts):
             return self.arrays.range(name, first, last)
         return self.arrays[name][first:last].tobytes()
@@ -199,10 +187,7 @@ class Blobs:
     """Byte strings concatenated in one part of a map, with their offsets in another."""
 
     def __init__(self, opened: MapFile, data: str, offsets: str, count: int) -> None:
-        """The `count` strings of the parts `data` and `offsets`.
-
-        Raises `MapFileError` where the offsets do not fit.
-        """
+        """Raises `MapFileError` where the offsets do not fit."""
         size = opened.size_of(data, np.uint8, 1)
         self._opened, self._name = opened, data
         self._offsets: NDArray[Any] = opened.array(offsets, np.int64, 1)
@@ -220,17 +205,16 @@ class Blobs:
             )
 
     def is_empty(self, number: int) -> bool:
-        """Whether a string has no bytes."""
         return bool(self._offsets[number] == self._offsets[number + 1])
 
     def blob(self, number: int) -> NDArray[np.uint8]:
-        """The bytes of a string. Raises `MapChangedError`."""
+        """Raises `MapChangedError`."""
         first, last = int(self._offsets[number]), int(self._offsets[number + 1])
         return np.frombuffer(self._opened.range(self._name, first, last), dtype=np.uint8)
 
 
 class _OpenFile:
-    """A file kept open for reading; closed when the object is collected."""
+    """Closed when the object is collected."""
 
     def __init__(self, path: Path) -> None:
         self._number = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -238,11 +222,10 @@ class _OpenFile:
         self.size = self.size_now()
 
     def size_now(self) -> int:
-        """Size of the file now, bytes."""
         return os.fstat(self._number).st_size
 
     def read(self, first: int, length: int) -> bytes:
-        """`length` bytes from `first`; fewer where the file ends. Raises `OSError`."""
+        """Fewer bytes where the file ends. Raises `OSError`."""
         data = os.pread(self._number, length, first)
         if len(data) in (0, length):
             return data
@@ -257,14 +240,11 @@ class _OpenFile:
 def open_map(path: Path, manifest_sha256: str | None = None) -> MapFile:
     """Open a map and verify every checksum in it.
 
-    `manifest_sha256` is that of a signature: another map is refused, also one that took the place
-    of the signed one after the signature was checked.
-
-    The container is safetensors: eight bytes with the length of a JSON header, the header, raw
-    arrays. It is parsed here, not with the library, because the arrays are read on demand, and
-    because every length is checked against the file before it is used.
+    `manifest_sha256`: of a signature; another map is refused, also one swapped after its check.
     Raises `MissingFileError`, `MapFileError`, or `MapVersionError`.
-    """
+
+    The container is safetensors, parsed here because arrays are read on demand and every length is
+    checked before it is used."""
     path = require_file(path, "map")
     try:
         opened = _OpenFile(path)
@@ -361,7 +341,7 @@ def _part(
 
 
 def _digests(opened: _OpenFile, first: int, length: int, *, blocks: bool) -> tuple[str, bytes]:
-    """SHA-256 (hexadecimal) of a part, and the digests of its blocks where asked for."""
+    """SHA-256 (hexadecimal), and digests of the blocks where asked for."""
     whole, of_blocks = hashlib.sha256(), bytearray()
     for at in range(first, first + length, _PIECE_BYTES):
         piece = opened.read(at, min(_PIECE_BYTES, first + length - at))
@@ -372,9 +352,39 @@ def _digests(opened: _OpenFile, first: int, length: int, *, blocks: bool) -> tup
 
 
 def _block_digests(data: bytes) -> bytes:
-    """Digests of the blocks of `data`, concatenated; BLAKE2b is fast without SHA instructions."""
+    """Concatenated; BLAKE2b is fast without SHA instructions."""
     view = memoryview(data)
     return b"".join(
         hashlib.blake2b(view[at : at + BLOCK_BYTES], digest_size=_BLOCK_DIGEST_BYTES).digest()
         for at in range(0, len(data), BLOCK_BYTES)
     )
+
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+class ByteCache(Generic[Key, Value]):
+    """The values used last, of at most `limit_bytes` in all by `size_of`; threads may share it."""
+
+    def __init__(self, limit_bytes: int, size_of: Callable[[Value], int]) -> None:
+        self._limit_bytes, self._size_of = limit_bytes, size_of
+        self._values: OrderedDict[Key, Value] = OrderedDict()
+        self._lock = threading.Lock()
+        self.held_bytes = 0
+
+    def get(self, key: Key) -> Value | None:
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+            return self._values.get(key)
+
+    def put(self, key: Key, value: Value) -> None:
+        """Hold a value unless the key is held; a value larger than the limit empties the cache."""
+        with self._lock:
+            if key in self._values:
+                return
+            self._values[key] = value
+            self.held_bytes += self._size_of(value)
+            while self.held_bytes > self._limit_bytes:
+                self.held_bytes -= self._size_of(self._values.popitem(last=False)[1])

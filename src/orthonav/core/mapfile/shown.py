@@ -16,20 +16,15 @@ from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 
 MAX_PX = 4096
-"""Longest side of a picture."""
 OUTLINE_PX = 1024
-"""Longest side of the raster whose outline is taken."""
-_FINER = 4
-"""Outlines run through the middles of pixels, which are therefore made so many times finer."""
+_FINER = 4  # outlines run through the middles of pixels, which are made so many times finer
 Grey = NDArray[np.uint8]
 
 
 def write_preview(opened: MapFile, path: Path) -> None:
-    """Write the imagery of the first sheet as a grey PNG or TIFF, with a file `.aux.xml` beside it
-    that places it, as GDAL and QGIS read it. Pixels of 0 have no imagery.
+    """Imagery of the first sheet as grey PNG or TIFF, with GDAL's `.aux.xml` beside it; 0: none.
 
-    Raises `OutputError` for another ending, and `MapFileError` where the map is damaged.
-    """
+    Raises `OutputError` for another ending, `MapFileError` where the map is damaged."""
     path = Path(path)
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         raise OutputError(f"a preview is a .png or .tif file: {path}")
@@ -43,10 +38,7 @@ def write_preview(opened: MapFile, path: Path) -> None:
 
 
 def footprint_geojson(opened: MapFile) -> str:
-    """The area with imagery of the first sheet as GeoJSON (RFC 7946): a polygon, or several.
-
-    Of a map without a registration layer it is the rectangle of its tiles.
-    """
+    """The area with imagery as GeoJSON (RFC 7946); without a layer the rectangle of the tiles."""
     grey, px_m, sheet = _picture(opened, OUTLINE_PX)
     shown = (grey > 0).astype(np.uint8)
     fine = shown.repeat(_FINER, axis=0).repeat(_FINER, axis=1)
@@ -88,7 +80,7 @@ def _picture(opened: MapFile, most_px: int) -> tuple[Grey, NDArray[np.float64], 
 
 
 def _ring(line: NDArray[Any], px_m: NDArray[np.float64], sheet: SheetInfo, *, outer: bool) -> Any:
-    """A closed line (N, 2) of pixels as longitudes and latitudes, counter-clockwise if `outer`."""
+    """A closed line (N, 2) as longitudes and latitudes, counter-clockwise if `outer`."""
     corner = np.array([sheet.grid.west_m, sheet.grid.north_m])
     en_m = corner + (line + 0.5) * px_m * (1, -1)
     east, north = en_m.T
@@ -100,7 +92,7 @@ def _ring(line: NDArray[Any], px_m: NDArray[np.float64], sheet: SheetInfo, *, ou
 
 
 def _georeference(sheet: SheetInfo, px_m: NDArray[np.float64]) -> str:
-    """GDAL's file beside an image: plane, place and size of pixels, value without imagery."""
+    """GDAL's file beside an image."""
     west_m, north_m = sheet.grid.west_m, sheet.grid.north_m
     transform = ", ".join(map(repr, map(float, (west_m, px_m[0], 0, north_m, 0, -px_m[1]))))
     return (

@@ -1,11 +1,7 @@
-"""Signatures of maps: authenticity and integrity.
+"""Signatures of maps (`docs/map-format.md`): `MAP.onav.sig`, Ed25519 over the manifest's digest.
 
-A detached Ed25519 signature, `MAP.onav.sig`, of the digest of the manifest, which holds the
-SHA-256 of every part. `open_map` checks all of them whenever it opens a map, so signing the
-manifest's digest covers every byte that is used, and verifying reads the header of the file only.
-A serial number and the time of signing are signed too, so that older maps can be refused.
-See `docs/map-format.md`.
-"""
+The manifest holds the SHA-256 of every part, and `open_map` checks them all, so verifying reads the
+header only. Serial number and time are signed too, so that older maps can be refused."""
 
 import base64
 import binascii
@@ -44,19 +40,14 @@ ALGORITHM = "ed25519"
 MAX_SIGNATURE_BYTES = 4096
 MAX_KEY_BYTES = 4096
 PRIVATE_NAME, PUBLIC_NAME = "private.pem", "public.pem"
-MAX_SERIAL = 2**53 - 1
-"""Largest integer that every JSON reader keeps exact."""
+MAX_SERIAL = 2**53 - 1  # largest integer that every JSON reader keeps exact
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
 class Signature:
-    """A verified signature.
-
-    `key_id`: of the key. `manifest_sha256`: digest of the map's manifest, hexadecimal. `serial`:
-    serial number, at least 0. `signed_utc`: time of signing by the clock of the signer.
-    """
+    """A verified signature; `signed_utc` by the clock of the signer."""
 
     key_id: str
     manifest_sha256: str
@@ -74,15 +65,13 @@ class Signature:
 
 
 def signature_path(path: Path) -> Path:
-    """Path of the signature of a map: the same folder, with `.sig` appended."""
     return Path(path).with_name(Path(path).name + ".sig")
 
 
 def map_digest(path: Path) -> str:
-    """SHA-256 (hex) of the manifest of a map; identifies a map by reading its header only.
+    """Of the manifest, hexadecimal, by the header only.
 
-    Raises `MissingFileError`, `MapFileError` or `MapVersionError`.
-    """
+    Raises `MissingFileError`, `MapFileError` or `MapVersionError`."""
     path = require_file(path, "map")
     try:
         with path.open("rb") as stream:
@@ -103,10 +92,9 @@ def map_digest(path: Path) -> str:
 
 
 def new_key(folder: Path) -> str:
-    """Write a new key pair, `private.pem` (mode 0600) and `public.pem`; returns its id.
+    """Write `private.pem` (mode 0600) and `public.pem`; returns the key's id.
 
-    Raises `OutputError` if either file exists, and `MissingExtraError`.
-    """
+    Raises `OutputError` if either file exists, and `MissingExtraError`."""
     _, serialization, ed25519 = _crypto()
     folder = Path(folder)
     private_path, public_path = folder / PRIVATE_NAME, folder / PUBLIC_NAME
@@ -114,9 +102,7 @@ def new_key(folder: Path) -> str:
         raise OutputError(f"folder holds a key already; name another folder: {folder}")
     private = ed25519.Ed25519PrivateKey.generate()
     pem = private.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     public = private.public_key()
     public_pem = public.public_bytes(
@@ -138,17 +124,13 @@ def new_key(folder: Path) -> str:
 
 
 def key_id(public: "Ed25519PublicKey") -> str:
-    """Short id of a key: the first 16 hexadecimal digits of the SHA-256 of its 32 bytes."""
+    """First 16 hexadecimal digits of the SHA-256 of its 32 bytes."""
     return hashlib.sha256(public.public_bytes_raw()).hexdigest()[:16]
 
 
 def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
-    """Sign a map with a private key (PEM); returns the path of the signature.
-
-    `serial` is 0 to `MAX_SERIAL`; by default the time in seconds since 1970, which increases. The
-    map is fully checked first. Raises `MissingFileError`, `MapFileError`, `OutputError`,
-    `VariantError` or `MissingExtraError`.
-    """
+    """Sign a map, fully checked first, with a private key (PEM); `serial`: 0 to `MAX_SERIAL`, by
+    default seconds since 1970. Raises `OrthonavError` of the kind that fits."""
     now = datetime.now(UTC)
     serial = int(now.timestamp()) if serial is None else serial
     if not 0 <= serial <= MAX_SERIAL:
@@ -172,12 +154,9 @@ def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
 def require_signature(path: Path, public_key: Path, not_before: str | None = None) -> Signature:
     """The signature of a map, checked with a key (PEM).
 
-    `not_before` is a serial number, or a date or time in UTC; older maps are refused. `open_map`,
-    given the digest of the signature, then compares the parts with the manifest. Raises
-    `MapFileError` if the signature is missing, broken, by another key, of another map or too old,
-    `MissingFileError` if the map or the key is missing, `VariantError` if `not_before` is invalid,
-    and `MissingExtraError`.
-    """
+    `not_before`: serial number, or date or time in UTC. Its digest is then given to `open_map`.
+    Raises `MapFileError` for a signature missing, broken, by another key, of another map or too
+    old, `MissingFileError`, `VariantError` (`not_before`) and `MissingExtraError`."""
     invalid, _, _ = _crypto()
     least = None if not_before is None else _least(not_before)
     public = _public_key(public_key)
@@ -198,7 +177,6 @@ def require_signature(path: Path, public_key: Path, not_before: str | None = Non
 
 
 def _least(text: str) -> int | datetime:
-    """The serial number, or the time in UTC, in an option."""
     if re.fullmatch(r"[0-9]{1,16}", text):
         return int(text)
     if re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}(T[0-9]{2}:[0-9]{2}(:[0-9]{2})?Z?)?", text):
@@ -223,7 +201,7 @@ def _require_not_older(found: Signature, least: int | datetime, text: str, path:
 
 
 def _signature(path: Path) -> tuple[Signature, str]:
-    """The validated fields of a signature file, not yet verified, and the encoded signature."""
+    """Not yet verified."""
     file = signature_path(path)
     if not file.is_file():
         raise MapFileError(f"map is not signed, there is no {file.name}: {path}")
@@ -298,7 +276,6 @@ def _key_bytes(path: Path, what: str) -> bytes:
 
 
 def _crypto() -> tuple[Any, Any, Any]:
-    """`InvalidSignature`, `serialization` and `ed25519` of the library."""
     try:
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives import serialization

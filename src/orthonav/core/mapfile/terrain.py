@@ -1,45 +1,34 @@
-"""The terrain layer of a map: heights of the ground, read chunk by chunk without GDAL.
-
-See `docs/map-format.md`. Maps are untrusted files, so every length and size is checked before it
-is used.
-"""
+"""The terrain layer of a map (`docs/map-format.md`); untrusted, so every length is checked."""
 
 import zlib
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthonav.core.caches import ByteCache
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import bilinear
 from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
-from orthonav.core.mapfile.reader import Blobs, MapFile
+from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
-CACHE_BYTES = 16 * 2**20
-"""Decoded chunks cached: 400 km2 at 10 m."""
+CACHE_BYTES = 16 * 2**20  # 400 km2 at 10 m
 _MAX_BYTES_PER_SAMPLE = 4
-"""Sanity limit: an uncompressed sample has 2 bytes."""
 _CHUNK_HEADER_BYTES = 1024
 Array = NDArray[np.float64]
 Heights = NDArray[np.float32]
 
 
 def terrain_part_names(sheet: int) -> tuple[str, str]:
-    """Names of the parts of a sheet's terrain: the chunks' bytes and their offsets."""
     return f"sheet{sheet}/terrain/bytes", f"sheet{sheet}/terrain/offsets"
 
 
 class TerrainLayer:
-    """Heights of the ground under one sheet, above mean sea level; NaN where unknown.
+    """Heights under one sheet, above mean sea level; NaN where unknown. Threads may share it.
 
-    Calling it with latitudes and longitudes gives heights
-    (`orthonav.core.geo.ground.TerrainHeights`). May be shared between threads.
-    """
+    Calling it with latitudes and longitudes makes it `orthonav.core.geo.ground.TerrainHeights`."""
 
     def __init__(self, opened: MapFile, sheet: int, info: TerrainInfo) -> None:
-        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
         self.info = info
         self.frame: LocalFrame = opened.manifest.sheets[sheet].frame
         self._path = opened.path
@@ -49,27 +38,23 @@ class TerrainLayer:
 
     @classmethod
     def of(cls, opened: MapFile, sheet: int = 0) -> "TerrainLayer | None":
-        """The layer of a sheet; None if the map has none. Raises `MapFileError`."""
+        """None if the map has none. Raises `MapFileError`."""
         info = opened.manifest.sheets[sheet].terrain
         return None if info is None else cls(opened, sheet, info)
 
     def __call__(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
-        """Heights (...) at positions (...), see `at_en_m`."""
         return self.at_en_m(self.frame.en_from_latlon(lat_deg, lon_deg))
 
     def at_en_m(self, points_en_m: ArrayLike) -> Array:
-        """Heights (...) at points (..., 2) of the sheet's plane, bilinear between samples.
+        """Bilinear (...) at (..., 2); NaN outside and beside samples without a height.
 
-        NaN outside the layer and beside samples without a height. Raises `MapFileError` if a chunk
-        is damaged, `MapChangedError`.
-        """
+        Raises `MapFileError` if a chunk is damaged, `MapChangedError`."""
         info, points = self.info, np.asarray(points_en_m, np.float64)
         col = (points[..., 0] - info.west_m) / info.posting_m - 0.5
         row = (info.north_m - points[..., 1]) / info.posting_m - 0.5
         return bilinear(self._samples, (info.rows, info.cols), col, row)
 
     def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
-        """Heights of samples (...) by row and column."""
         side = self.info.chunk_px
         chunk_rows, chunk_cols = rows // side, cols // side
         found = np.full(rows.shape, np.nan)
@@ -83,7 +68,7 @@ class TerrainLayer:
         return found
 
     def _chunk(self, chunk_row: int, chunk_col: int) -> Heights | None:
-        """A chunk, from the cache or decoded; None if it has no height."""
+        """From the cache or decoded; None if it has no height."""
         number = self._table.number(0, chunk_row, chunk_col)
         if self._blobs.is_empty(number):
             return None
@@ -102,7 +87,7 @@ class TerrainLayer:
 
 
 def decode_terrain(data: NDArray[np.uint8], shape: tuple[int, int], info: TerrainInfo) -> Heights:
-    """Heights of a chunk of `shape`, NaN where unknown. Raises `MapFileError` if it is invalid."""
+    """NaN where unknown. Raises `MapFileError`."""
     size = shape[0] * shape[1]
     if data.size > _MAX_BYTES_PER_SAMPLE * size + _CHUNK_HEADER_BYTES:
         raise MapFileError(f"{data.size} bytes for {shape[0]} x {shape[1]} samples")
@@ -132,7 +117,7 @@ def decode_terrain(data: NDArray[np.uint8], shape: tuple[int, int], info: Terrai
 
 
 def encode_terrain(heights: Heights, info: TerrainInfo) -> bytes:
-    """Bytes of a chunk (H, W) of heights, NaN where unknown; empty where all are."""
+    """Of a chunk (H, W), NaN where unknown; empty where all are."""
     known = np.isfinite(heights)
     if not known.any():
         return b""

@@ -20,10 +20,7 @@ METADATA_KEY = "orthonav"
 
 
 def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> Manifest:
-    """Write `arrays` and `manifest` to `path`; returns the manifest with its `parts` filled in.
-
-    Raises `OutputError` if it cannot be written; then nothing is left behind.
-    """
+    """The manifest with its `parts` filled in. Raises `OutputError` and leaves nothing behind."""
     parts = {name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())}
     described = {
         name: {
@@ -39,10 +36,7 @@ def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]
 
 
 def save_tensors(path: Path, arrays: Mapping[str, NDArray[Any]], metadata: str, what: str) -> None:
-    """Write arrays and metadata as safetensors, complete or not at all.
-
-    Raises `OutputError`, which names `what` could not be written.
-    """
+    """Complete or not at all; raises `OutputError`, which names `what`."""
     with replacing(path) as temporary:
         try:
             contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}

@@ -1,8 +1,6 @@
 """Blocks of a view beside the map: how well each fits when it is moved a little aside.
 
-A view that was rectified with the wrong tilt, relief or lens is distorted, so its blocks fit at
-different displacements. `orthonav.core.localize.camera` turns these into the camera.
-"""
+Under wrong tilt, relief or lens they fit at different displacements, which show the camera."""
 
 import math
 from typing import NamedTuple
@@ -18,26 +16,19 @@ from orthonav.core.register.template import BLOCKS, Template
 from orthonav.core.register.window import MapWindow, Reference
 
 GREY_SHARE = 0.25
-"""Energy of grey levels over that of gradients. Less than in the search: grey levels of another
-season mislead about small displacements (docs/decisions/camera.md)."""
-MIN_SEEN = 0.4
-"""Blocks of which less is seen on valid map do not count."""
+"""Grey over gradients: less than in the search, seasons mislead (docs/decisions/camera.md)."""
+MIN_SEEN = 0.4  # blocks of which less is seen on valid map do not count
 MIN_ENERGY = 0.1
-"""Blocks with less energy than this share of the median do not count: nearly uniform ground, where
-an edge that a displacement brings in would count for more than it is."""
+"""Nor those below this share of the median energy: edges brought in would count too much."""
 Array = NDArray[np.float32]
 
 
 class BlockScores(NamedTuple):
     """Correlation of each block of a view with the map under small displacements.
 
-    - `correlations` (B * B, 2 R + 1, 2 R + 1): by rows and columns that the map is moved by; what
-      is seen at a pixel of the window lies so many pixels down and right of it on the map.
-    - `pixels` (B * B,): pixels that count, 0 where too few of a block are seen.
-    - `middles_px` (B * B, 2): x and y of the blocks from the middle of the window.
-
-    All in pixels of the level of the view's template.
-    """
+    - `correlations` (B * B, 2 R + 1, 2 R + 1): by pixels down and right on the map.
+    - `pixels` (B * B,): that count, 0 where too few of a block are seen.
+    - `middles_px` (B * B, 2): x and y from the middle of the window."""
 
     correlations: NDArray[np.float64]
     pixels: NDArray[np.float64]
@@ -47,8 +38,7 @@ class BlockScores(NamedTuple):
 def block_scores(
     template: Template, reference: Reference, pose: Pose, reach_px: int
 ) -> BlockScores:
-    """Compare the blocks of a view whose window lies at `pose` with the map, moved by up to
-    `reach_px` pixels of the level along both axes."""
+    """Of a view whose window lies at `pose`, moved by up to `reach_px` pixels of the level."""
     seen = _sampled(template, reference, pose, reach_px)
     rows, cols = template.mask.shape
     count = BLOCKS * BLOCKS
@@ -74,8 +64,7 @@ def block_scores(
 
 
 def _sampled(template: Template, reference: Reference, pose: Pose, margin_px: int) -> Array:
-    """The map (H + 2 R, W + 2 R, 4) as the view's window and `margin_px` around it show it, edge
-    directions turned, zero where it is not valid."""
+    """(H + 2 R, W + 2 R, 4): the window and `margin_px` around it, turned; 0 where not valid."""
     window = MapWindow.of(template, reference, pose, 1, (margin_px, margin_px))
     sampled = np.empty((*window.shape, CHANNELS), np.float32)
     window.sample(pose, sampled)
@@ -96,8 +85,7 @@ def _energies(template: Template, values: Array) -> tuple[NDArray[np.float64], N
 
 
 def _products(template: Template, values: Array, seen: Array, reach_px: int) -> Array:
-    """Sums (B * B, 2 R + 1, 2 R + 1, 4) over blocks of channels (H, W, 4) times the map
-    (H + 2 R, W + 2 R, 4) under all displacements."""
+    """Sums (B * B, 2 R + 1, 2 R + 1, 4) over blocks of channels (H, W, 4) times the map, moved."""
     side = 2 * reach_px + 1
     products = np.empty((BLOCKS * BLOCKS, side, side, CHANNELS), np.float32)
     if KERNEL is not None:

@@ -1,14 +1,8 @@
-"""What registration compares: two kinds of channels of the same ground, made of grey levels.
+"""Two kinds of channels, made of grey levels, whose errors lie in different places.
 
-*Oriented gradients*: the edge direction doubled, so that an edge keeps its place when its contrast
-flips between seasons, weighted by a magnitude that saturates against its surroundings, so that a
-bright roof says no more than a hedge. As in matching of images of different sensors (CFOG, Ye et
-al., IEEE TGRS 2019), but as two numbers per pixel instead of a histogram.
-
-*Grey*: what is left of the grey levels after local mean and local contrast are taken out.
-
-They err in different places: their sum is far better than either.
-"""
+*Oriented gradients*: the edge direction doubled, so that contrast may flip between seasons,
+weighted by a magnitude that saturates against its surroundings (as CFOG, Ye et al., IEEE TGRS 2019,
+but two numbers per pixel instead of a histogram). *Grey*: without local mean and local contrast."""
 
 from dataclasses import dataclass
 
@@ -17,20 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
-CHANNELS = 4
-"""cosine and sine of the doubled edge direction, grey, valid."""
+CHANNELS = 4  # cosine and sine of the doubled edge direction, grey, valid
 GROUPS = (slice(0, 2), slice(2, 3))
-"""Those of the two kinds."""
 
 
 @dataclass(frozen=True)
 class ChannelRecipe:
-    """Parameters of the channels, in pixels of the level it is made at.
-
-    `gradient_sigma_px`: Gaussian before the gradient; `contrast_px`: side of the window in which a
-    gradient is weighed against its surroundings; `mean_px` and `deviation_px`: windows of local
-    mean and local contrast of grey; `grey_share`: weight of grey beside gradients.
-    """
+    """Windows in pixels of the level: `contrast_px` of gradients' surroundings, `mean_px`,
+    `deviation_px` of grey; `grey_share`: weight of grey beside gradients."""
 
     gradient_sigma_px: float = 1.0
     contrast_px: int = 27
@@ -40,7 +28,6 @@ class ChannelRecipe:
 
     @property
     def margin_px(self) -> int:
-        """How far a pixel's grey level can reach into the channels."""
         return max(self.contrast_px // 2 + 4, self.mean_px // 2 + self.deviation_px // 2 + 1)
 
 
@@ -49,25 +36,20 @@ COARSE = ChannelRecipe(gradient_sigma_px=0.7, contrast_px=17, mean_px=7, deviati
 """For views of some 30 pixels across: the same channels from smaller windows."""
 _GRADIENT_FLOOR = np.float32(0.5)
 _DEVIATION_FLOOR = np.float32(2.0)
-"""Grey levels (per pixel) below which gradient and contrast count as noise of an 8-bit picture."""
+"""Below, gradient and contrast count as noise of an 8-bit picture."""
 _CLIP = 3.0
-"""Limit of the normalized grey, in local standard deviations."""
 
 
 def channels_of(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe = FINE
 ) -> Array:
-    """Channels (H, W, 4) float32 of grey (H, W) uint8, zero where not valid.
-
-    The last channel is 1 where the channels count: valid, and not on the border of `valid`.
-    """
+    """(H, W, 4), zero where not valid; the last is 1 where valid and not on its border."""
     return np.asarray(cv2.merge(channel_planes(grey, valid, recipe)), np.float32)
 
 
 def channel_planes(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe
 ) -> list[Array]:
-    """Those of `channels_of`, each (H, W)."""
     whole = bool(valid.all())
     picture = np.asarray(grey, dtype=np.float32)
     share = np.ones(grey.shape, np.float32) if whole else valid.astype(np.float32)
@@ -92,7 +74,6 @@ class _LocalMean:
         self._counts: dict[int, Array] = {}
 
     def __call__(self, values: Array, side_px: int) -> Array:
-        """Means (H, W) of `values`, which are zero where not valid."""
         mean = _box(values, side_px)
         if self._whole:
             return mean
@@ -128,7 +109,7 @@ def _gradients(
 
 
 def _grey(picture: Array, share: Array, local: _LocalMean, recipe: ChannelRecipe) -> Array:
-    """Grey levels (H, W) without local mean, divided by the local deviation."""
+    """Without local mean, divided by the local deviation."""
     rest = (picture - local(picture * share, recipe.mean_px)) * share
     # Running sums of a box filter may fall a little below zero.
     power = np.maximum(local(rest * rest, recipe.deviation_px), 0)

@@ -5,8 +5,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-LAYOUT = 5
-"""Number of the layout of arguments and results; a kernel with another one is not used."""
+LAYOUT = 5  # of arguments and results; a kernel with another one is not used
 _NAME = "orthonav.core.register._kernel"
 log = logging.getLogger(__name__)
 
@@ -26,5 +25,4 @@ def _compiled() -> Any:
 
 
 KERNEL: Any = _compiled()
-"""Module of the functions in `_kernel.c`; None where no compiler was at hand at installation. NumPy
-then does the same, several times slower."""
+"""None where no compiler was at hand at installation: NumPy then does the same, slower."""

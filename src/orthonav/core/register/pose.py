@@ -19,12 +19,8 @@ def rotation(turn_rad: float, scale: float = 1.0) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the middle of a view's window lies on the map, and how it is turned and scaled.
-
-    `x_px, y_px`: columns and rows of the map at level 0, pixel-is-area, y to the south;
-    `turn_rad`: heading of the top of the window, clockwise from north; `log_scale`: natural
-    logarithm of the true over the assumed ground resolution (and so of true over reported height).
-    """
+    """The middle of a view's window on the map, level 0, pixel-is-area, y to the south; heading,
+    clockwise, and `log_scale` of true over reported height (and ground resolution)."""
 
     x_px: float
     y_px: float
@@ -33,19 +29,17 @@ class Pose:
 
     @property
     def linear(self) -> Array:
-        """Rotation and scale (2, 2) from the view's window to the map."""
         return rotation(self.turn_rad, math.exp(self.log_scale))
 
     def distance_px(self, other: "Pose") -> float:
-        """Distance of two places, pixels of level 0."""
         return math.hypot(self.x_px - other.x_px, self.y_px - other.y_px)
 
     def map_px(self, from_middle_px: Array) -> Array:
-        """Map coordinates (..., 2) of points given from the middle of the window, level 0 px."""
+        """Of points (..., 2) from the middle of the window, level 0."""
         return np.asarray(from_middle_px @ self.linear.T + [self.x_px, self.y_px])
 
     def stepped(self, step: Sequence[float]) -> "Pose":
-        """This pose after the inverse of a small step (dx, dy, turn, log scale) of the window."""
+        """After the inverse of a small step (dx, dy, turn, log scale) of the window."""
         scale = math.exp(self.log_scale)
         cos, sin = scale * math.cos(self.turn_rad), scale * math.sin(self.turn_rad)
         return Pose(
@@ -57,44 +51,33 @@ class Pose:
 
 
 def even_scale(log_scale: float) -> float:
-    """Factor of correlation times root of pixels that makes scores of chance alike at any scale.
-
-    A view that is magnified touches more pixels of the map, without more information; on mirrored
-    views chance grows with about the root of the scale (docs/decisions/registration.md).
+    """Makes scores of chance alike at any scale: a magnified view touches more pixels without more
+    information, and chance grows with about the root of the scale (docs/decisions/registration.md).
     """
     return math.exp(log_scale / 2)
 
 
-NAT_SCORE = 1.0
-"""Units of the score per nat of the prior of heading and scale
-(docs/decisions/registration.md)."""
-SIGMAS = 3.0
-"""A place is compared under scales within so many standard deviations of the expected one."""
-HALF_STEP = 0.07
-"""And half a step of the bank of scales farther."""
+NAT_SCORE = 1.0  # units of the score per nat of the prior (docs/decisions/registration.md)
+SIGMAS = 3.0  # scales compared at a place, in standard deviations,
+HALF_STEP = 0.07  # and half a step of the bank farther
 
 
 @dataclass(frozen=True, eq=False)
 class ScaleMap:
-    """Log scales (true over reported height) expected over a sheet.
-
-    `values` (H, W): at nodes `step_px` apart, the first at (0, 0), x and y in pixels of level 0.
-    `std`: their standard deviation.
-    """
+    """Log scales (true over reported height) at nodes (H, W), `step_px` of level 0 apart."""
 
     values: NDArray[np.float32]
     step_px: float
     std: float
 
     def at(self, x_px: float, y_px: float) -> float:
-        """The log scale expected at a place; beyond the sheet that of its border."""
+        """Beyond the sheet that of its border."""
         rows, cols = self.values.shape
         row = min(max(round(y_px / self.step_px), 0), rows - 1)
         col = min(max(round(x_px / self.step_px), 0), cols - 1)
         return float(self.values[row, col])
 
     def over(self, level: int, row: int, col: int, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """Log scales expected at the pixels of a window (H, W) of a level."""
         unit = 2.0**level / self.step_px
         matrix = np.array([[unit, 0, col * unit], [0, unit, row * unit]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -111,11 +94,7 @@ class ScaleMap:
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Expected heading and scale: `turn_rad` (None: unknown), and standard deviations of both.
-
-    `scale_map`: the log scale expected at each place, with a deviation of its own; None where 0 is
-    expected everywhere.
-    """
+    """`turn_rad`: None: unknown. `scale_map`: None: 0 is expected everywhere."""
 
     turn_rad: float | None
     turn_std_rad: float
@@ -123,7 +102,6 @@ class PosePrior:
     scale_map: ScaleMap | None = None
 
     def cost(self, pose: Pose) -> float:
-        """What is subtracted from the score of a pose, by the prior."""
         if self.scale_map is None:
             return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
         own = PosePrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
@@ -133,10 +111,7 @@ class PosePrior:
     def nats(
         self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
     ) -> float:
-        """Negative log density of a heading and scale, 0 at its peak.
-
-        Where they stand for all `within` (rad, log scale) around, that of the likeliest of those.
-        """
+        """Negative log density, 0 at its peak; the least `within` (rad, log scale) around."""
         parts = [(log_scale, self.log_scale_std, within[1])]
         if self.turn_rad is not None:
             off = math.remainder(turn_rad - self.turn_rad, 2 * math.pi)

@@ -1,12 +1,9 @@
 """Moving a candidate to its best position, heading and scale, and judging it there.
 
-Gauss-Newton on the sum of squared differences between a view's channels and the map's, each kind
-of channels with its own gain, so that correlation is what is maximized; the step is found on the
-view's side, whose derivatives are made once (inverse compositional alignment, Baker and Matthews,
-IJCV 2004). The covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang
-and Zeger 1986): residuals of neighbouring pixels are not independent, so their scores are summed
-by blocks of the view, and the spread of those sums is what moves the peak.
-"""
+Gauss-Newton on squared differences of channels, each kind with its own gain, so that correlation is
+maximized; derivatives are the view's (inverse compositional, Baker and Matthews, IJCV 2004). The
+covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang and Zeger 1986)
+over blocks of the view, for residuals of neighbouring pixels are not independent."""
 
 import math
 from collections.abc import Sequence
@@ -31,38 +28,25 @@ from orthonav.core.register.window import (
 )
 
 Array = NDArray[np.float32]
-STEPS = 6
-"""Gauss-Newton steps at most. Like the other values here without a source of their own, chosen on
-the scenes of `python -m benchmarks.real_imagery`."""
-SLACK_PX = 6
-"""Margin of the map window around the first pose: two steps of `MAX_STEP_PX`."""
-SMALL_STEP_PX = 0.03
-"""A step that moves no part of the view by more than this ends the refinement."""
-MAX_STEP_PX = 3.0
-"""Longest step: about the basin of convergence (docs/decisions/registration.md)."""
-DAMPING = 1e-3
-"""Relative damping of the Gauss-Newton matrix (Levenberg and Marquardt)."""
-MIN_CORRELATION = 0.08
-"""Correlations below count as this in the gain, so that steps do not vanish."""
-WHOLE_OVERLAP = 0.97
-"""Above this overlap the Gauss-Newton matrix of the whole view is used."""
+STEPS = 6  # At most. Values here without a source: by `python -m benchmarks.real_imagery`.
+SLACK_PX = 6  # two steps of `MAX_STEP_PX`
+SMALL_STEP_PX = 0.03  # ends the refinement
+MAX_STEP_PX = 3.0  # the basin of convergence (docs/decisions/registration.md)
+DAMPING = 1e-3  # relative (Levenberg and Marquardt)
+MIN_CORRELATION = 0.08  # least in the gain, so that steps do not vanish
+WHOLE_OVERLAP = 0.97  # Above, the Gauss-Newton matrix of the whole view is used
 BLOCK_SUMS = 7
-"""Numbers of each block in `SpreadSums.blocks`."""
-MIN_CURVATURE = 0.05
-"""Least curvature of a direction in the covariance, as a share of the Gauss-Newton matrix."""
+MIN_CURVATURE = 0.05  # of a direction in the covariance, as a share of the Gauss-Newton matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """How well a view fits the map at a pose and a level.
 
-    `score`: weighted sum of correlations times the square root of the pixels of the level that
-    it rests on; `correlations` of the kinds of channels, `weighted` their weighted mean;
-    `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
-    `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
-    standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
-    pixels), turn (rad) and log scale, where they were asked for.
-    """
+    `score`: weighted sum of correlations times the root of the pixels; `correlations` of the kinds;
+    `overlap`: share on valid map; where asked for, `agreement`: share of blocks that speak for it,
+    `blocks_t`: their mean over its standard deviation, `covariance` (4, 4) of x, y, turn, log
+    scale."""
 
     pose: Pose
     level: int
@@ -77,14 +61,12 @@ class Fit:
 
 
 class Refiner:
-    """Refines candidates of one view at one level."""
-
     def __init__(self, template: Template, reference: Reference) -> None:
         self.template, self.reference = template, reference
         self._reach_px = math.hypot(*template.mask.shape) / 2
 
     def prepare(self) -> None:
-        """Make what threads share, so that none makes it again."""
+        """What threads share, once."""
         if KERNEL is None:
             _ = self.template.self_slopes, self.template.hessians
         else:
@@ -98,10 +80,7 @@ class Refiner:
         *,
         with_covariance: bool = False,
     ) -> Fit:
-        """The view at the best pose near `pose`, within a few pixels of the level.
-
-        It ends where a step moves no part of the view by more than `small_step_px`.
-        """
+        """The best pose within a few pixels of the level; ends below `small_step_px`."""
         window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
         fit, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
@@ -119,7 +98,7 @@ class Refiner:
     def _refined(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
     ) -> tuple[Fit, Sequence[float]]:
-        """The best pose of so many steps at most, and the last step (4,)."""
+        """And the last step (4,)."""
         if KERNEL is None:
             return self._refined_by_numpy(window, pose, steps, small_step_px)
         found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
@@ -131,7 +110,6 @@ class Refiner:
     def _for_kernel(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
     ) -> tuple[object, ...]:
-        """The view beside the map at a pose, and the limits of steps."""
         template = self.template
         limits = (
             *(window.row, window.col, window.unit, steps, small_step_px),
@@ -143,7 +121,6 @@ class Refiner:
     def _refined_by_numpy(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
     ) -> tuple[Fit, Sequence[float]]:
-        """`_refined` without the kernel."""
         unit = 2.0**self.template.level
         converged, step = False, [0.0] * 4
         seen = best = self._compared(window, pose)
@@ -162,12 +139,11 @@ class Refiner:
         return best.fit(converged), step
 
     def _compared(self, window: MapWindow, pose: Pose) -> "Comparison":
-        """The view beside the map under a pose."""
         planes = sampled_planes(self.template, window, pose)
         return Comparison(self.template, pose, compared(self.template, *planes))
 
     def _hessian(self, seen: "Comparison") -> NDArray[np.float64]:
-        """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
+        """Over the part of the view that lies on the map."""
         first, second = seen.squares
         hessians = self.template.hessians
         if seen.overlap <= WHOLE_OVERLAP:
@@ -176,7 +152,6 @@ class Refiner:
         return np.asarray(first * hessians[0] + second * hessians[1])
 
     def _spread(self, window: MapWindow, pose: Pose) -> "SpreadSums":
-        """What the covariance at a pose is made of."""
         if KERNEL is None:
             pixels = _Pixels(self.template, window, pose)
             return SpreadSums(pixels.observed(), self._hessian(pixels.seen), pixels.sums_by_block())
@@ -186,7 +161,7 @@ class Refiner:
         return SpreadSums(observed, hessian, out[32:].reshape(-1, BLOCK_SUMS))
 
     def _step(self, seen: "Comparison") -> list[float]:
-        """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
+        """Of the window: x, y (px of the level), turn, log scale."""
         hessian = self._hessian(seen)
         hessian.flat[::5] *= 1 + DAMPING
         hessian.flat[::5] += 1e-12
@@ -197,7 +172,7 @@ class Refiner:
         return math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3])
 
     def _to_map(self, pose: Pose) -> NDArray[np.float64]:
-        """From steps of the window to position (level-0 px), turn and log scale: (4, 4)."""
+        """From steps of the window to position (level-0 px), turn and log scale."""
         to_map = np.eye(4)
         to_map[:2, :2] = pose.linear * 2.0**self.template.level
         return to_map
@@ -207,9 +182,7 @@ class SpreadSums(NamedTuple):
     """What a covariance is made of.
 
     - `observed` (4, 4): products of the view's derivatives by the steps and the map's.
-    - `hessian` (4, 4): the Gauss-Newton matrix.
-    - `blocks` (B * B, 7): by block of the view, the derivatives (4) of the score by the steps, the
-      products of view and map of both kinds of channels, and the pixels that count.
+    - `blocks` (B * B, 7): derivatives (4) of the score, products of both kinds of channels, pixels.
     """
 
     observed: NDArray[np.float64]
@@ -217,26 +190,21 @@ class SpreadSums(NamedTuple):
     blocks: NDArray[np.float64]
 
     def covariance(self) -> NDArray[np.float64]:
-        """Covariance (4, 4) of the steps.
-
-        Noise and change have derivatives too: counted as if they held the view in place, they
-        would make the position appear known along ground that runs in one direction. So the
-        curvature is that of the view's derivatives times the map's.
-        """
+        """The curvature is that of the view's derivatives times the map's: noise and change have
+        derivatives too, and would make a position appear known along ground of one direction."""
         terms = self.blocks[:, :4]
         spread = terms.T @ terms * (BLOCKS**2 / (BLOCKS**2 - 4))
         inverse = _bounded_inverse((self.observed + self.observed.T) / 2, self.hessian)
         return np.asarray(inverse @ spread @ inverse.T)
 
     def agreement(self) -> float:
-        """Share of the blocks of a view whose channels correlate positively."""
+        """Share of blocks whose channels correlate positively."""
         sums, counts = self.blocks[:, 4] + self.blocks[:, 5], self.blocks[:, 6]
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0
 
     def blocks_t(self) -> float:
-        """Sum of the gradients' products over the blocks of a view, divided by the root of the sum
-        of their squares: large where many blocks agree, not a few strong ones."""
+        """Sum of the gradients' products over blocks, by the root of their squares."""
         sums = self.blocks[:, 4]
         return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))
 
@@ -244,7 +212,7 @@ class SpreadSums(NamedTuple):
 def _bounded_inverse(
     observed: NDArray[np.float64], hessian: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Inverse (P, P) of `observed`, no direction held less than a share of what `hessian` says."""
+    """Of `observed`, no direction held less than a share of what `hessian` says."""
     own = np.sqrt(np.diag(hessian)) + 1e-12
     values, vectors = np.linalg.eigh(observed / np.outer(own, own))
     inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
@@ -252,13 +220,8 @@ def _bounded_inverse(
 
 
 class Comparison:
-    """A view beside the map under one pose.
-
-    `correlations`, `squares` and `gains` by kind of channel: the step is made of gain * map -
-    correlation^2 * view, so that its part of each kind is what moves the peak, weighted by what
-    that kind can say: steps from the plain difference would fall short by the square of the
-    correlation.
-    """
+    """A view beside the map. Steps are gain * map - correlation^2 * view, by kind: plain
+    differences would fall short by the square of the correlation."""
 
     def __init__(self, template: Template, pose: Pose, sums: Sums) -> None:
         self.template, self.pose, self._sums = template, pose, sums
@@ -281,17 +244,14 @@ class Comparison:
         self.score = total * math.sqrt(max(pixels, 0.0)) * even_scale(pose.log_scale)
 
     def slope(self) -> NDArray[np.float64]:
-        """Derivatives (4,) of the score by the steps."""
         own = self.template.self_slopes - self._sums.left_slopes
         return np.asarray(self.gains @ self._sums.slopes - self.squares @ own)
 
     def shares(self) -> NDArray[np.float64]:
-        """Share of each block of the view (B * B) that lies on valid map."""
         pixels = self.template.block_pixels
         return np.asarray((pixels - self._sums.left_pixels) / np.maximum(pixels, 1.0))
 
     def fit(self, converged: bool) -> Fit:
-        """The numbers of this pose."""
         return Fit(
             self.pose,
             self.template.level,
@@ -304,8 +264,7 @@ class Comparison:
 
 
 class _Pixels:
-    """The pixels of a comparison: `map` (3, H, W) as the view's window shows it, `counts` (H, W), 1
-    where both are valid, and `residual` (3, H, W), gain * map - correlation^2 * view."""
+    """`map` (3, H, W), `counts` (H, W), `residual`: gain * map - correlation^2 * view."""
 
     def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
         planes, valid = sampled_planes(template, window, pose)
@@ -322,7 +281,6 @@ class _Pixels:
             )
 
     def observed(self) -> NDArray[np.float64]:
-        """Products (4, 4) of the view's derivatives by the steps and the map's."""
         mine = self.seen.template.gradients
         theirs = gradients(self.map, self.counts)
         theirs *= np.repeat(self.seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
@@ -345,7 +303,6 @@ class _Pixels:
         )
 
     def sums_by_block(self) -> NDArray[np.float64]:
-        """`SpreadSums.blocks`."""
         terms = by_steps(np.einsum("cphw,chw->phw", self.seen.template.gradients, self.residual))
         products = self._view * self.map
         kinds = [products[group].sum(axis=0) for group in GROUPS]

@@ -1,11 +1,8 @@
 """Candidates: where, and how turned and scaled, a view might lie in a window of the map.
 
-The view's channels are laid on the window at every position at once by FFT, for each heading and
-scale of a bank. Channels of the map are divided by their local energy beforehand, so that one
-backward transform gives the sum over all kinds of channels. What comes out is the correlation
-times the square root of the pixels that it rests on: pure chance then gives values alike at every
-scale, whereas correlation alone favours small views.
-"""
+The view's channels are laid at every position by FFT, for each heading and scale of a bank.
+Channels of the map are divided by their local energy beforehand: one backward transform gives the
+sum of all kinds. Correlation times the root of its pixels makes chance alike at every scale."""
 
 import math
 import threading
@@ -27,20 +24,12 @@ from orthonav.core.register.template import Template, energy_of, turn_planes
 from orthonav.core.register.window import Reference, cut, thread_memory
 
 Array = NDArray[np.float32]
-ENERGY_FLOOR = 0.3
-"""Share of the typical energy added to the local one, so that blank ground is not amplified."""
-
-
+ENERGY_FLOOR = 0.3  # of the typical energy, so that blank ground is not amplified
 POSES_AT_ONCE = 6
-"""Poses that a thread takes at a time."""
 PLACES_AT_ONCE = 50
-"""Poses whose surroundings a thread searches at a time."""
-MAX_KEPT_WINDOWS = 4
-"""Search windows of whole sheets in the cache."""
-WIDE = 8
-"""Columns or rows that the kernel transforms together."""
-LONGEST_PX = 32768
-"""Longest side of a window that the kernel takes."""
+MAX_KEPT_WINDOWS = 4  # of whole sheets in the cache
+WIDE = 8  # columns or rows that the kernel transforms together
+LONGEST_PX = 32768  # of a window that the kernel takes
 
 
 def bank(
@@ -51,8 +40,7 @@ def bank(
     scale_step: float,
     sigmas: float,
 ) -> list[tuple[float, float]]:
-    """Turns (rad) and log scales that reach `sigmas` standard deviations, each with each; all turns
-    where `None`."""
+    """Turns (rad) and log scales within `sigmas`, each with each; all turns where `None`."""
     if turn_std_rad is None or sigmas * turn_std_rad + turn_step_rad / 2 >= math.pi:
         count = math.ceil(2 * math.pi / turn_step_rad)
         turns = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
@@ -63,25 +51,20 @@ def bank(
 
 
 def _spread(reach: float, step: float) -> NDArray[np.float64]:
-    """Values around 0, `step` apart, so that nothing within `reach` is farther than half a step."""
+    """Around 0, so that nothing within `reach` is farther than half a step."""
     count = max(1, math.ceil(2 * reach / step))
     return (np.arange(count, dtype=np.float64) - (count - 1) / 2) * step
 
 
 class Peak(NamedTuple):
-    """A candidate: `score` (correlation times square root of pixels) at a pose."""
-
     score: float
     pose: Pose
 
 
 class SearchWindow:
-    """A window of the map made ready to be searched: channels (H, W, 4) at a level.
-
-    (`row`, `col`) is its first pixel on that level of the sheet; `view_px` about the side of the
-    views that will be laid on it; within `margin_px` of the border no middle of a view is sought.
-    `half_px`: the largest `posed_half_px` of these views; None: not known yet.
-    """
+    """Channels (H, W, 4) of the map at a level, first pixel (`row`, `col`), ready to be searched
+    for views of about `view_px`, none within `margin_px` of the border; `half_px`: largest
+    `posed_half_px`."""
 
     def __init__(
         self,
@@ -109,17 +92,17 @@ class SearchWindow:
 
     @cached_property
     def channels(self) -> Array:
-        """The channels (H, W, 3) divided by their local energy."""
+        """Divided by their local energy."""
         return self._normalized()
 
     @cached_property
     def spectra(self) -> NDArray[np.complex64]:
-        """Spectra (3, h, w) of the channels, padded to `size`; the channels are not kept."""
+        """Padded to `size`; the channels are not kept."""
         return self._transformed()
 
     @cached_property
     def spectra_by_columns(self) -> Array:
-        """The same as the kernel takes them (G, 3, h, 16): eight columns, real parts first."""
+        """As the kernel takes them (G, 3, h, 16): eight columns, real parts first."""
         spectra = self._transformed()
         channels, rows, cols = spectra.shape
         out = np.zeros((-(-cols // WIDE), channels, rows, 2, WIDE), np.float32)
@@ -130,15 +113,13 @@ class SearchWindow:
 
     @property
     def by_kernel(self) -> bool:
-        """Whether the kernel searches it: where there is one, and no side is too long for it."""
         return KERNEL is not None and max(self.size) <= LONGEST_PX
 
     def prepare(self, template: Template) -> None:
-        """Make what threads share when they search for a view, so that none makes it again."""
+        """What threads share, once."""
         _ = self.spectra_by_columns if self.by_kernel else (self.spectra, template.interleaved)
 
     def prepare_near(self, template: Template) -> None:
-        """The same for `best_near`."""
         _ = self.channels
         if KERNEL is None:
             _ = template.interleaved
@@ -154,7 +135,7 @@ class SearchWindow:
 
 
 def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
-    """Channels (H, W, C) divided by the root of their mean energy in windows as large as views."""
+    """Root of the mean energy in windows as large as views."""
     energy = np.einsum("ijc,ijc->ij", channels, channels)
     side = min(max(3, view_px // 2), 2 * min(energy.shape) - 1)
     local = cv2.blur(energy, (side, side)) / np.maximum(cv2.blur(counts, (side, side)), 0.1)
@@ -163,7 +144,7 @@ def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
 
 
 class SearchWindows:
-    """Windows of one sheet. Safe to share between threads."""
+    """Of one sheet; threads may share it."""
 
     def __init__(self, reference: Reference) -> None:
         self._reference = reference
@@ -171,7 +152,7 @@ class SearchWindows:
         self._lock = threading.Lock()
 
     def whole(self, level: int, recipe: ChannelRecipe, view_px: float) -> SearchWindow:
-        """The whole sheet at a level: views of about the same size share it."""
+        """Views of about the same size share it."""
         side = _rounded_side(view_px / 2**level)
         key = (level, recipe, side)
         with self._lock:
@@ -192,10 +173,7 @@ class SearchWindows:
         reach_px: float,
         half_px: int | None = None,
     ) -> SearchWindow:
-        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y).
-
-        `half_px`: see `SearchWindow`.
-        """
+        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y)."""
         unit = 2.0**level
         margin = math.ceil(view_px / 2 / unit)
         rows, cols = self._reference.shape(level)
@@ -212,7 +190,7 @@ class SearchWindows:
 
 
 def _rounded_side(side: float) -> int:
-    """A side rounded up by steps of about a quarter, so that views of like size share a window."""
+    """By steps of about a quarter, so that views of like size share a window."""
     return math.ceil(2 ** (math.ceil(4 * math.log2(max(side, 8.0))) / 4))
 
 
@@ -224,11 +202,9 @@ def search(
     scales: ScaleMap | None = None,
     pool: Executor | None = None,
 ) -> list[Peak]:
-    """The `count` best candidates, best first, not closer together than an eighth of the view.
+    """The `count` best candidates, best first, at least an eighth of the view apart.
 
-    With `scales` every place is compared under the scales that are expected there only. The threads
-    of `pool` share the poses; what comes out does not depend on them.
-    """
+    `scales`: only those expected at a place are compared. Results do not depend on `pool`."""
     share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
     parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
     window.prepare(template)
@@ -259,8 +235,7 @@ def search(
 def best_near(
     template: Template, window: SearchWindow, poses: Sequence[Pose], reach_px: float
 ) -> list[Peak]:
-    """The best place of a view within `reach_px` (level 0) of each pose, along each axis, under its
-    heading and scale."""
+    """Within `reach_px` (level 0) of each pose, along each axis, under its heading and scale."""
     unit = 2.0**template.level
     reach = math.ceil(reach_px / unit)
     places = np.array(
@@ -286,8 +261,7 @@ def best_near(
 def _best_near(
     template: Template, window: SearchWindow, place: NDArray[np.float64], reach: int
 ) -> tuple[float, float, float]:
-    """Score, x and y of the best place within `reach` of (x, y, turn, log scale), pixels of the
-    window; without the kernel."""
+    """Score, x and y near (x, y, turn, log scale), pixels of the window; without the kernel."""
     x, y, turn, log_scale = place.tolist()
     half = posed_half_px(template, log_scale)
     # Middles of views lie on first corners of pixels, from these on.
@@ -310,7 +284,7 @@ def _best_of(
     part: range,
     scales: ScaleMap | None,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """The best score (H, W) of some of the poses at every place, and the number of its pose."""
+    """Best score (H, W) at every place, and the number of its pose."""
     shape = window.height, window.width
     expected = None if scales is None else scales.over(window.level, window.row, window.col, shape)
     if window.by_kernel:
@@ -342,7 +316,7 @@ def _best_by_kernel(
     scales: ScaleMap | None,
     expected: Array | None,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """The same by the kernel; `expected` (H, W): log scales expected at every place."""
+    """The same; `expected` (H, W): log scales."""
     bands = -(-window.height // (2 * WIDE))
     best = np.full((bands, window.size[1], 2 * WIDE), -np.inf, np.float32)
     which = np.zeros(best.shape, np.int32)
@@ -361,8 +335,7 @@ def _best_by_kernel(
 
 
 def _in_bands(values: Array, shape: tuple[int, ...]) -> Array:
-    """Values (H, W) as the kernel takes them (B, C, 16): bands of sixteen rows, column by column;
-    NaN beyond them."""
+    """(B, C, 16) for the kernel: bands of sixteen rows, column by column; NaN beyond."""
     bands, cols, rows = shape
     out = np.full((bands * rows, cols), np.nan, np.float32)
     out[: values.shape[0], : values.shape[1]] = values
@@ -370,7 +343,7 @@ def _in_bands(values: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _from_bands(values: NDArray[Any], window: SearchWindow) -> NDArray[Any]:
-    """Values (H, W) of the window from what the kernel made (B, C, 16)."""
+    """The inverse."""
     rows = values.swapaxes(1, 2).reshape(-1, values.shape[1])
     return np.ascontiguousarray(rows[: window.height, : window.width])
 
@@ -388,8 +361,7 @@ class _Scratch:
         self._total, self._product = made[3 * rows * half :].reshape(2, rows, half)
 
     def scores(self, template: Template, turn: float, log_scale: float) -> Array | None:
-        """Score (H, W) of the view's middle lying on each pixel's first corner; None if the view
-        does not fit into the window."""
+        """Of the view's middle on each pixel's first corner; None if it does not fit."""
         window = self._window
         half = posed_half_px(template, log_scale)
         rows, cols = window.size
@@ -420,16 +392,11 @@ def posed_half_px(template: Template, log_scale: float) -> int:
 
 
 def largest_half_px(template: Template, poses: Sequence[tuple[float, float]]) -> int:
-    """The largest `posed_half_px` of a template under poses (turn, log scale)."""
     return posed_half_px(template, max(log_scale for _, log_scale in poses))
 
 
 def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
-    """Channels (3, P, P) of a template as the map would show them, its middle in theirs.
-
-    Each kind of channel has the norm of its weight over `even_scale`, so that scores of all scales
-    compare.
-    """
+    """(3, P, P), its middle in theirs, each kind with the norm of its weight over `even_scale`."""
     height, width = template.mask.shape
     half = posed_half_px(template, log_scale)
     linear = rotation(turn, math.exp(log_scale))
@@ -462,7 +429,7 @@ def _peaks(scores: Array, count: int, apart: int) -> list[tuple[int, int]]:
 
 
 def _between(scores: Array, row: int, col: int) -> tuple[float, float]:
-    """Peak (x, y) in pixels, by a parabola on each axis."""
+    """(x, y) in pixels, by a parabola on each axis."""
 
     def offset(before: float, at: float, after: float) -> float:
         bend = before - 2 * at + after

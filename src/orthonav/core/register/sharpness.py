@@ -1,11 +1,8 @@
 """How much a place stands out from the ground around it, which tells it from texture that repeats.
 
-A view of rows, lattices or a single road fits nearly as well a little aside. Places found by chance
-do so too. The view's window is moved a little aside, and what it scores there is compared with its
-score at the place itself: for all channels, for gradients alone, and as phase correlation (Kuglin
-and Hines, 1975), which weighs all spatial frequencies alike. All three come from the same spectra.
-What they bring is in docs/decisions/evidence.md.
-"""
+Rows, lattices and single roads fit nearly as well a little aside, and so do places by chance.
+Scores aside are compared with that of the place, for all channels, gradients alone, and phase
+correlation (Kuglin and Hines, 1975), all from the same spectra (docs/decisions/evidence.md)."""
 
 import math
 from typing import NamedTuple
@@ -22,26 +19,18 @@ from orthonav.core.register.window import MapWindow, Reference
 
 Array = NDArray[np.float32]
 REACH_SHARE, MIN_REACH_PX = 0.125, 8
-"""The window is moved by up to this share of its sides to either side, and by so many pixels of the
-level at least."""
+"""How far the window is moved: share of its sides, pixels of the level at least."""
 PEAK_SHARE = 0.06
-"""Moves below this share of the view's side belong to the place itself."""
+"""Moves below this share of the view's side, or so many pixels, belong to the place itself."""
 MIN_PEAK_PX = 3.0
-"""The same, at least, pixels of the level."""
-NEAR_PX = 3.0
-"""The place itself is the best within so many pixels."""
+NEAR_PX = 3.0  # the place itself is the best within so many pixels
 MAX_RATIO = 10.0
-PHASE_FLOOR = 1e-3
-"""Frequencies of less power than this share of the mean count less in the phase correlation."""
+PHASE_FLOOR = 1e-3  # share of the mean power below which frequencies count less
 
 
 class Sharpness(NamedTuple):
-    """How far the score of a place stands out from those a little aside.
-
-    `ratio`: of all channels, over the best one aside, up to 10; 0 where the view does not correlate
-    at all. `gradients`, `phase`: of gradients alone, and by phase correlation of all channels, over
-    the mean aside, in standard deviations.
-    """
+    """Over scores a little aside: `ratio` of all channels over the best, up to 10; 0 without
+    correlation; `gradients`, `phase` over the mean, in standard deviations."""
 
     ratio: float
     gradients: float
@@ -49,7 +38,7 @@ class Sharpness(NamedTuple):
 
 
 def sharpness(template: Template, reference: Reference, pose: Pose) -> Sharpness:
-    """How far a view stands out at `pose`; heading and scale stay those of `pose`."""
+    """At the heading and scale of `pose`."""
     moved = _moved_scores(template, reference, pose)
     rows, cols = (np.arange(side, dtype=np.float64) - side // 2 for side in moved.shape[1:])
     moved_px = np.hypot(rows[:, None], cols)
@@ -75,11 +64,9 @@ def _deviations(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]
 
 
 def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array:
-    """Scores (3, 2 R + 1, 2 C + 1) of a view's window moved by up to R rows and C columns: of
-    gradients, of grey, and by phase correlation.
+    """Scores (3, 2 R + 1, 2 C + 1) of gradients, grey and phase correlation, by rows and columns.
 
-    Not divided by the energy of the map under each move: that hardly changes.
-    """
+    Not divided by the energy of the map under each move: that hardly changes."""
     height, width = template.mask.shape
     rows, cols = (max(MIN_REACH_PX, int(side * REACH_SHARE)) for side in (height, width))
     window = MapWindow.of(template, reference, pose, 0, (rows, cols))

@@ -19,20 +19,13 @@ from orthonav.core.register.channels import (
 from orthonav.core.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
-JUDGED_PX = 72.0
-"""A view is judged at the level where it is about so many pixels across
-(docs/decisions/registration.md)."""
-BLOCKS = 6
-"""Blocks along one side of a view, in which residuals are taken as one (see `refine`)."""
+JUDGED_PX = 72.0  # Across, at the judged level (docs/decisions/registration.md)
+BLOCKS = 6  # along one side of a view, in which residuals are taken as one (see `refine`)
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """One view at one level.
-
-    `planes` (4, H, W): channels, each kind scaled to the energy that its weight gives it, and 1
-    where it counts; `weights` of the kinds; `level` of the map whose ground resolution it has.
-    """
+    """`planes` (4, H, W): channels scaled to the energy of their weight, and 1 where it counts."""
 
     level: int
     planes: Array
@@ -43,7 +36,6 @@ class Template:
     def of(
         cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: ChannelRecipe
     ) -> "Template":
-        """The template of grey levels (H, W) at the ground resolution of `level`."""
         planes, weights = np.stack(channel_planes(grey, valid, recipe)), (1.0, recipe.grey_share)
         for group, weight in zip(GROUPS, weights, strict=True):
             energy = energy_of(planes[group])
@@ -52,48 +44,41 @@ class Template:
 
     @property
     def channels(self) -> Array:
-        """The channels (3, H, W)."""
         return self.planes[:3]
 
     @property
     def mask(self) -> Array:
-        """1 where the view counts (H, W) float32."""
         return np.asarray(self.planes[3], np.float32)
 
     @cached_property
     def values(self) -> Array:
-        """The planes side by side (H, W, 4)."""
         return np.asarray(cv2.merge(list(self.planes)), np.float32)
 
     @cached_property
     def pixels(self) -> float:
-        """Number of pixels that count."""
         return float(self.mask.sum())
 
     @cached_property
     def whole(self) -> bool:
-        """Whether every pixel counts."""
         return bool(self.mask.min() > 0)
 
     @cached_property
     def interleaved(self) -> Array:
-        """The channels as (H, W, 3)."""
         return np.ascontiguousarray(self.values[..., :3])
 
     @cached_property
     def energies(self) -> NDArray[np.float64]:
-        """Sums of squares (G,) of the kinds of channels."""
+        """Sums of squares (G,) of the kinds."""
         return np.array([energy_of(self.channels[group]) for group in GROUPS])
 
     @cached_property
     def slopes(self) -> Array:
-        """Derivatives of the channels along x and y (H, W, 8), each of four numbers, the last 0;
-        with the kernel only."""
+        """Derivatives along x and y (H, W, 8), each of four numbers, the last 0; kernel only."""
         return self._derived[0]
 
     @cached_property
     def _derived(self) -> tuple[Array, NDArray[np.float64]]:
-        """`slopes`, and all numbers of `block_hessians` and `self_slopes`, by the kernel."""
+        """`slopes`, and all numbers of `block_hessians` and `self_slopes`."""
         slopes = np.empty((*self.values.shape[:2], 2 * CHANNELS), np.float32)
         out = np.empty(BLOCKS**2 * len(GROUPS) * 16 + len(GROUPS) * 4)
         KERNEL.derive(self.values, slopes, out)
@@ -101,25 +86,22 @@ class Template:
 
     @cached_property
     def gradients(self) -> Array:
-        """Derivatives of the channels along x and y, per pixel: (3, 2, H, W)."""
+        """Along x and y, per pixel: (3, 2, H, W)."""
         return gradients(self.channels, self.mask)
 
     @cached_property
     def jacobian(self) -> Array:
-        """How the channels change with a small step of the window: (3, 4, H, W).
-
-        Steps are x, y (pixels of the level), turn (rad) and log scale about the middle.
-        """
+        """(3, 4, H, W) by steps x, y (pixels of the level), turn (rad), log scale."""
         return by_steps(self.gradients.swapaxes(0, 1)).swapaxes(0, 1)
 
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
-        """Gauss-Newton matrices (G, 4, 4) of the steps, one for each kind of channel."""
+        """(G, 4, 4)."""
         return np.asarray(self.block_hessians.sum(axis=0))
 
     @cached_property
     def block_hessians(self) -> NDArray[np.float64]:
-        """What each block of the view (row by row) adds to `hessians`: (B * B, G, 4, 4)."""
+        """Of each block, row by row: (B * B, G, 4, 4)."""
         if KERNEL is not None:
             return self._derived[1][: -4 * len(GROUPS)].reshape(BLOCKS**2, len(GROUPS), 4, 4)
         starts = zip(self.block_starts, self.mask.shape, strict=True)
@@ -140,38 +122,36 @@ class Template:
 
     @cached_property
     def numbers(self) -> NDArray[np.float64]:
-        """All numbers of the template that the kernel takes (`numbers_t` in `_kernel.c`)."""
+        """For the kernel (`numbers_t` in `_kernel.c`)."""
         parts = (self.pixels, self.energies, self.weights, self.self_slopes, self.hessians)
         blocks = self.block_pixels, self.block_hessians
         return np.concatenate([np.ravel(each).astype(np.float64) for each in (*parts, *blocks)])
 
     @cached_property
     def block_pixels(self) -> NDArray[np.float64]:
-        """Pixels that count in each block (B * B)."""
         return self.block_sums(self.mask).astype(np.float64)
 
     def block_sums(self, values: Array) -> Array:
-        """Sums of values (..., H, W) over the blocks of the view, row by row: (..., B * B)."""
+        """Of values (..., H, W), row by row: (..., B * B)."""
         rows, cols = self.block_starts
         sums = np.add.reduceat(np.add.reduceat(values, rows, axis=-2), cols, axis=-1)
         return np.asarray(sums.reshape(*values.shape[:-2], BLOCKS * BLOCKS))
 
     @cached_property
     def block_starts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """First rows and first columns of `BLOCKS` x `BLOCKS` blocks of the window."""
         rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
         return rows.astype(np.intp), cols.astype(np.intp)
 
 
 def by_kind(template: Template, channels: Array) -> NDArray[np.float64]:
-    """Derivatives of a view by the steps times channels (3, H, W), summed by kind (G, 4)."""
+    """Derivatives by the steps times channels (3, H, W), summed by kind (G, 4)."""
     parts = zip(template.jacobian, channels, strict=True)
     each = np.array([rows.reshape(4, -1) @ part.reshape(-1) for rows, part in parts])
     return np.array([each[group].sum(axis=0) for group in GROUPS], np.float64)
 
 
 def _products(jacobian: Array) -> NDArray[np.float64]:
-    """Products (G, 4, 4) of derivatives (3, 4, H, W), summed over the channels of each kind."""
+    """(G, 4, 4) of derivatives (3, 4, H, W)."""
     out = np.zeros((len(GROUPS), 4, 4))
     for number, group in enumerate(GROUPS):
         for each in jacobian[group]:
@@ -181,7 +161,7 @@ def _products(jacobian: Array) -> NDArray[np.float64]:
 
 
 def gradients(channels: Array, mask: Array) -> Array:
-    """Derivatives (C, 2, H, W) of channels (C, H, W) by x and y, per pixel, 0 beyond the mask."""
+    """(C, 2, H, W) by x and y, per pixel, 0 beyond the mask."""
     out = np.empty((len(channels), 2, *mask.shape), dtype=np.float32)
     for channel, into in zip(channels, out, strict=True):
         cv2.Sobel(channel, cv2.CV_32F, 1, 0, dst=into[0], scale=1 / 8)
@@ -191,8 +171,7 @@ def gradients(channels: Array, mask: Array) -> Array:
 
 
 def by_steps(along: Array) -> Array:
-    """Terms (4, .., H, W) of steps along x and y, of a turn and of the log scale, of those along x
-    and y (2, .., H, W)."""
+    """Of steps along x and y (2, .., H, W): of x, y, turn and log scale (4, .., H, W)."""
     x, y = from_middle(*along.shape[-2:])
     out = np.empty((4, *along.shape[1:]), np.float32)
     out[:2] = along
@@ -202,17 +181,14 @@ def by_steps(along: Array) -> Array:
 
 
 def from_middle(height: int, width: int) -> tuple[Array, Array]:
-    """Centres of pixels from the middle of a window, x (1, W) and y (H, 1)."""
+    """x (1, W) and y (H, 1)."""
     x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
     y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
     return x, y
 
 
 def turn_planes(made: Array, turn_rad: float, into: Array, scratch: Array) -> None:
-    """Channels (H, W, C) as planes `into` (C, H, W), edge directions turned clockwise.
-
-    `scratch` (2, H, W) is overwritten.
-    """
+    """As planes `into` (C, H, W), edge directions turned clockwise; `scratch` (2, H, W)."""
     cv2.split(made, [*scratch, *into[2:]])
     cos, sin = math.cos(2 * turn_rad), math.sin(2 * turn_rad)
     cv2.addWeighted(scratch[0], cos, scratch[1], -sin, 0, dst=into[0])
@@ -220,35 +196,28 @@ def turn_planes(made: Array, turn_rad: float, into: Array, scratch: Array) -> No
 
 
 def energy_of(values: Array) -> float:
-    """Sum of squares of a contiguous array."""
     flat = values.reshape(-1)
     return float(flat @ flat)
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Levels of the map at which a view is searched coarsely, judged, and finished."""
-
     coarse: int
     judged: int
     final: int
 
     @classmethod
     def of(cls, view_px: float, levels: int) -> "Levels":
-        """Levels for a view of `view_px` pixels of level 0 across (root of its area)."""
+        """For a view of `view_px` pixels of level 0 across (root of its area)."""
         judged = max(0, min(round(math.log2(max(view_px, 1.0) / JUDGED_PX)), levels - 1))
         return cls(min(judged + 1, levels - 1), judged, max(judged - 1, 0))
 
     def recipe(self, level: int) -> ChannelRecipe:
-        """Parameters of the channels at a level."""
         return COARSE if level > self.judged else FINE
 
 
 class ViewTemplates:
-    """A view's templates at the levels of a map, made when asked for.
-
-    `grey` and `valid` (H, W) are the rectified view at the ground resolution of level `finest`.
-    """
+    """Templates at the levels of a map, made when asked for, of a view at level `finest`."""
 
     def __init__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], finest: int) -> None:
         self.finest = finest
@@ -257,28 +226,24 @@ class ViewTemplates:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """What was seen (H, W), at the finest level."""
         return self._pictures[0][1]
 
     @cached_property
     def side_px(self) -> float:
-        """Root of the area of the view, in pixels of level 0."""
+        """Root of the area, level 0."""
         return math.sqrt(self.at(self.finest).pixels) * 2.0**self.finest
 
     def at(self, level: int, recipe: ChannelRecipe = FINE) -> Template:
-        """The template at a level, `finest` or coarser."""
         key = (level, recipe)
         if key not in self._made:
             self._made[key] = Template.of(*self._picture(level), level, recipe)
         return self._made[key]
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns at a level, `finest` or coarser."""
         rows, cols = self._picture(level)[0].shape
         return rows, cols
 
     def _picture(self, level: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid at a level."""
         while len(self._pictures) <= level - self.finest:
             self._pictures.append(halved(*self._pictures[-1]))
         return self._pictures[level - self.finest]
@@ -287,11 +252,9 @@ class ViewTemplates:
 def halved(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Grey and valid at half the resolution; the last row or column of an odd number is left out.
+    """The last row or column of an odd number is left out, half a pixel of the finer picture.
 
-    Leaving one out moves the middle by half a pixel of the finer picture: above the coarse level,
-    where places are only known to more than that.
-    """
+    Only above the coarse level, where places are known to more than that."""
     size = grey.shape[1] // 2, grey.shape[0] // 2
     grey, valid = grey[: 2 * size[1], : 2 * size[0]], valid[: 2 * size[1], : 2 * size[0]]
     smaller = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

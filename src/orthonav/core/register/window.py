@@ -1,8 +1,6 @@
-"""The map as registration sees it: channels of windows, sampled under the pose of a view, and
-the sums over the pixels of both.
+"""Windows of the map, sampled under the pose of a view, and the sums over the pixels of both.
 
-The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not.
-"""
+The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not."""
 
 import math
 import threading
@@ -22,10 +20,7 @@ _kept = threading.local()
 
 
 def thread_memory(name: str, size: int) -> NDArray[np.float32]:
-    """`size` numbers of this thread, the same ones at every call with that `name`.
-
-    Who asks again under the same name overwrites what it held before.
-    """
+    """The same memory at every call of this thread with that `name`."""
     found: NDArray[np.float32] | None = getattr(_kept, name, None)
     if found is None or found.size < size:
         found = np.empty(size, np.float32)
@@ -34,30 +29,26 @@ def thread_memory(name: str, size: int) -> NDArray[np.float32]:
 
 
 Array = NDArray[np.float32]
-LONGEST_PX = 32768
-"""Longest side of an array that the kernel and OpenCV sample."""
-WHOLE_LEVEL_PX = 2_000_000
-"""Levels of up to so many pixels are made ready whole, once (16 bytes each)."""
+LONGEST_PX = 32768  # that the kernel and OpenCV sample
+WHOLE_LEVEL_PX = 2_000_000  # smaller levels are made ready whole, once (16 bytes each)
 
 
 class GreyPyramid(Protocol):
-    """Grey levels of one sheet at several resolutions, each half as fine as the one before."""
+    """Grey levels of one sheet, each level half as fine as the one before."""
 
     levels: int
 
-    def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
-        ...
+    def shape(self, level: int) -> tuple[int, int]: ...
 
     def read(
         self, level: int, row: int, col: int, height: int, width: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of a window, which may reach beyond the sheet."""
+        """Grey and valid of a window, which may reach beyond the sheet."""
         ...
 
 
 class Reference:
-    """Channels of one sheet. Safe to share between threads."""
+    """Channels of one sheet; threads may share it."""
 
     def __init__(self, pyramid: GreyPyramid) -> None:
         self.pyramid = pyramid
@@ -66,21 +57,18 @@ class Reference:
 
     @property
     def levels(self) -> int:
-        """Number of levels; level 0 is the finest."""
         return self.pyramid.levels
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
         return self.pyramid.shape(level)
 
     def caches(self, level: int) -> bool:
-        """Whether the channels of a level are made once and cached: where it is small enough."""
         return (
             math.prod(self.shape(level)) <= WHOLE_LEVEL_PX and max(self.shape(level)) <= LONGEST_PX
         )
 
     def whole(self, level: int, recipe: ChannelRecipe = FINE) -> Array:
-        """Channels (H, W, 4) of a whole level, computed once."""
+        """Once."""
         with self._lock:
             key = (level, recipe)
             if key not in self._whole:
@@ -92,7 +80,7 @@ class Reference:
     def window(
         self, level: int, row: int, col: int, height: int, width: int, recipe: ChannelRecipe = FINE
     ) -> Array:
-        """Channels (height, width, 4) of a window; zero beyond the sheet."""
+        """(height, width, 4); zero beyond the sheet."""
         rows, cols = self.shape(level)
         if self.caches(level):
             return cut(self.whole(level, recipe), row, col, height, width)
@@ -107,7 +95,7 @@ class Reference:
 
 
 def cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
-    """A window (height, width, C) of an array (H, W, C); zero beyond it. A view where possible."""
+    """Zero beyond the array. A view where possible."""
     rows, cols = whole.shape[:2]
     y0, x0, y1, x1 = max(row, 0), max(col, 0), min(row + height, rows), min(col + width, cols)
     if (y0, x0, y1, x1) == (row, col, row + height, col + width):
@@ -118,18 +106,12 @@ def cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
     return out
 
 
-LARGEST_LOG_SCALE = 1.0
-"""A window reaches no farther than under this log scale: more than twice what is searched. Beyond
-it the map counts as missing, whatever a computed pose asks for."""
+LARGEST_LOG_SCALE = 1.0  # Beyond, the map counts as missing: more than twice what is searched
 
 
 @dataclass(frozen=True, eq=False)
 class MapWindow:
-    """Channels (R, C, 4) of the map at a level, for windows of `shape` (H, W) near a pose.
-
-    (`row`, `col`) is its first pixel on that level of the sheet; `unit` pixels of level 0 are one
-    of the level.
-    """
+    """Channels (R, C, 4) of a level, from (`row`, `col`), for windows (H, W) near a pose."""
 
     made: Array
     row: int
@@ -146,11 +128,9 @@ class MapWindow:
         slack_px: int,
         margins: tuple[int, int] = (0, 0),
     ) -> "MapWindow":
-        """Around the window of a view at a pose, larger by `margins` (rows, columns) on each side.
+        """Around the window of a view, larger by `margins` (rows, columns) on each side.
 
-        `slack_px`: how far the pose may still move, pixels of the level. The whole level where that
-        is cached.
-        """
+        `slack_px`: how far the pose may still move. The whole level where that is cached."""
         rows, cols = template.mask.shape
         height, width = rows + 2 * margins[0], cols + 2 * margins[1]
         unit = 2.0**template.level
@@ -169,14 +149,12 @@ class MapWindow:
         return cls(made, row, col, unit, (height, width))
 
     def sample(self, pose: Pose, into: Array) -> None:
-        """Channels (H, W, 4) of the map as the window shows it under a pose."""
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         matrix = np.reshape(self.matrix(pose), (2, 3))
         cv2.warpAffine(self.made, matrix, self.shape[::-1], dst=into, flags=flags)
 
     def matrix(self, pose: Pose) -> tuple[float, ...]:
-        """Numbers (6,) of the matrix (2, 3) from the window's pixels to those of `made` under a
-        pose, both counted from pixel centres, row by row."""
+        """(2, 3), row by row, from pixels of the window to those of `made`, from pixel centres."""
         height, width = self.shape
         scale = math.exp(pose.log_scale)
         cos, sin = scale * math.cos(pose.turn_rad), scale * math.sin(pose.turn_rad)
@@ -187,19 +165,12 @@ class MapWindow:
         return cos, -sin, column, sin, cos, row
 
 
-FULLY_VALID = 0.99
-"""A pixel counts where the sampled map is valid by more than this."""
+FULLY_VALID = 0.99  # A pixel counts where the sampled map is valid by more
 
 
 class Sums(NamedTuple):
-    """Sums over the pixels of a view that count, and that see valid map.
-
-    - `products`, `energies` (2,): view times map, and map squared, by kind of channel.
-    - `left_energies` (2,): view squared over its pixels that see no valid map.
-    - `slopes` (2, 4): derivatives by the steps times map.
-    - `left_slopes` (2, 4): derivatives times view over its pixels that see no valid map.
-    - `left_pixels` (B * B,): number of these by block.
-    """
+    """Over the pixels of a view that count and see valid map, by kind of channel: view times map,
+    map squared, derivatives times map; `left`: over its pixels that see no valid map, by block."""
 
     products: NDArray[np.float64]
     energies: NDArray[np.float64]
@@ -210,7 +181,6 @@ class Sums(NamedTuple):
 
     @classmethod
     def of_row(cls, row: NDArray[np.float64]) -> "Sums":
-        """Views of one row of `SUMS` numbers."""
         slopes, left_slopes = row[6:14].reshape(2, 4), row[14:22].reshape(2, 4)
         return cls(row[:2], row[2:4], row[4:6], slopes, left_slopes, row[22:])
 
@@ -219,10 +189,7 @@ SUMS = 22 + BLOCKS**2
 
 
 def compared(template: Template, seen: Array, valid: Array, slopes: bool = True) -> Sums:
-    """The sums of a view beside `sampled_planes`; those of derivatives are 0 unless `slopes`.
-
-    `seen` becomes 0 where the view or the map does not count.
-    """
+    """Sums of derivatives only with `slopes`. `seen` becomes 0 where view or map does not count."""
     made = Sums.of_row(np.zeros(SUMS))
     if not (template.whole and valid.min() > FULLY_VALID):
         counts = template.mask * (valid > FULLY_VALID)
@@ -243,10 +210,7 @@ def compared(template: Template, seen: Array, valid: Array, slopes: bool = True)
 
 
 def sampled_planes(template: Template, window: MapWindow, pose: Pose) -> tuple[Array, Array]:
-    """The map as the view's window shows it: channels (3, H, W), and how far it is valid (H, W).
-
-    Memory of the thread, overwritten by the next call.
-    """
+    """Channels (3, H, W), validity (H, W), in memory that the thread's next call overwrites."""
     shape = template.mask.shape
     planes = thread_memory("sampled", 10 * template.mask.size).reshape(10, *shape)
     interleaved = planes[:4].reshape(*shape, 4)

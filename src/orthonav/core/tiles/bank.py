@@ -1,13 +1,9 @@
 """A bank of poses: one view embedded under many headings and scales, without turning the picture.
 
-The view is represented once and averaged down to micro-cells. Each pose then samples `MICRO` x
-`MICRO` of their values where its own micro-cells lie, adds them up to cells and turns the phases
-of the harmonics: some 50 us a pose instead of the 1.5 ms of turning, representing and embedding
-the picture again. Two things are approximate: gradients are taken at the reported resolution, and
-micro-cells are not turned. But the bank sees beyond the tile, where the turned picture has a
-border, and its embeddings find their tile no less often. Canny's edges, which depend on direction
-and ground resolution, come out less alike than gradients or grey levels do.
-"""
+The view is represented once and averaged to micro-cells; each pose samples `MICRO` x `MICRO` of
+them, adds them up to cells and turns the phases of the harmonics: 50 us instead of 1.5 ms.
+Gradients are taken at the reported resolution and micro-cells are not turned, but the bank sees
+beyond the tile, and finds it no less often. Canny's edges come out less alike."""
 
 import math
 from collections.abc import Sequence
@@ -21,29 +17,26 @@ from numpy.typing import NDArray
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedEmbedder, WhitenedRecipe
 
-CHUNK_POSES = 64
-"""Poses worked on together: few enough for what they need to stay in the processor's cache."""
-_PLANES = 4
-"""Channels that OpenCV resamples at once."""
+CHUNK_POSES = 64  # few enough for the processor's cache
+_PLANES = 4  # channels that OpenCV resamples at once
 
 Array = NDArray[np.float32]
 Poses = NDArray[np.float64]
 
 
 class Representation(Protocol):
-    """What is compared: one channel, or a magnitude and its harmonics 1, 2, .. of the doubled
-    direction, real and imaginary part each."""
+    """One channel, or a magnitude and real and imaginary parts of harmonics 1, 2, .."""
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
+        pass
 
     @property
     def margin_px(self) -> int:
-        """How far a pixel's value can reach into the representation."""
+        """How far a pixel's value can reach."""
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Array:
-        """Channels (C, H, W) of grey levels (H, W)."""
+        pass
 
 
 def embed_poses(
@@ -56,13 +49,10 @@ def embed_poses(
 ) -> Array:
     """Unit embeddings (Q, D) of a view under `poses`; zero where a pose sees nothing.
 
-    `grey` (H, W) and `valid` (H, W) are the view rectified with its own top at the top, at the
-    ground resolution of the map as reported; H and W are free. A pose is the true heading of that
-    top (rad, clockwise from north) and the natural logarithm of true over reported ground
-    resolution. Each embedding is close to that of the tile-sized square, north up, about the view's
-    middle. Scales farther than a third from the reported one are less similar. Raises `ValueError`
-    if `tile_px` is not a multiple of `MICRO` or the representation is of no known kind.
-    """
+    `grey`, `valid` (H, W): heading up, at the reported resolution. A pose: true heading (rad) and
+    log of true over reported resolution. Each is close to that of the tile about the view's middle,
+    up to a third of scale. Raises `ValueError` for a bad `tile_px` or an unknown kind of
+    representation."""
     channels = representation.channels
     if tile_px % MICRO or (channels > 1 and channels % 2 == 0):
         raise ValueError(
@@ -82,11 +72,9 @@ def embed_poses(
 
 @dataclass(frozen=True, eq=False)
 class _Thinned:
-    """Channels of a view averaged over squares of `cell_px`, and its valid share as the last.
+    """Averaged over `cell_px`, the valid share as the last; up to four channels a plane.
 
-    `planes` hold up to four channels each, (h, w, c); `middle_px` (x, y) of the view's window in
-    pixels of the view from their first corner.
-    """
+    `middle_px` (x, y): of the view's window, in its pixels."""
 
     planes: list[Array]
     middle_px: tuple[float, float]
@@ -100,7 +88,7 @@ def _thinned(
     poses: Poses,
     tile_px: int,
 ) -> _Thinned:
-    """The part of the view that the poses reach, represented and averaged down."""
+    """The part of the view that the poses reach."""
     turns, log_scales = poses.T
     across = np.abs(np.cos(turns)) + np.abs(np.sin(turns))
     cell_px = tile_px // MICRO
@@ -123,7 +111,7 @@ def _around_middle(size: int, reach: float) -> slice:
 
 
 def _averaged(channel: Array, cell_px: int) -> Array:
-    """Means (h, w) over squares of `cell_px`; beyond the border lie zeros."""
+    """Over squares of `cell_px`; beyond the border lie zeros."""
     if cell_px == 1:
         return channel
     height, width = channel.shape
@@ -138,7 +126,7 @@ def _averaged(channel: Array, cell_px: int) -> Array:
 
 
 def _pooled(recipe: WhitenedRecipe, thinned: _Thinned, poses: Poses, tile_px: int) -> Array:
-    """Sums (Q, cells, cells, C + 1) of the view's channels and valid share over a tile's cells."""
+    """Sums (Q, cells, cells, C + 1) of channels and valid share over a tile's cells."""
     x, y = _samples(thinned, poses, tile_px)
     count, cells = len(poses), recipe.cells
     pooled = []
@@ -153,7 +141,7 @@ def _pooled(recipe: WhitenedRecipe, thinned: _Thinned, poses: Poses, tile_px: in
 
 
 def _samples(thinned: _Thinned, poses: Poses, tile_px: int) -> tuple[Array, Array]:
-    """Where in the planes, x and y (Q, MICRO * MICRO) each, the middles of micro-cells lie."""
+    """Middles of micro-cells, x and y (Q, MICRO * MICRO) each."""
     along = ((np.arange(MICRO) + 0.5) / MICRO - 0.5) * (tile_px / thinned.cell_px)
     east, south = np.tile(along, MICRO), np.repeat(along, MICRO)
     turns, log_scales = poses.T
@@ -167,11 +155,8 @@ def _samples(thinned: _Thinned, poses: Poses, tile_px: int) -> tuple[Array, Arra
 
 
 def _turned(cells: Array, poses: Poses) -> Array:
-    """Cells (Q, cells, cells, C) as they would be on the map: turned, in grey levels per its pixel.
-
-    A direction grows by the turn, so harmonic k of the doubled direction by 2 k turns; a step of
-    grey levels spreads over more pixels of the map where the view is coarser than reported.
-    """
+    """Cells (Q, cells, cells, C) as on the map: harmonic k of the doubled direction turns by 2 k
+    turns, and grey levels spread over more pixels where the view is coarser than reported."""
     channels = cells.shape[-1]
     if channels == 1:
         return np.ascontiguousarray(cells)

@@ -19,9 +19,7 @@ TABLE = {
     "triplet": Variant("orthonav.core.tiles.network:TripletRecipe", extra="neural"),
     "bovw": Variant("orthonav.core.tiles.words:WordsRecipe"),
 }
-"""Methods by the name that `orthonav build --method` takes."""
 Part = Callable[[str, Any, int], NDArray[Any]]
-"""A stored array by name, type and number of axes; raises `MapFileError` where it is not there."""
 
 
 class ViewEmbedder(Protocol):
@@ -29,25 +27,21 @@ class ViewEmbedder(Protocol):
 
     @property
     def recipe(self) -> Any:
-        """Its parameters: a frozen dataclass of the table of methods."""
+        pass
 
     @property
     def dims(self) -> int:
-        """Numbers per embedding."""
+        pass
 
     def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Embedding (D,) of a representation (C, S, S); `valid` (S, S) is what was seen."""
+        """(D,) of a representation (C, S, S); `valid` (S, S) is what was seen."""
 
     def parts(self) -> dict[str, NDArray[Any]]:
-        """Arrays to be stored in the map."""
+        pass
 
 
 def embedder_of(plain: Any, part: Part, channels: int) -> ViewEmbedder:
-    """The embedder of a recipe as stored and its parts, for representations of so many channels.
-
-    Raises `VariantError` for a recipe that this program does not know, `MapFileError` for parts
-    that do not fit.
-    """
+    """Raises `VariantError` for an unknown recipe, `MapFileError` for parts that do not fit."""
     recipe: Any = variant_from_recipe(TABLE, plain)
     if isinstance(recipe, WhitenedRecipe):
         return _whitened(recipe, part, channels)

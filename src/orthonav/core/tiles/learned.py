@@ -1,11 +1,8 @@
 """Edges by a network from a file: `onnx:weights=PATH`.
 
-Di Piazza et al. 2024 name learnt edges as the next step. Any network will do that takes "grey"
-(1, 1, H + 2 m, W + 2 m) float32, grey levels as 0 to 1 with a margin of m pixels, and gives "edges"
-(1, 1, H, W) float32, positive where there is an edge; H and W are free. `python -m
-experiments.paper.between_dates` makes one. onnxruntime runs it, and nothing else of the file is
-executed. A map stores the SHA-256 of the network, and flies with that network only.
-"""
+It takes "grey" (1, 1, H + 2 m, W + 2 m) float32, 0 to 1 with a margin of m pixels, and gives
+"edges" (1, 1, H, W), positive on an edge; `python -m experiments.paper.between_dates` makes one. A
+map stores its SHA-256, and flies with that network only."""
 
 import hashlib
 import os
@@ -24,20 +21,15 @@ from orthonav.core.files import require_file
 
 VARIABLE = "ORTHONAV_EDGES"
 PROBE_PX, LARGEST_MARGIN_PX = 96, 32
-LARGEST_BYTES = 64 << 20
-"""A network above this is not meant for an aircraft; nothing larger is read."""
+LARGEST_BYTES = 64 << 20  # larger networks are not meant for an aircraft
 
 
 @dataclass(frozen=True)
 class LearnedEdges:
     """Binary edges of a network in an ONNX file.
 
-    - `weights`: path of the file; by default ORTHONAV_EDGES. Maps do not store it.
-    - `sha256`: digest of the file in hexadecimal; by default that of the file that is there. Maps
-      store it, so that a view is never compared with edges of another network.
-
-    Raises `MissingFileError` without the file, `MissingExtraError` without onnxruntime, and
-    `VariantError` for a file with another digest or one that holds no such network.
+    `weights`: by default ORTHONAV_EDGES; maps store only `sha256`. Raises `MissingFileError`,
+    `MissingExtraError` without onnxruntime, `VariantError` for another digest or no such network.
     """
 
     weights: str = ""
@@ -54,24 +46,16 @@ class LearnedEdges:
 
     @property
     def path(self) -> str:
-        """Path of the network: `weights`, else ORTHONAV_EDGES."""
         return self.weights or os.environ.get(VARIABLE, "")
 
-    @property
-    def channels(self) -> int:
-        """Number of channels C."""
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:
-        """Radius of influence of a pixel on the edges."""
         return _network(self.path, self.sha256)[1]
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Edges (1, H, W), 1 on an edge, else 0; none along the border of `valid`.
-
-        Values of pixels that are not valid have no influence.
-        """
+        """1 on an edge, else 0; none along the border of `valid`."""
         out = np.zeros((1, *grey.shape), np.float32)
         if not valid.any():
             return out
@@ -86,7 +70,6 @@ class LearnedEdges:
 
 
 def _read(path: str) -> bytes:
-    """The file, up to a limit; raises `MissingFileError` or `VariantError`."""
     with require_file(Path(path), "edge network").open("rb") as stream:
         data = stream.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:
@@ -96,10 +79,7 @@ def _read(path: str) -> bytes:
 
 @lru_cache(maxsize=4)
 def _network(path: str, sha256: str) -> tuple[Any, int]:
-    """onnxruntime's session of a network and its margin in pixels; one session serves all threads.
-
-    Raises as `LearnedEdges`.
-    """
+    """Session and margin in pixels; one session serves all threads."""
     data = _read(path)
     found = hashlib.sha256(data).hexdigest()
     if found != sha256:
@@ -135,6 +115,6 @@ def _network(path: str, sha256: str) -> tuple[Any, int]:
 
 
 def _run(session: Any, levels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What the network gives for grey levels (H, W); (h, w) where it gives one channel."""
+    """(h, w) of grey levels (H, W), where it gives one channel."""
     found = session.run(["edges"], {"grey": levels[None, None]})[0]
     return np.asarray(found[0, 0] if found.ndim == 4 and found.shape[:2] == (1, 1) else found)

@@ -1,8 +1,6 @@
-"""Neural encoders as they fly: an ONNX graph in the map, run by onnxruntime.
+"""Neural encoders as they fly: an ONNX graph in the map, run by onnxruntime, without PyTorch.
 
-Embeddings of Di Piazza et al. 2024, section Methodology: an auto-encoder's 1024 numbers or a
-triplet network's. How they are learnt is in `orthonav.research`; nothing here needs PyTorch.
-"""
+Embeddings of Di Piazza et al. 2024, section Methodology; `orthonav.research` learns them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,8 +16,7 @@ from orthonav.core.extras import needed
 SIMILARITIES = ("product", "cosine")
 PRECISIONS = ("float32", "float16", "int8")
 MININGS = ("hardest", "semihard")
-CHUNK_TILES = 16
-"""Tiles run at once: enough to keep a core busy, few enough for a small machine's memory."""
+CHUNK_TILES = 16  # enough to keep a core busy, few enough for a small machine's memory
 OPERATORS = frozenset(
     [
         "Add",
@@ -38,18 +35,16 @@ OPERATORS = frozenset(
         "Relu",
     ]
 )
-"""What an encoder may consist of: nothing that loops, branches, reads files or makes big arrays."""
+"""Nothing that loops, branches, reads files or makes big arrays."""
 
 
 @dataclass(frozen=True)
 class AutoEncoderRecipe:
     """Parameters of the auto-encoder.
 
-    `dims`: numbers per tile. `width`: channels before its dense layer, a multiple of 8; 512 gives
-    the paper's 172,506,561 parameters. `epochs`, `batch`, `learning_rate`: of AdamW. `similarity`:
-    "product" compares embeddings as they come (the paper), "cosine" scaled to length 1. `precision`
-    of what flies: "float32", "float16" (weights only) or "int8".
-    """
+    `width`: channels before its dense layer, a multiple of 8; 512 is the paper's. `epochs`,
+    `batch`, `learning_rate`: of AdamW. `similarity`: "product" (the paper) or "cosine".
+    `precision`: "float32", "float16" (weights only) or "int8"."""
 
     dims: int = 1024
     width: int = 512
@@ -71,11 +66,9 @@ class TripletRecipe:
     """Parameters of the triplet network.
 
     `width`: channels of its first stage, 64 in ResNet34; embeddings have 16 times as many numbers.
-    `margin`: alpha of the loss, in squared distances of embeddings as they are compared. `mining`:
-    "hardest" or "semihard" negatives. `apart`: how far, in tile widths, another tile of the batch
-    must lie along rows or columns to count as another place: neighbours that overlap nearly wholly
-    cannot be separated by a loss. The others are as in `AutoEncoderRecipe`, for Adam.
-    """
+    `margin`: alpha of the loss, squared distances. `mining`: "hardest" or "semihard" negatives.
+    `apart`: distance of another place in tile widths. The others are as in `AutoEncoderRecipe`, for
+    Adam."""
 
     width: int = 64
     epochs: int = 200
@@ -97,7 +90,6 @@ class TripletRecipe:
 
     @property
     def dims(self) -> int:
-        """Numbers per embedding."""
         return 16 * self.width
 
 
@@ -118,13 +110,10 @@ def _require(name: str, value: object, fits: bool, what: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class NetworkEmbedder:
-    """A learnt encoder: `onnx` is its graph as bytes (n,) uint8, `threads` what one run may use.
+    """A learnt encoder: `onnx` is its graph as bytes (n,) uint8.
 
-    The graph takes "maps" (N, C, S, S) and gives "embedding" (N, D), both float32, N free. Raises
-    `MapFileError` for bytes that are no such graph, contain anything but plain layers or point to
-    other files: at once where that can be seen without onnxruntime, else at first use.
-    `MissingExtraError` comes at first use where onnxruntime is not installed.
-    """
+    "maps" (N, C, S, S) to "embedding" (N, D), float32, N free. Raises `MapFileError` for other
+    graphs, at first use at the latest, and `MissingExtraError` then."""
 
     recipe: AutoEncoderRecipe | TripletRecipe
     onnx: NDArray[np.uint8]
@@ -136,36 +125,27 @@ class NetworkEmbedder:
         check_graph(self.onnx)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled or copied: all but the running session."""
+        """All but the running session."""
         return {"recipe": self.recipe, "onnx": self.onnx, "threads": self.threads}
 
     @property
     def dims(self) -> int:
-        """Numbers per embedding."""
         return self.recipe.dims
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Channels, rows and columns (C, S, S) of what is embedded."""
+        """(C, S, S) of what is embedded."""
         _, channels, height, width = self._session.get_inputs()[0].shape
         return int(channels), int(height), int(width)
 
     def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Embedding (D,) of a view's representation (C, S, S), zero where not valid (S, S).
-
-        Raises `ValueError` if the shapes are not those that the encoder was learnt for.
-        """
+        """Raises `ValueError` for shapes that the encoder was not learnt for."""
         if valid.shape != maps.shape[1:]:
             raise ValueError(f"valid must be {maps.shape[1:]}, got {valid.shape}")
         return np.asarray(self.views(np.where(valid, maps, np.float32(0))[None])[0])
 
     def views(self, maps: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Embeddings (N, D) of representations (N, C, S, S), zero where not valid.
-
-        Unit vectors for the similarity "cosine" (zero for one without length), as the network
-        gives them for "product". Each is the same whatever comes beside it up to rounding. Raises
-        `ValueError` if the shapes are not those that the encoder was learnt for.
-        """
+        """(N, D) of (N, C, S, S); unit vectors for "cosine". Raises `ValueError`."""
         if maps.ndim != 4 or maps.shape[1:] != self.shape:
             raise ValueError(f"maps must be (N, {self.shape}), got {maps.shape}")
         out = np.empty((len(maps), self.dims), dtype=np.float32)
@@ -179,12 +159,11 @@ class NetworkEmbedder:
         return out
 
     def parts(self) -> dict[str, NDArray[Any]]:
-        """Arrays to be stored in the map."""
         return {"onnx": self.onnx}
 
     @cached_property
     def _session(self) -> Any:
-        """onnxruntime's session: made at first use, may be used by several threads at once."""
+        """Made at first use; threads may share it."""
         runtime = _onnxruntime()
         options = runtime.SessionOptions()
         options.intra_op_num_threads = self.threads
@@ -227,10 +206,8 @@ def _onnxruntime() -> Any:
 def check_graph(data: NDArray[np.uint8]) -> None:
     """Raise `MapFileError` unless bytes (n,) are one plain ONNX graph that holds all its weights.
 
-    Only the layout is read (onnx.proto, IR version 8), so that nothing of an untrusted file is
-    run or opened before it is known to be harmless: operators of `OPERATORS` in the standard
-    domain, no functions, no graphs inside the graph, no weights in other files.
-    """
+    Only the layout is read (onnx.proto, IR version 8): operators of `OPERATORS` in the standard
+    domain, no functions, no graphs inside the graph, no weights in other files."""
     whole = np.ascontiguousarray(data).data
     graphs = 0
     for number, value in _fields(whole):

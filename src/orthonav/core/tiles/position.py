@@ -1,16 +1,12 @@
-"""From the scores of tiles to a position: the rules of the literature, side by side.
+"""Scores of tiles by exact search, and a position from them by the rules of the literature.
 
-*best*: the tile with the highest score (Di Piazza et al., IGARSS 2024). *weighted*: the mean of the
-centres of all tiles searched, weighted by their scores (Bianchi and Barfoot, RA-L 2021); scores
-below zero count as zero. *neighbours*: the mean of the best tile and those around it, weighted by
-what their scores have above the lowest of them (after Couturier and Akhloufi, 2021). *peak*: the
-top of a parabola through the best tile and its neighbours, orthonav's own.
+*best*: the highest score (Di Piazza et al., IGARSS 2024). *weighted*: mean of all centres, weighted
+by scores above zero (Bianchi and Barfoot, RA-L 2021). *neighbours*: the best tile and those around
+it, weighted by scores above the lowest (after Couturier and Akhloufi, 2021). *peak*: a parabola
+through the best tile and its neighbours: a third of the error (`python -m benchmarks --only
+compare`)."""
 
-Di Piazza et al. found no gain from interpolation with a triplet network. With the whitened
-gradient embedding the score falls smoothly around the peak: the parabola cuts the median error to
-about a third of that of the best tile's centre (`python -m benchmarks --only compare`).
-"""
-
+from collections.abc import Iterator
 from typing import Literal, get_args
 
 import cv2
@@ -26,7 +22,7 @@ STEPS_EN = ((1, 0), (0, 1))
 
 
 class TileNeighbours:
-    """Finds the tiles beside a tile; tiles (N, 2) are sorted by grid rows, then columns."""
+    """Tiles (N, 2) beside a tile, sorted by grid rows, then columns."""
 
     def __init__(self, grid: TileGrid, centres_en_m: NDArray[np.float32]) -> None:
         """Raises `MapFileError` where centres are not on the grid or not sorted."""
@@ -38,7 +34,7 @@ class TileNeighbours:
             raise MapFileError("tile centres are not those of the tile grid, sorted by rows")
 
     def beside(self, tile: int, east: int, north: int) -> int | None:
-        """Row of the tile so many steps east and north of a tile; None if there is none."""
+        """Row of the tile, None if there is none."""
         row, col = divmod(int(self._flat[tile]), self._cols)
         if not 0 <= col + east < self._cols:
             return None
@@ -47,12 +43,9 @@ class TileNeighbours:
     def maxima(
         self, scores: NDArray[np.float32], count: int, rows: NDArray[np.intp] | None = None
     ) -> NDArray[np.intp]:
-        """Places in `scores` of the `count` best tiles that no tile next to them exceeds, best
-        first.
+        """Places in `scores` of the `count` best that no tile next to them exceeds, best first.
 
-        `scores` (N,) belong to all tiles, or to `rows` (sorted) where given; tiles whose score is
-        not finite are left out.
-        """
+        `scores` (N,) belong to all tiles, or to sorted `rows`; those not finite are left out."""
         flat = self._flat if rows is None else self._flat[rows]
         on_grid = np.full(self._shape, -np.inf, np.float32)
         on_grid.flat[flat] = np.where(np.isfinite(scores), scores, -np.inf)
@@ -64,11 +57,7 @@ class TileNeighbours:
     def peak_offset(
         self, scores: NDArray[np.float32], best: int, rows: NDArray[np.intp] | None = None
     ) -> tuple[float, float]:
-        """Offset (east, north) of the peak from the best tile, in strides, each within 0.5.
-
-        `scores` belong to all tiles, or to `rows` (sorted) where given; `best` is a row of the map.
-        Zero along an axis on which a neighbour is missing.
-        """
+        """(east, north) in strides within 0.5; zero on an axis where a neighbour is missing."""
         offsets = []
         for east, north in STEPS_EN:
             ahead, behind = (
@@ -81,7 +70,7 @@ class TileNeighbours:
     def around(
         self, scores: NDArray[np.float32], best: int, rows: NDArray[np.intp] | None = None
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """The best tile and those next to it, corners too, that have a score: rows and scores."""
+        """With those next to it, corners too, that have a score."""
         steps = [(east, north) for east in (-1, 0, 1) for north in (-1, 0, 1)]
         known = [(tile, _score(scores, rows, tile)) for tile in self._besides(best, steps)]
         kept = [(tile, score) for tile, score in known if np.isfinite(score)]
@@ -94,10 +83,7 @@ class TileNeighbours:
 
 
 def parabola_peak(behind: float, middle: float, ahead: float) -> float:
-    """Where the parabola through values at -1, 0, 1 has its peak, within 0.5 of the middle.
-
-    Zero where the middle is not the highest or a value is NaN.
-    """
+    """Of values at -1, 0, 1, within 0.5; zero where the middle is not the highest or one is NaN."""
     if not (middle >= behind and middle >= ahead):
         return 0.0
     curvature = 2 * middle - behind - ahead
@@ -105,7 +91,6 @@ def parabola_peak(behind: float, middle: float, ahead: float) -> float:
 
 
 def find(sorted_values: NDArray[np.intp], value: int) -> int | None:
-    """Index of a value in sorted values; None if it is not there."""
     at = int(np.searchsorted(sorted_values, value))
     return at if at < len(sorted_values) and sorted_values[at] == value else None
 
@@ -116,7 +101,6 @@ def _score(scores: NDArray[np.float32], rows: NDArray[np.intp] | None, tile: int
 
 
 def check_rule(rule: str) -> PositionRule:
-    """The rule of that name; raises `VariantError` if there is none."""
     for known in RULES:
         if rule == known:
             return known
@@ -132,11 +116,7 @@ def offset_en_m(
     neighbours: TileNeighbours,
     stride_m: float,
 ) -> tuple[float, float]:
-    """Offset (east, north) in metres of the position from the centre of the best tile.
-
-    `scores` belong to all tiles, or to `rows` (sorted) where given; `centres_en_m` (N, 2) are those
-    of all tiles, `best` is a row of them.
-    """
+    """(east, north) from the centre of the best tile, a row of `centres_en_m` (N, 2)."""
     if rule == "best":
         return 0.0, 0.0
     if rule == "peak":
@@ -153,3 +133,82 @@ def offset_en_m(
     away = centres_en_m[tiles].astype(np.float64) - centres_en_m[best]
     east, north = weights @ away / weights.sum()
     return float(east), float(north)
+
+
+BLOCK_ROWS = 1024  # decoded at once: half a megabyte at 128 numbers, which stays in the cache
+CACHE_BYTES = 128 * 2**20  # decoded embeddings kept: 260,000 tiles of 128 numbers
+_CONVERT_FP16 = getattr(cv2, "convertFp16", None)  # OpenCV 4, where cv2.add knows no float16
+_ZERO = np.zeros(1, dtype=np.float16)
+
+
+class ExactIndex:
+    """Scalar products with stored embeddings (N, D) float16.
+
+    Up to `cache_bytes` are kept decoded to float32; larger maps are decoded at every search."""
+
+    def __init__(self, embeddings: NDArray[np.float16], cache_bytes: int = CACHE_BYTES) -> None:
+        if embeddings.ndim != 2 or embeddings.dtype != np.float16:
+            raise ValueError(
+                f"embeddings must be (N, D) float16, got {embeddings.shape} {embeddings.dtype}"
+            )
+        self._stored = embeddings
+        self._may_cache = embeddings.size * 4 <= cache_bytes
+        self._decoded: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    def scores(
+        self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
+    ) -> NDArray[np.float32]:
+        """(N, Q) of queries (Q, D), with `rows` or all."""
+        columns = np.ascontiguousarray(queries.T, dtype=np.float32)
+        out = np.empty((self._count(rows), columns.shape[1]), dtype=np.float32)
+        for part, block in self._blocks(rows):
+            np.matmul(block, columns, out=out[part])
+        return out
+
+    def best(
+        self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
+    ) -> NDArray[np.float32]:
+        """Highest (N,) of any query (Q, D), without memory of N times Q. Raises `ValueError`."""
+        if len(queries) == 0:
+            raise ValueError("at least one query is needed, got none")
+        columns = np.ascontiguousarray(queries.T, dtype=np.float32)
+        count = self._count(rows)
+        out = np.empty(count, dtype=np.float32)
+        scores = np.empty((min(count, BLOCK_ROWS), columns.shape[1]), dtype=np.float32)
+        for part, block in self._blocks(rows):
+            some = np.matmul(block, columns, out=scores[: len(block)])
+            some.max(axis=1, out=out[part])
+        return out
+
+    def _count(self, rows: NDArray[np.intp] | None) -> int:
+        return len(self._stored) if rows is None else len(rows)
+
+    def _blocks(self, rows: NDArray[np.intp] | None) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        if self._may_cache and self._decoded is None:
+            self._decoded = self._stored.astype(np.float32)
+        source = self._stored if self._decoded is None else self._decoded
+        # In blocks also where nothing is decoded: BLAS then takes a few queries twice as fast.
+        for start in range(0, self._count(rows), BLOCK_ROWS):
+            part = slice(start, start + BLOCK_ROWS)
+            yield part, _float32(source[part] if rows is None else source[rows[part]])
+
+
+def _float32(block: NDArray[np.float16] | NDArray[np.float32]) -> NDArray[np.float32]:
+    """OpenCV's conversions are several times as fast as NumPy's."""
+    if block.dtype == np.float32:
+        return np.asarray(block, dtype=np.float32)
+    halves = np.ascontiguousarray(block, dtype=np.float16)
+    if _CONVERT_FP16 is not None:
+        return np.asarray(_CONVERT_FP16(halves.view(np.int16))).reshape(halves.shape)
+    decoded = cv2.add(halves, _ZERO, dtype=cv2.CV_32F)
+    return np.asarray(decoded, dtype=np.float32).reshape(halves.shape)
+
+
+def rows_within(
+    centres_en_m: NDArray[np.float32], centre_en_m: NDArray[np.float64], radius_m: float
+) -> NDArray[np.intp]:
+    offset = centres_en_m - np.asarray(centre_en_m, dtype=np.float32)
+    return np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= radius_m**2)

@@ -1,7 +1,6 @@
 """Image representations that are compared: grey levels, edges or gradients.
 
-Every variant is called as `variant(grey, valid)` with `grey` (H, W) uint8 and `valid` (H, W) bool
-and returns float32 `(C, H, W)`, zero where not valid; its inputs stay unchanged.
+`variant(grey, valid)` with (H, W) uint8 and bool gives float32 `(C, H, W)`, zero where not valid.
 """
 
 from dataclasses import dataclass
@@ -13,8 +12,73 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.variants import Variant
 
+HARMONICS = 3  # chosen on imagery of two dates (docs/decisions/embedding.md)
+BINS = 8  # of the equivalent histogram; its triangular bins set the weights of the harmonics
+# A triangular bin of an orientation histogram passes harmonic k with the weight sinc(k / bins)^2.
+_SHARES = [np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2) for k in range(1, HARMONICS + 1)]
+
+
+@dataclass(frozen=True)
+class OrientedGradients:
+    """(7, H, W), levels per pixel: magnitude, real and imaginary part of harmonics 1 to 3."""
+
+    sigma_px: float = 1.5
+
+    def __post_init__(self) -> None:
+        if not 0 < self.sigma_px <= 16:
+            raise VariantError(
+                f"gradient sigma_px must be above 0 and at most 16, got {self.sigma_px}"
+            )
+
+    channels = 1 + 2 * HARMONICS
+
+    @property
+    def margin_px(self) -> int:
+        return int(np.ceil(4 * self.sigma_px)) + 1  # OpenCV's kernel of 4 sigma, then Scharr
+
+    def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        smooth = cv2.GaussianBlur(
+            np.asarray(grey, dtype=np.float32), (0, 0), self.sigma_px
+        ).reshape(grey.shape)
+        east = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
+        south = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
+        out = np.empty((self.channels, *grey.shape), dtype=np.float32)
+        power, south2 = east * east, south * south
+        cos = power - south2
+        power += south2
+        np.sqrt(power, out=out[0])
+        if not valid.all():
+            reach = 2 * self.margin_px + 1
+            out[0] *= cv2.erode(
+                valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1
+            )
+        power += np.float32(1e-6)
+        cos /= power
+        sin = np.multiply(east, south, out=south2)
+        sin *= 2 / power
+        _fill_harmonics(out, cos, sin)
+        return out
+
+
+def _fill_harmonics(
+    out: NDArray[np.float32], cos: NDArray[np.float32], sin: NDArray[np.float32]
+) -> None:
+    """In place, each from the one before: fresh arrays would cost more than the arithmetic."""
+    product = np.empty_like(cos)
+    np.multiply(out[0], cos, out=out[1])
+    np.multiply(out[0], sin, out=out[2])
+    for k in range(2, HARMONICS + 1):
+        real, imaginary = out[2 * k - 3], out[2 * k - 2]
+        np.multiply(real, cos, out=out[2 * k - 1])
+        out[2 * k - 1] -= np.multiply(imaginary, sin, out=product)
+        np.multiply(real, sin, out=out[2 * k])
+        out[2 * k] += np.multiply(imaginary, cos, out=product)
+    for k, share in enumerate(_SHARES, 1):
+        out[2 * k - 1 : 2 * k + 1] *= share
+
+
 TABLE = {
-    "gradient": Variant("orthonav.core.tiles.gradients:OrientedGradients"),
+    "gradient": Variant("orthonav.core.tiles.represent:OrientedGradients"),
     "gray": Variant("orthonav.core.tiles.represent:Gray"),
     "canny": Variant("orthonav.core.tiles.represent:Canny"),
     "segments": Variant("orthonav.research.segments:Segments", extra="segments"),
@@ -25,30 +89,20 @@ TABLE = {
 
 @dataclass(frozen=True)
 class Gray:
-    """Grey levels scaled to 0..1, (1, H, W): the baseline of Di Piazza et al. 2024."""
+    """0..1, (1, H, W): the baseline of Di Piazza et al. 2024."""
 
-    @property
-    def channels(self) -> int:
-        """Number of channels C."""
-        return 1
+    channels = 1
 
-    @property
-    def margin_px(self) -> int:
-        """Radius of influence of a pixel on the representation."""
-        return 0
+    margin_px = 0
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Grey levels (1, H, W) in 0..1."""
         return np.where(valid, grey, 0).astype(np.float32)[None] / np.float32(255)
 
 
 @dataclass(frozen=True)
 class Canny:
-    """Binary edges of the Canny detector, by default as in Di Piazza et al. 2024, section 4.
-
-    `low` and `high` are the hysteresis thresholds on the Sobel gradient (L1 norm, 8-bit grey),
-    `kernel` the Sobel aperture (3, 5 or 7).
-    """
+    """Binary edges, by default as in Di Piazza et al. 2024, section 4; thresholds on the Sobel
+    gradient (L1 norm, 8-bit grey), aperture 3, 5 or 7."""
 
     low: float = 100.0
     high: float = 200.0
@@ -60,18 +114,15 @@ class Canny:
         if self.kernel not in (3, 5, 7):
             raise VariantError(f"canny kernel must be 3, 5 or 7, got {self.kernel}")
 
-    @property
-    def channels(self) -> int:
-        """Number of channels C."""
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:
-        """Radius of influence of a pixel on the representation, without hysteresis."""
+        """Without hysteresis."""
         return self.kernel // 2 + 2
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Edges (1, H, W), 1 on an edge, else 0; none along the border of `valid`."""
+        """None along the border of `valid`."""
         edges = cv2.Canny(np.ascontiguousarray(grey), self.low, self.high, apertureSize=self.kernel)
         if not valid.all():
             reach = self.kernel + 2

@@ -1,12 +1,9 @@
 """The whitened embedding: pooled oriented gradients, decorrelated on the reference area itself.
 
-Cells of a tile overlap (each pixel belongs to up to four, with triangular weights), so that a
-shift or turn of the view moves energy gradually from one cell to the next. Each cell is divided
-by its own norm: contrast differs between years, directions do not. Principal components of the
-reference tiles, each divided by its standard deviation (whitening, Jegou and Chum, ECCV 2012),
-give all directions of variation the same weight. Similarity is the scalar product of unit
-vectors.
-"""
+Cells overlap with triangular weights, so that a shift moves energy gradually. Each is divided by
+its own norm: contrast differs between years, directions do not. Principal components of the
+reference tiles are divided by their standard deviations (whitening, Jegou and Chum, ECCV 2012).
+Similarity is the scalar product of unit vectors."""
 
 import contextlib
 import math
@@ -24,21 +21,15 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 
-CHUNK_TILES = 512
-"""Tiles worked on at once: 0.9 MB of features, which stays in the cache."""
-MAX_LEARNT_TILES = 20_000
-"""Tiles from which a whitening is learnt, at most: 44 for each of 448 features."""
+CHUNK_TILES = 512  # 0.9 MB of features, which stays in the cache
+MAX_LEARNT_TILES = 20_000  # 44 for each of 448 features
 PART_NOISE = 2.0
-"""Noise of the conditional mean where cells are missing, over the smallest variance kept; chosen
-with docs/decisions/embedding.md."""
-SOLVER_STEPS = 6
-"""Steps of conjugate gradients for the same, over many poses."""
+"""Where cells are missing, over the smallest variance kept (docs/decisions/embedding.md)."""
+SOLVER_STEPS = 6  # of conjugate gradients for the same, over many poses
 SHARE_ROUNDING = 1e-3
 """A cell seen to this much less than the whole counts as whole: resampling rounds."""
 TINY = np.float32(1e-30)
-"""Guards divisions by zero."""
-SPARSE_BYTES = 32 * 2**20
-"""Larger arrays of a sheet take memory only where they are written."""
+SPARSE_BYTES = 32 * 2**20  # larger arrays of a sheet take memory only where they are written
 Made = TypeVar("Made")
 Features = NDArray[np.float32]
 Work = Callable[[Features, Features], Made]
@@ -46,11 +37,7 @@ Work = Callable[[Features, Features], Made]
 
 @dataclass(frozen=True)
 class WhitenedRecipe:
-    """Parameters of the whitened embedding.
-
-    `cells`: cells along one side of a tile. `dims`: numbers kept per tile. `floor`: norm below
-    which a cell counts as empty rather than being blown up, in units of the representation.
-    """
+    """`cells`: along a side of a tile. `floor`: norm below which a cell counts as empty."""
 
     cells: int = 8
     dims: int = 128
@@ -66,7 +53,7 @@ class WhitenedRecipe:
 
     @cached_property
     def pooling(self) -> NDArray[np.float32]:
-        """Weights (cells, MICRO) of micro-cells in cells: triangles two cells wide."""
+        """(cells, MICRO): triangles two cells wide."""
         width = MICRO / self.cells
         micro = (np.arange(MICRO) + 0.5) / width
         centre = np.arange(self.cells) + 0.5
@@ -75,10 +62,7 @@ class WhitenedRecipe:
 
 
 class CellSheet:
-    """Micro-cell means of a whole sheet, filled block by block.
-
-    `means` is (h, w, C) and `valid` (h, w), sampled as `CellLayout` says.
-    """
+    """Micro-cell means (h, w, C) and valid share (h, w) of a whole sheet, filled block by block."""
 
     def __init__(self, layout: CellLayout, height_px: int, width_px: int, channels: int) -> None:
         shape = (layout.samples(height_px), layout.samples(width_px))
@@ -95,13 +79,12 @@ class CellSheet:
     def put(
         self, row_px: int, col_px: int, means: NDArray[np.float32], share: NDArray[np.float32]
     ) -> None:
-        """Take in the `cell_means` of such a block."""
         row, col = row_px // self.layout.spacing_px, col_px // self.layout.spacing_px
         part = np.s_[row : row + share.shape[0], col : col + share.shape[1]]
         self.means[part], self.valid[part] = means, share
 
     def valid_share(self, tiles_px: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Share of valid pixels of each tile whose first pixel (row, col) is in (N, 2)."""
+        """Of tiles whose first pixel (row, col) is in (N, 2)."""
         out = np.empty(len(tiles_px))
         for part in _chunks(len(tiles_px)):
             cells = self.micro_cells(self.valid[..., None], tiles_px[part])
@@ -111,10 +94,7 @@ class CellSheet:
     def micro_cells(
         self, samples: NDArray[np.float32], tiles_px: NDArray[np.intp]
     ) -> NDArray[np.float32]:
-        """Those of the samples (h, w, C) of the sheet that are a tile's, (N, MICRO, MICRO, C).
-
-        Raises `IndexError` for tiles that reach beyond the sheet.
-        """
+        """Of samples (h, w, C) a tile's (N, MICRO, MICRO, C). Raises `IndexError`."""
         step = self.layout.step
         height, width = (size - (MICRO - 1) * step for size in samples.shape[:2])
         down, right, deep = samples.strides
@@ -130,10 +110,7 @@ class CellSheet:
 
 
 def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Zeros of which only what is written takes memory: a corridor fills little of its box.
-
-    NumPy asks for huge pages, of which one number would take megabytes.
-    """
+    """Take memory where written; NumPy's huge pages would take megabytes for one number."""
     size = math.prod(shape)
     if 4 * size < SPARSE_BYTES:
         return np.zeros(shape, dtype=np.float32)
@@ -147,10 +124,7 @@ def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
 def pooled_features(
     recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Features (N, F) of the tiles whose first pixels (row, col) are given, and weights (N, F).
-
-    A weight is the share of a cell that is valid; features are normalized cell by cell.
-    """
+    """Features and weights (N, F), the valid share of a cell, of tiles by their first pixels."""
     features = _normalized(recipe, _pooled_tiles(recipe, sheet, tiles_px))
     count, channels = len(tiles_px), features.shape[-1]
     valid = sheet.micro_cells(sheet.valid[..., None], tiles_px)
@@ -163,11 +137,7 @@ def pooled_features(
 
 
 def _normalized(recipe: WhitenedRecipe, cells: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Cells (N, cells, cells, C) free of contrast: each divided by its norm.
-
-    Where there is one channel only (grey levels, edge maps) a cell has no direction to keep: the
-    tile's mean is taken out and the tile as a whole divided by its norm.
-    """
+    """Each cell divided by its norm; with one channel the tile as a whole, without its mean."""
     axes: tuple[int, ...] = (-1,)
     if cells.shape[-1] == 1:
         cells = cells - cells.mean(axis=(1, 2), keepdims=True)
@@ -188,7 +158,7 @@ def _pooled(recipe: WhitenedRecipe, micro: NDArray[np.float32]) -> NDArray[np.fl
 def _pooled_tiles(
     recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
 ) -> NDArray[np.float32]:
-    """Cells (N, cells, cells, C) of tiles; what those beside each other share is summed once."""
+    """The same of tiles; what those beside each other share is summed once."""
     step, cells, channels = sheet.layout.step, recipe.cells, sheet.means.shape[2]
     reach = (MICRO - 1) * step + 1
     row, col = (tiles_px // sheet.layout.spacing_px).T
@@ -210,10 +180,7 @@ def _pooled_tiles(
 
 @dataclass(frozen=True, eq=False)
 class WhitenedEmbedder:
-    """A learnt whitened embedding.
-
-    `mean` (F,) and `basis` (F, D) float16 as stored in the map; computed in float32.
-    """
+    """`mean` (F,) and `basis` (F, D) float16 as stored in the map; computed in float32."""
 
     recipe: WhitenedRecipe
     mean: NDArray[np.float16]
@@ -229,16 +196,12 @@ class WhitenedEmbedder:
 
     @property
     def dims(self) -> int:
-        """Numbers per embedding."""
         return int(self.basis.shape[1])
 
     def tiles(
         self, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
     ) -> NDArray[np.float16]:
-        """Unit embeddings (N, D) of tiles whose first pixels (row, col) are given (N, 2).
-
-        They are the same for any number of threads (`workers`).
-        """
+        """(N, D), the same for any number of `workers`."""
         out = np.empty((len(tiles_px), self.dims), dtype=np.float16)
         _ = self._mean, self._basis  # made before threads ask for them
 
@@ -253,14 +216,10 @@ class WhitenedEmbedder:
     def features(
         self, features: NDArray[np.float32], weights: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Unit embeddings (N, D) of tiles of which `pooled_features` are known, (N, F) each."""
         return _unit(((features - self._mean) * weights) @ self._basis)
 
     def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Unit embedding (D,) of a view's representation (C, S, S); zero for an empty one.
-
-        Raises `ValueError` if the view is not a square of a multiple of `MICRO` pixels.
-        """
+        """(D,), zero if empty. Raises `ValueError` unless a square of a multiple of `MICRO`."""
         channels, height, width = maps.shape
         if height != width or height % MICRO:
             raise ValueError(f"view must be square, a multiple of {MICRO} px, got {maps.shape}")
@@ -276,24 +235,19 @@ class WhitenedEmbedder:
     def _from_part(
         self, centred: NDArray[np.float32], weights: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Whitened components (D,) of a view in which cells are missing or partly seen.
+        """Components (D,) of a view in which cells are missing or partly seen.
 
-        Components are no longer orthogonal on the rest of the tile, so their most probable values
-        are solved for: the conditional mean of probabilistic PCA (Tipping and Bishop 1999) with
-        noise of `PART_NOISE` times the smallest variance kept. In reference tiles missing cells
-        stay at the mean instead: solved for, tiles with little imagery attract too many views.
-        """
+        They are not orthogonal on the rest of the tile, so the conditional mean of probabilistic
+        PCA is solved for (Tipping and Bishop 1999). In reference tiles missing cells stay at the
+        mean: solved for, tiles with little imagery attract too many views."""
         loadings = self._loadings
         seen = loadings.T * (weights / PART_NOISE)
         normal = seen @ loadings + np.eye(self.dims, dtype=np.float32)
         return np.asarray(np.linalg.solve(normal, seen @ centred))
 
     def cells(self, cells: NDArray[np.float32], valid: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Unit embeddings (Q, D) of many views at once, as `view` gives them one by one.
-
-        `cells` (Q, cells, cells, C) are sums of micro-cells weighted by `recipe.pooling` along
-        rows and columns, `valid` (Q, cells, cells) sums of their valid shares.
-        """
+        """(Q, D) of many views, as `view`; sums of micro-cells by `recipe.pooling`, and of their
+        shares."""
         out = np.empty((len(cells), self.dims), dtype=np.float32)
         along = self.recipe.pooling.sum(axis=1)
         shares = (valid / np.outer(along, along)).reshape(len(cells), -1)
@@ -310,11 +264,8 @@ class WhitenedEmbedder:
     def _from_parts(
         self, centred: NDArray[np.float32], weights: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Components (Q, D) of many views, solved for as in `_from_part`.
-
-        By conjugate gradients for all of them at once, preconditioned with what would be exact if
-        every cell had the mean weight: a twentieth of the time of exact solutions.
-        """
+        """`_from_part` of many views (Q, D), by conjugate gradients, preconditioned as if every
+        cell had the mean weight: a twentieth of the time."""
         loadings = self._loadings
         noisy = weights / np.float32(PART_NOISE)
         power = np.square(loadings).sum(axis=0)
@@ -337,7 +288,7 @@ class WhitenedEmbedder:
     def _normal(
         self, components: NDArray[np.float32], noisy: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """What the normal matrices of `_from_part` make of components (Q, D)."""
+        """The normal matrices of `_from_part` times components (Q, D)."""
         loadings = self._loadings
         return np.asarray(components + ((components @ loadings.T) * noisy) @ loadings)
 
@@ -348,7 +299,6 @@ class WhitenedEmbedder:
         return np.asarray(self._basis / norms**2 * norms.max())
 
     def parts(self) -> dict[str, NDArray[Any]]:
-        """Arrays to be stored in the map."""
         return {"mean": self.mean, "basis": self.basis}
 
 
@@ -358,18 +308,14 @@ def _unit(vectors: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
 
 
 def _dots(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Scalar products (Q, 1) of the rows of two arrays (Q, D)."""
     return np.asarray(np.einsum("qd,qd->q", first, second)[:, None])
 
 
 def learn(
     recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
 ) -> WhitenedEmbedder:
-    """Learn mean and whitening from the tiles (N, 2) of the reference area.
-
-    At most `MAX_LEARNT_TILES` of them, evenly taken, are used. Fewer than `dims` components are
-    kept where the tiles do not span more. The same is learnt by any number of threads (`workers`).
-    """
+    """From at most `MAX_LEARNT_TILES` tiles, by any number of threads; fewer than `dims` components
+    where the tiles do not span more."""
     taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
 
     def over_batches(work: Work[Made]) -> Iterator[Made]:
@@ -381,14 +327,14 @@ def learn(
 
 
 class OverBatches(Protocol):
-    """Runs a function on the features (N, F) and weights (N, F) of every batch, in order."""
+    """Runs a function on features and weights (N, F) of every batch, in order."""
 
     def __call__(self, work: "Work[Made]") -> Iterator[Made]:
-        """What the function makes of each batch."""
+        pass
 
 
 def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> WhitenedEmbedder:
-    """The whitening of features that come in batches: one pass for their mean, one for scatter."""
+    """One pass for the mean, one for scatter."""
 
     def sums(features: Features, weights: Features) -> tuple[Any, Any]:
         total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
@@ -412,12 +358,9 @@ def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> Wh
 
 
 def _whitening(
-    recipe: WhitenedRecipe,
-    mean: NDArray[np.float16],
-    scatter: NDArray[np.float64],
-    count: int,
+    recipe: WhitenedRecipe, mean: NDArray[np.float16], scatter: NDArray[np.float64], count: int
 ) -> WhitenedEmbedder:
-    """The embedding that whitens `count` features of mean (F,) and scatter matrix (F, F)."""
+    """Of `count` features with mean (F,) and scatter matrix (F, F)."""
     variances, vectors = np.linalg.eigh(scatter / count)
     variances, vectors = variances[::-1], vectors[:, ::-1]
     kept = int(np.count_nonzero(variances[: recipe.dims] > 1e-6 * max(variances[0], 1e-12)))
@@ -431,7 +374,7 @@ def _whitening(
 
 
 def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
-    """What `work` makes of some tiles at a time, in their order, by so many threads."""
+    """In order."""
     if workers <= 1:
         yield from map(work, _chunks(count))
         return

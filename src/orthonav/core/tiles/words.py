@@ -1,15 +1,10 @@
 """Bag of visual words (Sivic and Zisserman, ICCV 2003): how often which local features occur.
 
-Di Piazza et al. 2024, section 2: features of all reference pictures are grouped into k clusters,
-the words; a picture is the vector of how many of its features fall to each word, and two pictures
-are similar by the scalar product of their vectors. Features are SIFT (Lowe, IJCV 2004) or
-SuperPoint (DeTone et al. 2018). Words are meant for grey levels, as in the paper.
-`orthonav.research.words` learns them.
+As in Di Piazza et al. 2024, section 2, on grey levels, with SIFT (Lowe, IJCV 2004) or SuperPoint
+(DeTone et al. 2018), which needs PyTorch and does not fly. `orthonav.research.words` learns them.
 
-SIFT descriptors and words are whole numbers of at most 255, and so are, below 2^24, all sums that
-decide on the nearest word: float32 gives them exactly, on every machine and in any order.
-SuperPoint needs PyTorch and does not fly: its detector is handed in by `orthonav.research.words`.
-"""
+SIFT descriptors and words are whole numbers, and sums below 2^24 that decide on the nearest word
+are exact in float32, on every machine and in any order."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,28 +17,23 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 
-CHUNK_FEATURES = 4096
-"""Features compared with all words at once: 16 MB for 1,024 words."""
-DIMS = {"sift": 128, "superpoint": 256}
-"""Numbers per descriptor."""
+CHUNK_FEATURES = 4096  # 16 MB for 1,024 words
+DIMS = {"sift": 128, "superpoint": 256}  # numbers per descriptor
 
 Grey = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Array = NDArray[np.float32]
 Detector = Callable[[Grey], tuple[Array, Array, Array]]
-"""Features of a picture: points (N, 2) in pixels from the outer corner, radii (N,) and descriptors
-(N, D)."""
+"""Points (N, 2) from the outer corner, radii (N,) and descriptors (N, D) of a picture."""
 
 
 @dataclass(frozen=True)
 class WordsRecipe:
     """Parameters of a bag of visual words.
 
-    `words`: clusters k; the paper tries 256 to 10000. `features`: "sift" or "superpoint", the
-    latter with the path of its `weights`. `max_features`: at most so many of a picture, the
-    strongest. `similarity`: "product" compares frequencies (sum 1) as the paper does, "cosine"
-    vectors of unit length. `tfidf`: 1 weighs each word by how rare it is among the pictures.
-    """
+    `words`: clusters k; the paper tries 256 to 10000. `max_features`: the strongest of a picture.
+    `similarity`: "product" compares frequencies (the paper), "cosine" unit vectors. `tfidf`: 1
+    weighs words by how rare they are."""
 
     words: int = 1024
     features: str = "sift"
@@ -72,12 +62,9 @@ class WordsRecipe:
 
 @dataclass(frozen=True, eq=False)
 class WordsEmbedder:
-    """A learnt vocabulary.
+    """`vocabulary` (k, D): uint8 for SIFT (128), float16 for SuperPoint (256).
 
-    `vocabulary` (k, D) as stored in the map: uint8 for SIFT (D = 128), float16 for SuperPoint
-    (D = 256). `idf` (k,) float32, weights of rare words; empty without `tfidf`. `detector`: finds
-    the features; None for SIFT.
-    """
+    `idf` (k,) float32, empty without `tfidf`. `detector`: None for SIFT."""
 
     recipe: WordsRecipe
     vocabulary: NDArray[Any]
@@ -100,7 +87,6 @@ class WordsEmbedder:
 
     @property
     def dims(self) -> int:
-        """Numbers per embedding, k."""
         return self.recipe.words
 
     @cached_property
@@ -112,15 +98,13 @@ class WordsEmbedder:
         return np.asarray(np.square(self._words).sum(axis=0) / 2, dtype=np.float32)
 
     def view(self, maps: Array, valid: Mask) -> Array:
-        """Frequencies of words (k,) in a view's grey levels (1, S, S), as `similarity` says.
+        """(k,) of grey levels (1, S, S), 0..1 as of `represent.Gray`, or 0..255 if one is above 1.
 
-        Grey levels are 0..1 as `represent.Gray` gives them, or 0..255 if one is above 1.
-        A view without features gives zeros. Raises `ValueError` if there is not one channel.
-        """
+        Zeros without features. Raises `ValueError` unless there is one channel."""
         return self._weighted(self.counts(_levels(maps), valid))
 
     def views(self, maps: Array, valid: Mask | None = None) -> Array:
-        """Frequencies (N, k) of views (N, 1, S, S), everywhere valid or where (N, S, S) says."""
+        """Of (N, 1, S, S), everywhere valid or where (N, S, S) says."""
         if valid is None:
             valid = np.ones((len(maps), *maps.shape[2:]), dtype=bool)
         out = np.empty((len(maps), self.dims), dtype=np.float32)
@@ -129,7 +113,7 @@ class WordsEmbedder:
         return out
 
     def counts(self, grey: Grey, valid: Mask) -> NDArray[np.int64]:
-        """How many features of a picture (H, W) fall to each word (k,)."""
+        """Of features of a picture (H, W) by words (k,)."""
         found = self.assigned(describe(self.recipe, grey, valid, self.detector))
         return np.bincount(found, minlength=self.dims)
 
@@ -152,12 +136,10 @@ class WordsEmbedder:
         return np.asarray(vector, dtype=np.float32)
 
     def parts(self) -> dict[str, NDArray[Any]]:
-        """Arrays to be stored in the map."""
         return {"vocabulary": self.vocabulary, "idf": self.idf}
 
 
 def _levels(maps: Array) -> Grey:
-    """Grey levels (S, S) uint8 of a representation (1, S, S) of 0..1 or 0..255."""
     if maps.ndim != 3 or len(maps) != 1:
         raise ValueError(f"words are of grey levels, one channel (1, S, S); got {maps.shape}")
     factor = 255 if maps.max(initial=0) <= 1 else 1
@@ -167,11 +149,9 @@ def _levels(maps: Array) -> Grey:
 def describe(
     recipe: WordsRecipe, grey: Grey, valid: Mask, detector: Detector | None = None
 ) -> Array:
-    """Descriptors (N, D) of the features of a picture (H, W) that see valid pixels only.
+    """Descriptors (N, D) of features that see valid pixels only, within their radius.
 
-    A feature is left out if a pixel within its radius is not valid. `detector` is needed for other
-    features than SIFT; raises `VariantError` without.
-    """
+    `detector`: for other features than SIFT; raises `VariantError` without."""
     if detector is None and recipe.features != "sift":
         raise VariantError(f"features '{recipe.features}' do not fly; they need their detector")
     if not valid.any():
@@ -193,7 +173,7 @@ def describe(
 
 
 def _sift(grey: Grey, most: int) -> tuple[Array, Array, Array]:
-    """Points (N, 2) from the outer corner, radii (N,) and descriptors (N, 128), whole numbers."""
+    """Points (N, 2) from the outer corner, radii (N,), descriptors (N, 128), whole numbers."""
     sift = cv2.SIFT.create(nfeatures=most)
     found, descriptors = sift.detectAndCompute(grey, None)
     if not len(found):

@@ -20,31 +20,23 @@ from orthonav.core.track.model import (
 )
 
 TRUSTED = (0.1, 0.5)
-"""Views with a probability of their own below the first do not count, above the second fully."""
-MOST_OF_ONE = 0.75
-"""A single view counts at most so much: less than `CONFIRMED`."""
+"""Views with less probability of their own do not count, above the second fully."""
+MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
-"""Heading and scale in a measurement."""
-SEARCHED_SIGMAS = 6.0
-"""Width of the search over heading and scale, in standard deviations, from end to end."""
-MAX_LOG_ODDS = 7.0
-"""Limit of the log odds of a single view."""
-WORTH_LOG_ODDS = -12.0
-"""Less likely places are left out."""
-LEAST_PLACE = 1e-12
-"""Least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds."""
+SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
+MAX_LOG_ODDS = 7.0  # of a single view
+WORTH_LOG_ODDS = -12.0  # less likely places are left out
+LEAST_PLACE = 1e-12  # least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds
 
 
 def places_of(
     best: Place, confidence: RegisteredConfidence, near_px: float, searched_share: float
 ) -> list[tuple[float, float, Place]]:
-    """Log odds, probability by the view alone, and place: of the best place and of its rivals that
-    are farther than `near_px` from it and from each other.
+    """Log odds, probability by the view alone, and place: the best, and rivals `near_px` apart.
 
-    A search of only a share of the map finds fewer rivals, and chance is lower: the log odds are
-    those within the area searched times `searched_share`, or, if less, those of a search of the
-    whole map whose rivals are what chance makes (docs/decisions/tracking.md).
-    """
+    A search of a share of the map finds fewer rivals, and chance is lower: the log odds are those
+    within the area times `searched_share`, or, if less, those of a whole search whose rivals are
+    what chance makes (docs/decisions/tracking.md)."""
     share, chances = math.log(searched_share), confidence.chances
     chance = {
         "rival": chances.of_strength(best.scores),
@@ -69,7 +61,7 @@ def places_of(
 
 
 def _as_rival(best: Place, place: Place) -> dict[str, float]:
-    """The scores of a rival as if it were the best place, and the best one its rival."""
+    """As if it were the best place, and the best one its rival."""
     share = place.score / max(best.score, 1e-6)
     look = best.scores["look"]
     return best.scores | {
@@ -84,13 +76,11 @@ def _as_rival(best: Place, place: Place) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A sighting as a measurement of the state.
+    """A sighting as a measurement of `model.SEEN`: `mean` (6,), `noise` (6, 6).
 
-    `mean` (6,), `noise` (6, 6): of `model.SEEN`. `log_odds`: log odds over the density of
-    places, headings and scales that only look alike. `own_noise` (6, 6): covariance without regard
-    to earlier views of the same ground. `alone`: probability by the view alone. `log_chance`: log
-    density of places, headings and scales that chance finds in the area searched.
-    """
+    `log_odds`: over the density of what only looks alike. `own_noise` (6, 6): without regard to
+    earlier views of the same ground. `alone`: probability by the view alone. `log_chance`: log
+    density of what chance finds in the area searched."""
 
     mean: Array
     noise: Array
@@ -103,9 +93,7 @@ class Measurement:
 def measurement(
     model: Model, reported: ReportedAttitude, sighting: Sighting
 ) -> tuple[Array, Array, Array]:
-    """A sighting as a measurement of `SEEN` (6,), and two covariances
-    (6, 6): of the errors of map and view, and of the telemetry noise, which is independent at every
-    view."""
+    """Mean (6,), covariances (6, 6) of map and view, and of telemetry noise, new at each view."""
     noise = sighting.covariance.copy()
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)
@@ -125,8 +113,7 @@ def measurement(
 def updated(
     mean: Array, covariance: Array, innovation: Array, spread: Array
 ) -> tuple[Array, Array]:
-    """Kalman update: posterior mean (.., 10) and covariance (.., 10, 10), by an innovation (.., 6)
-    and its covariance (.., 6, 6)."""
+    """Kalman update (.., 10), (.., 10, 10) by an innovation (.., 6), covariance (.., 6, 6)."""
     gain = np.linalg.solve(spread, SEEN @ covariance).swapaxes(-1, -2)
     after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
     moved = mean + (gain @ innovation[..., None])[..., 0]
@@ -134,14 +121,13 @@ def updated(
 
 
 def log_densities(off: Array, spread: Array) -> Array:
-    """Natural logarithms (..) of the densities of Gaussians (.., N, N) at `off` (.., N)."""
+    """Of Gaussians (.., N, N) at `off` (.., N)."""
     _, log_det = np.linalg.slogdet(2 * math.pi * spread)
     weighted = np.linalg.solve(spread, off[..., None])[..., 0]
     return np.asarray(-0.5 * ((off * weighted).sum(axis=-1) + log_det))
 
 
 def log_density(off: Array, spread: Array) -> float:
-    """The same of one Gaussian."""
     return float(log_densities(off, spread))
 
 
@@ -155,13 +141,9 @@ def tempered(
 ) -> Measurement:
     """A sighting as a measurement, tempered by the share of it that is new.
 
-    `mounts`: probability and covariance (10, 10) of the initial state of each kind of mount.
-    `areas_m2`: of the map, and of the part of it that was searched.
-
-    A likelihood raised to the power `newness` has a broader peak, which stands out less from
-    all places, headings and scales. The telemetry noise, independent at every view, is
-    excluded.
-    """
+    `mounts`: probability and covariance (10, 10) of the initial state of each kind. `areas_m2`: of
+    the map, and of the part searched. A likelihood to the power `newness` has a broader peak; the
+    telemetry noise, independent at every view, is excluded."""
     mean, noise, independent = measurement(model, reported, sighting)
     map_m2, searched_m2 = areas_m2
     own = np.diag(noise)[POSE] + model.initial_bias()[:2]
@@ -195,11 +177,10 @@ def recognition(
 ) -> Array:
     """Probabilities (K,) that a view showed the map, given its place and predictions of that.
 
-    `covariances` (K, 6, 6): of the predictions of what was seen. `most_agreement`: see `Model`. The
-    odds by the view alone, times the likelihood ratio of the innovations (K, 6) in position,
-    heading and scale between a right place and one that chance finds in the area searched. A place
-    within the gate is never less likely for its distance.
-    """
+    The odds by the view alone, times the likelihood ratio of innovations (K, 6), of predictions
+    with `covariances` (K, 6, 6), between a right place and one that chance finds in the area
+    searched, at most `most_agreement`. A place within the gate is never less likely for its
+    distance."""
     spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
     ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
     agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
@@ -208,10 +189,7 @@ def recognition(
 
 
 def confirmed_ground(alone: float, ground: float) -> float:
-    """New ground, in views, that a view confirms by its probability `alone`.
-
-    `ground`: share of the view that the last one did not show.
-    """
+    """New ground, in views; `ground`: share of the view that the last one did not show."""
     low, high = TRUSTED
     trust = min(max((alone - low) / (high - low), 0.0), 1.0)
     return min(ground * trust, MOST_OF_ONE)

@@ -1,12 +1,10 @@
 """The track: a mixture of hypotheses, each a Kalman filter, and the belief "elsewhere".
 
-A view is ambiguous: its true place may be the second best, or none of those found. So every
-hypothesis is split, into one for each place where the view may have been taken and one for none of
-them, weighted by likelihood (multiple hypothesis tracking, Reid 1979; a Gaussian sum filter,
-Sorenson and Alspach 1971). Unlikely hypotheses are dropped, similar ones merged. The remaining
-probability stands for "elsewhere": it is 1 at the start, new hypotheses are born from it, and some
-returns to it with every view, so that no error is permanent (docs/decisions/tracking.md).
-"""
+A view's true place may be the second best, or none of those found. So every hypothesis is split,
+one for each place and one for none, weighted by likelihood (multiple hypothesis tracking, Reid
+1979; a Gaussian sum filter, Sorenson and Alspach 1971). Unlikely ones are dropped, similar ones
+merged. The rest is "elsewhere": 1 at the start, new hypotheses are born from it, and some returns
+to it with every view, so that no error is permanent (docs/decisions/tracking.md)."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,14 +17,6 @@ import numpy as np
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.confidence import within
 from orthonav.core.records import CONFIDENT
-from orthonav.core.track.hypotheses import (
-    Hypothesis,
-    distance,
-    major,
-    merged,
-    moments,
-    moved,
-)
 from orthonav.core.track.likelihood import (
     Measurement,
     confirmed_ground,
@@ -37,9 +27,11 @@ from orthonav.core.track.likelihood import (
     updated,
 )
 from orthonav.core.track.model import (
+    HEADING,
     POSITION,
     SEEN,
     STATE,
+    VELOCITY,
     Array,
     Model,
     ReportedAttitude,
@@ -56,54 +48,158 @@ from orthonav.core.track.motion import (
     velocity_forgotten,
 )
 
+MAX_HYPOTHESES = 40  # the least likely are dropped: the cost of a view grows with their number
+MIN_SHARE = 1e-7
+MERGE_SIGMAS = 1.0
+"""Merging loses less (in nats, doubled) than this distance in standard deviations, squared."""
+MINOR_OF_GROUP = 0.01  # share of a group of hypotheses below which one says nothing about the group
+NORTH_STEP_M = 100.0  # over which the convergence of two planes is measured
+COMPARED: Array = np.zeros((6, STATE))
+"""Position, velocity and the whole tilt, by which hypotheses are compared."""
+COMPARED[range(6), [0, 1, 2, 3, 6, 7]] = COMPARED[[4, 5], [8, 9]] = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One hypothesis of the track, with probability `share`, `mean` (10,), `covariance` (10, 10).
+
+    `sighted`: new ground that it recognized, in views; `uncounted`: since the last view that
+    counted. `number`: unique in the flight. `parent`, `expected`: that of the last view and its
+    prediction; -1, None where it was born now. `recognized`: probability, by the last view and its
+    agreement with the prediction, that it showed the map here. `followed`: from a confirmed track
+    or reported position."""
+
+    share: float
+    mean: Array
+    covariance: Array
+    sighted: float
+    number: int
+    parent: int = -1
+    expected: Expected | None = None
+    recognized: float = 0.0
+    followed: bool = False
+    uncounted: float = 0.0
+
+
+def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
+    """Most likely first; similar ones merged, unlikely ones dropped."""
+    likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
+    left = likely or ordered[:1]  # the last one stays, however unlikely
+    if not left:
+        return []
+    means = np.array([each.mean for each in left]) @ COMPARED.T
+    covariances = COMPARED @ np.array([each.covariance for each in left]) @ COMPARED.T
+    numbers = np.arange(len(left))
+    out: list[Hypothesis] = []
+    while len(numbers) and len(out) < MAX_HYPOTHESES:
+        first = left[numbers[0]]
+        alike = _divergence(means[numbers], covariances[numbers]) < 2 * MERGE_SIGMAS**2
+        alike[0] = True
+        group = [left[number] for number in numbers[alike]]
+        numbers = numbers[~alike]
+        mean, covariance = moments(group)
+        share = sum(each.share for each in group)
+        sighted = sum(each.share * each.sighted for each in group) / share
+        out.append(
+            replace(
+                first,
+                share=share,
+                mean=mean,
+                covariance=covariance,
+                sighted=sighted,
+                recognized=recognized(group),
+            )
+        )
+    return out
+
+
+def recognized(group: Sequence[Hypothesis]) -> float:
+    """Largest probability of having recognized the map, by the `major` ones."""
+    return max(each.recognized for each in major(group))
+
+
+def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those with at least `MINOR_OF_GROUP` of the probability of the group."""
+    least = MINOR_OF_GROUP * sum(each.share for each in group)
+    return [each for each in group if each.share >= least]
+
+
+def _divergence(means: Array, covariances: Array) -> Array:
+    """Kullback-Leibler divergence (nats, (N,)) of Gaussians (N, 6) of `COMPARED` from the first: a
+    well-known place must not vanish in a wide hypothesis (docs/decisions/tracking.md)."""
+    inverse = np.linalg.inv(covariances[0])
+    off = means - means[0]
+    turned = inverse @ covariances
+    _, log_det = np.linalg.slogdet(turned)
+    distance = np.einsum("ni,ij,nj->n", off, inverse, off)
+    spread = np.trace(turned, axis1=1, axis2=2)
+    return np.asarray((distance + spread - means.shape[1] - log_det) / 2)
+
+
+def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
+    """As one Gaussian, (10,) and (10, 10); not to be changed."""
+    if len(group) == 1:
+        return group[0].mean, group[0].covariance
+    shares = np.array([each.share for each in group])
+    shares = shares / shares.sum()
+    means = np.array([each.mean for each in group])
+    mean = shares @ means
+    off = means - mean
+    covariance = np.tensordot(shares, np.array([each.covariance for each in group]), axes=1)
+    return mean, np.asarray(covariance + (off * shares[:, None]).T @ off)
+
+
+def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
+    """In another plane, turned by the convergence of north."""
+    two = each.mean[POSITION] + np.array([[0.0, 0.0], [0.0, NORTH_STEP_M]])
+    place, to_north = other.en_from_latlon(*plane.latlon_from_en(two))
+    east, north = (to_north - place).tolist()
+    turn = math.atan2(east, north)
+    turned = np.eye(len(each.mean))
+    turned[POSITION, POSITION] = turned[VELOCITY, VELOCITY] = [
+        [math.cos(turn), math.sin(turn)],
+        [-math.sin(turn), math.cos(turn)],
+    ]
+    mean = turned @ each.mean
+    mean[POSITION] = place
+    mean[HEADING] += turn
+    return replace(each, mean=mean, covariance=turned @ each.covariance @ turned.T)
+
+
+def distance(one: Hypothesis, other: Hypothesis) -> float:
+    return math.dist(one.mean[POSITION], other.mean[POSITION])
+
+
 MIN_SPLIT = 1e-5
-"""Predictions less likely than this share of all predictions of a hypothesis are not followed. This
-and the other values without a source were chosen on the flights of docs/tracking.md."""
-MINOR_SHARE = 1e-4
-"""Less likely hypotheses are not split for rare events."""
-MAJOR_SHARE = 0.05
-"""The same without odometry, where hypotheses are not merged between views."""
-START_SHARE = 0.9
-"""Probability of a reported start position."""
-LIKELY = 0.5
-"""A track with less confidence is lost."""
+"""Least share to be followed. Values without a source: by the flights of docs/tracking.md."""
+MINOR_SHARE = 1e-4  # less likely hypotheses are not split for rare events,
+MAJOR_SHARE = 0.05  # nor these without odometry, where hypotheses are not merged between views
+START_SHARE = 0.9  # of a reported start position
+LIKELY = 0.5  # A track with less confidence is lost
 CONFIRMED = 1.25
-"""New ground, in views, that must be recognized before a track is confirmed. Each view counts by
-its own probability: no single view confirms a track, nor do further views of its ground, nor views
-that fit only because they were searched there (docs/decisions/tracking.md)."""
-UNCONFIRMED = 0.8
-"""Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md)."""
+"""New ground, in views, to be recognized before a track is confirmed, each by its own probability:
+no single view confirms, nor further views of its ground, nor those that fit only because they were
+searched there (docs/decisions/tracking.md)."""
+UNCONFIRMED = 0.8  # most that is stated before a track is confirmed (docs/decisions/tracking.md)
 RECOGNIZED = 0.2
-"""Probability from which on a view shows the map, by this view alone and by its agreement with the
-prediction. Without, a track is coasting (docs/decisions/tracking.md)."""
-RECOGNIZED_SIGMAS = 1.5
-"""Farther from the estimated position than this many standard deviations per axis, a view does not
-show the map there."""
+"""From which on a view shows the map. Without, a track is coasting (docs/decisions/tracking.md)."""
+RECOGNIZED_SIGMAS = 1.5  # farther from the estimate, per axis, a view does not show the map there
 RECOGNIZED_SHARE = 0.1
-"""A hypothesis with less of the probability of its cluster does not show where the cluster is
-(docs/decisions/tracking.md)."""
+"""Hypotheses with less of their cluster do not show where it is (docs/decisions/tracking.md)."""
 UNRECOGNIZED = 0.5
-"""Factor on the count of recognized ground for each view of new ground that does not show the map:
-after a few, a track must be confirmed again."""
+"""Factor on the count of recognized ground for a view of new ground that does not show the map."""
 BLIND = 0.5
-"""Factor on the evidence, against a track that was confirmed, of a view that does not show the map,
-for each such view before: clouds, water and a covered lens last (decisions/tracking.md)."""
-MOST_SIGHTED = 3.0
-"""Highest count of recognized ground, in views."""
+"""Factor on the evidence against a confirmed track of a view that does not show the map, for each
+such view before: clouds, water and a covered lens last (docs/decisions/tracking.md)."""
+MOST_SIGHTED = 3.0  # highest count, in views
 FORGOTTEN = 0.5
-"""The count is multiplied by this with every view at which the position is less certain than
-`Model.wide_m`: after a while a track must be confirmed again."""
-GATE = 36.0
-"""Gate: largest squared innovation of the position over the trace of its covariance."""
+"""Factor on the count with every view at which the position is less certain than `Model.wide_m`."""
+GATE = 36.0  # largest squared innovation of the position over the trace of its covariance
 
 
 class State(Enum):
-    """State of the track, as `fixes.jsonl` has it."""
-
-    SEARCHING = "searching"
-    """No place has been confirmed."""
-    TRACKING = "tracking"
-    """Confirmed, and this view shows the map where the track is."""
+    SEARCHING = "searching"  # no place has been confirmed
+    TRACKING = "tracking"  # Confirmed, and this view shows the map where the track is
     COASTING = "coasting"
     """Confirmed before; this view does not show the map, the position is dead reckoning."""
     LOST = "lost"
@@ -111,20 +207,16 @@ class State(Enum):
 
     @property
     def is_followed(self) -> bool:
-        """Whether the position is that of a confirmed track."""
         return self in (State.TRACKING, State.COASTING)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The estimate of the track: its best cluster of hypotheses. Its arrays are not to be changed.
+    """The best cluster of hypotheses. Its arrays are not to be changed.
 
-    `mean` (10,), `covariance` (10, 10): of the cluster. `confidence`: probability that the aircraft
-    is within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
-    however wide it is. `recognized`: probability that the last view showed the map there.
-    `confirmed`: whether enough of its ground was recognized lately. `followed`: whether it descends
-    from a confirmed track or a reported position.
-    """
+    `confidence`: probability of being within the radius asked for; `belief`: however wide the
+    cluster. `recognized`: probability that the last view showed the map there. `confirmed`: enough
+    ground was recognized lately. `followed`: from a confirmed track or a reported position."""
 
     mean: Array
     covariance: Array
@@ -140,8 +232,7 @@ class Mixture:
     """The belief about one flight. Mutable; not to be shared between threads."""
 
     def __init__(self, model: Model, extent_en_m: tuple[float, float, float, float]) -> None:
-        """`extent_en_m` (west, south, east, north) is that of the map: the aircraft may be
-        anywhere on it."""
+        """`extent_en_m`: west, south, east, north of the map, on which the aircraft is."""
         self.model = model
         self._set_extent(extent_en_m)
         self.hypotheses: list[Hypothesis] = []
@@ -155,22 +246,18 @@ class Mixture:
         self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
 
     def move(
-        self,
-        plane: LocalFrame,
-        other: LocalFrame,
-        extent_en_m: tuple[float, float, float, float],
+        self, plane: LocalFrame, other: LocalFrame, extent_en_m: tuple[float, float, float, float]
     ) -> None:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
         self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
-        """Begin at a reported position (2,) with standard deviation `std_m` per axis."""
+        """At a reported position (2,), `std_m` per axis."""
         self.hypotheses = list(self._born_at(mean_en_m, std_m, START_SHARE))
         self.elsewhere = 1 - START_SHARE
 
     def _born_at(self, mean_en_m: Array, std_m: float, share: float) -> Iterator[Hypothesis]:
-        """Hypotheses at a position, together of probability `share`."""
         for mount, mean, covariance in self._mounts():
             mean[POSITION] = mean_en_m
             covariance[POSITION, POSITION] = np.eye(2) * std_m**2
@@ -178,7 +265,7 @@ class Mixture:
             yield Hypothesis(share * mount, mean, covariance, 0.0, self._numbers, followed=True)
 
     def measure_position(self, mean_en_m: Array, std_m: float) -> None:
-        """Update with a position (2,) measured by other means, such as GNSS, `std_m` per axis."""
+        """By other means, such as GNSS, (2,), `std_m` per axis."""
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
@@ -210,11 +297,8 @@ class Mixture:
         camera: CameraDisplacement | None = None,
         telemetry_noise: Array | None = None,
     ) -> None:
-        """Predict over so many seconds, by the reported velocity and the camera's odometry.
-
-        `telemetry_noise` (3,): variances of reported heading (rad) and log scale from view to view
-        and of the horizon (rad), those of the model where None.
-        """
+        """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
+        (rad), log scale, horizon (rad), None: the model's."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays = 1 - self.model.lost
         made = []
@@ -233,11 +317,9 @@ class Mixture:
         camera: CameraDisplacement | None,
         telemetry_noise: Array,
     ) -> Iterator[tuple[float, Expected]]:
-        """The predictions of a hypothesis with their probabilities: with odometry and without.
+        """With their probabilities: with odometry, which may be an outlier, and without.
 
-        Odometry may be an outlier; it is weighted by its innovation. Where no velocity is reported,
-        the aircraft may also have made an unexpected turn.
-        """
+        Where no velocity is reported, the aircraft may also have made an unexpected turn."""
         model, likely = self.model, 1 - self.model.odometry_outlier
         coasting = self._state in (State.COASTING, State.LOST)
         step = partial(predicted, model, each.mean, coasting=coasting)
@@ -283,13 +365,10 @@ class Mixture:
     ) -> None:
         """Update with the places where a view may have been taken; all of them may be wrong.
 
-        `searched`: the circle of the map that was searched, middle (2,) and radius in metres; None
-        for all of it. `newness`: share of the view that counts as new evidence. Views of the same
-        ground have the same errors, so many of them count no more than one. `new_ground`: share of
-        the view that the last one did not show, which alone confirms a track; None: `newness`.
-        `confirms`: whether these places competed with all others where the aircraft may be. Without
-        that, a view does not count towards a confirmed track.
-        """
+        `searched`: middle (2,) and radius in metres; None: all of the map. `newness`: share that
+        counts as new evidence, for views of the same ground have the same errors. `new_ground`:
+        share that the last view did not show, which alone confirms a track; None: `newness`.
+        `confirms`: whether these places competed with all others where the aircraft may be."""
         ground = newness if new_ground is None else new_ground
         starts = [
             replace(each, uncounted=min(each.uncounted + ground, 1.0)) for each in self.hypotheses
@@ -312,7 +391,7 @@ class Mixture:
     def _missed(
         self, each: Hypothesis, newness: float, ground: float, searched: tuple[Array, float] | None
     ) -> Hypothesis:
-        """A hypothesis for which the view was taken at none of the places found; see `update`."""
+        """For which the view was taken at none of the places found; see `update`."""
         in_search = self._on_map(each.mean)
         if searched is not None:
             in_search &= math.dist(each.mean[:2], searched[0]) < searched[1]
@@ -322,11 +401,7 @@ class Mixture:
         return replace(each, share=share, sighted=_forgotten(each.sighted, ground))
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
-        """The best cluster, None where there is no hypothesis.
-
-        It updates the state of the track, except with `between_views`: after the prediction to a
-        view, before the update with it.
-        """
+        """The best cluster, None without hypotheses. Updates the state, except `between_views`."""
         if not self.hypotheses:
             return None
         best = self._best(radius_m)
@@ -347,11 +422,8 @@ class Mixture:
         return Estimate(mean, covariance, confidence, self._state, belief, seen, confirmed, follows)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
-        """Largest probability of having recognized the map at the estimated position.
-
-        Hypotheses of the cluster that are farther from it than it is certain, or that hardly
-        contribute to it, do not count.
-        """
+        """Largest probability of having recognized the map, of hypotheses no farther away than it
+        is certain and that contribute."""
         reach_m = RECOGNIZED_SIGMAS * math.sqrt(float(np.trace(covariance[POSITION, POSITION])) / 2)
         least = RECOGNIZED_SHARE * sum(each.share for each in near)
         return max(
@@ -364,7 +436,6 @@ class Mixture:
         )
 
     def _follow(self, near: list[Hypothesis]) -> None:
-        """Mark the hypotheses of a confirmed track."""
         numbers = {each.number for each in near}
         self.hypotheses = [
             replace(each, followed=True) if each.number in numbers else each
@@ -373,24 +444,22 @@ class Mixture:
 
     @property
     def likeliest(self) -> Hypothesis | None:
-        """The most likely single hypothesis."""
         return self.hypotheses[0] if self.hypotheses else None
 
     def _best(self, radius_m: float) -> Hypothesis:
-        """The hypothesis with the highest probability around it, of the eight most likely."""
+        """With the highest probability around it, of the eight most likely."""
         heaviest = self.hypotheses[:8]
         return max(heaviest, key=lambda one: self._inside(radius_m, one.mean[POSITION]))
 
     def _inside(self, radius_m: float, middle: Array) -> float:
-        """Probability that the aircraft is within a radius of a place (2,)."""
+        """Of a place (2,)."""
         return sum(
             each.share * within(each.mean, each.covariance, radius_m, middle)
             for each in self.hypotheses
         )
 
     def bias(self) -> tuple[Array, Array]:
-        """The estimated errors of heading (rad), log scale, pitch and roll (rad) as reported: mean
-        (4,) and covariance (4, 4) over all hypotheses."""
+        """Errors of heading (rad), log scale, pitch and roll (rad) as reported: (4,) and (4, 4)."""
         if not self.hypotheses:
             _, covariance = self._nowhere()
             return np.zeros(4), (SEEN @ covariance @ SEEN.T)[2:, 2:]
@@ -398,12 +467,8 @@ class Mixture:
         return (SEEN @ mean)[2:], (SEEN @ covariance @ SEEN.T)[2:, 2:]
 
     def _next_state(self, confidence: float, confirmed: bool, follows: bool) -> State:
-        """State after a view.
-
-        `confirmed`: by it and by enough ground recognized before. `follows`: whether the likeliest
-        place descends from a confirmed track or a reported position; another one is no dead
-        reckoning.
-        """
+        """`confirmed`: by this view and enough ground before. `follows`: the likeliest place
+        descends from a confirmed track or a reported position; another one is no dead reckoning."""
         followed = self._state.is_followed
         if confirmed and confidence >= (LIKELY if followed and follows else CONFIDENT):
             return State.TRACKING
@@ -416,7 +481,7 @@ class Mixture:
         return bool(inside.all())
 
     def _with_bias_jump(self, each: Hypothesis) -> list[Hypothesis]:
-        """A hypothesis without and with a bias jump since the last view."""
+        """Without and with a bias jump since the last view."""
         rare = self.model.bias_jump
         if each.expected is None or each.share < MINOR_SHARE:
             return [each]
@@ -438,11 +503,8 @@ class Mixture:
         ground: float,
         confirms: bool,
     ) -> Iterator[Hypothesis]:
-        """Hypotheses after a measurement, without those for which it lies outside the gate.
-
-        `found`: probability that a view is found. `ground`: share of the view that the last one did
-        not show. `confirms`: see `update`.
-        """
+        """After a measurement, without those for which it lies outside the gate. `found`:
+        probability that a view is found. `ground`: share that the last view did not show."""
         near = [each for each in starts if self._is_near(each, seen)]
         if not near:
             return
@@ -478,13 +540,12 @@ class Mixture:
 
     @staticmethod
     def _is_near(each: Hypothesis, seen: Measurement) -> bool:
-        """Whether a measurement lies within the gate of a hypothesis."""
         variances = each.covariance[0, 0] + each.covariance[1, 1]
         reach = variances + seen.noise[0, 0] + seen.noise[1, 1]
         return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
-        """Mean (10,) and covariance (10, 10) of a state that may be anywhere on the map."""
+        """Mean (10,) and covariance (10, 10), anywhere on the map."""
         place, speed = self.area_m2, self.model.speed_mps**2
         horizon = self.model.horizon_rad**2
         variances = [
@@ -501,8 +562,7 @@ class Mixture:
             yield off, *self._nowhere(self.model.off_tilt_rad)
 
     def _born(self, seen: Measurement, confirms: bool) -> Iterator[Hypothesis]:
-        """The hypotheses born from the belief elsewhere, at a measurement. `confirms`: see
-        `update`."""
+        """From the belief elsewhere, at a measurement."""
         for share, mean, covariance in self._mounts():
             spread = SEEN @ covariance @ SEEN.T + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
@@ -539,20 +599,17 @@ class Mixture:
         )
 
     def _merge(self, made: list[Hypothesis]) -> None:
-        """Take new hypotheses in place of the present ones, similar ones merged."""
         self.hypotheses = made
         self._normalize()
         self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
         self._normalize()
 
     def _normalize(self) -> None:
-        """Shares and the belief elsewhere add up to one."""
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total
 
 
 def _forgotten(sighted: float, ground: float) -> float:
-    """The count of recognized ground after a view that does not show the map; `ground`: the share
-    of it that the last one did not show."""
+    """After a view that does not show the map; `ground`: share that the last view did not show."""
     return sighted * float(UNRECOGNIZED**ground)

@@ -19,26 +19,21 @@ from orthonav.core.track.model import (
 )
 
 VELOCITY_JITTER = 0.3
-"""Share of the error of a reported velocity that is independent at every view; chosen on the
-flights of docs/tracking.md."""
+"""Of the error of a reported velocity, independent at every view (docs/tracking.md)."""
 VELOCITY_STD_MPS, VELOCITY_SHARE = 1.0, 0.02
-"""Standard deviation of a reported velocity that comes without one: this, and this share of the
-speed (docs/tracking.md)."""
+"""Of a reported velocity without deviation, and share of the speed (docs/tracking.md)."""
 
 
 def usual_velocity_std_mps(speed_mps: float) -> float:
-    """Standard deviation per axis of a reported velocity that comes without one."""
     return VELOCITY_STD_MPS + VELOCITY_SHARE * speed_mps
 
 
 @dataclass(frozen=True, eq=False)
 class ReportedVelocity:
-    """The reported velocity over ground, m/s east and north.
+    """Over ground, m/s east and north (2,), since the last view and the one before it, None
+    without.
 
-    `now_en_mps` (2,): since the last view. `before_en_mps` (2,): the one reported with the last
-    view, None where there was none. `std_mps`: standard deviation per axis of its error, which is
-    nearly constant for `correlation_s`; None: `Model.reported_velocity_s`.
-    """
+    `std_mps`: per axis, of an error nearly constant for `correlation_s`; None: `Model`'s."""
 
     now_en_mps: Array
     before_en_mps: Array | None
@@ -50,13 +45,11 @@ class ReportedVelocity:
 class CameraDisplacement:
     """The displacement since the last view, measured by the camera.
 
-    `moved_en_m` (2,): metres east and north, rotated by the reported heading and scaled by the
-    reported height of the view before, and so subject to their errors. `covariance` (2, 2).
-    `reach_m`: the radius within which it was sought. `turned_rad`, `scaled`: change of heading
-    (rad) and log scale beyond the reported change. `turned_std_rad`, `scaled_std`: their standard
-    deviations. `levers_m` (2, 2, 2): metres east and north by which an error of the pitch and roll
-    (rad) displaces the camera, now and before; `corrected_rad` (2, 2): what they were corrected by.
-    """
+    `moved_en_m` (2,), `covariance` (2, 2): rotated by heading and scaled by height as reported
+    before, and so subject to their errors. `reach_m`: radius of the search. `turned_rad`, `scaled`:
+    change of heading and log scale beyond the reported one. `levers_m` (2, 2, 2): metres east and
+    north by an error of pitch and roll (rad), now and before; `corrected_rad` (2, 2): what they
+    were corrected by."""
 
     moved_en_m: Array
     covariance: Array
@@ -71,12 +64,9 @@ class CameraDisplacement:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A predicted state, with the state before it.
+    """A predicted state (10,), with the one before it by the odometry in between too.
 
-    `mean` (10,), `covariance` (10, 10): the prediction. `mean_before`, `covariance_before`: the
-    state at the last view, by the odometry in between too. `cross` (10, 10): covariance of the
-    state before (rows) and the prediction (columns).
-    """
+    `cross` (10, 10): covariance of the state before (rows) and the prediction (columns)."""
 
     mean: Array
     covariance: Array
@@ -85,7 +75,7 @@ class Expected:
     cross: Array
 
     def without(self, part: slice, variances: Array) -> "Expected":
-        """The same with components of the state reset to zero mean and these variances."""
+        """With components of the state reset to zero mean and these variances."""
         mean, covariance, cross = self.mean.copy(), self.covariance.copy(), self.cross.copy()
         mean[part] = 0.0
         cross[:, part] = 0.0
@@ -105,14 +95,12 @@ def predicted(
     *,
     coasting: bool = False,
 ) -> Expected:
-    """The state predicted over so many seconds, by the reported velocity or else its own.
+    """The state after so many seconds, by the reported velocity or else its own.
 
-    `telemetry_noise` (3,): variances of reported heading (rad) and log scale from view to view, and
-    of the horizon. The first two are added to the biases of these, unless the `camera` measured the
-    change; the horizon is a Gauss-Markov process (`Model.horizon_s`). The displacement
-    by the camera is not included: see `by_camera`. While `coasting`, the error of a reported
-    velocity drifts (`Model.coasting_walk`).
-    """
+    `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
+    their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
+    `Model.horizon_s`). The displacement itself is added by `by_camera`. While `coasting`, the error
+    of a reported velocity drifts (`Model.coasting_walk`)."""
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
@@ -153,7 +141,7 @@ def predicted(
 
 
 def _add(noise: Array, position: float, both: float, velocity: float) -> None:
-    """Add variances of position and velocity and their covariance `both`, alike on both axes."""
+    """Alike on both axes; `both`: their covariance."""
     for axis in (0, 1):
         noise[axis, axis] += position
         noise[axis, axis + 2] += both
@@ -162,12 +150,8 @@ def _add(noise: Array, position: float, both: float, velocity: float) -> None:
 
 
 def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected, float]:
-    """The prediction updated with a displacement by the camera, and the log density of the latter.
-
-    The displacement measures the position now less that before (stochastic cloning, Roumeliotis and
-    Burdick 2002), rotated and scaled by the errors of heading and scale before; what the tilts of
-    both views err by looks like motion.
-    """
+    """With a displacement by the camera, and the log density of that (stochastic cloning,
+    Roumeliotis and Burdick 2002), under errors of heading, scale and both tilts."""
     mean = np.concatenate([expected.mean, expected.mean_before])
     now, before = slice(0, STATE), slice(STATE, 2 * STATE)
     joint = np.empty((2 * STATE, 2 * STATE))  # filled: np.block takes ten times as long
@@ -201,7 +185,6 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
 
 
 def velocity_forgotten(model: Model, covariance: Array) -> Array:
-    """The covariance (10, 10) of a state with its velocity reset to unknown."""
     out = covariance.copy()
     out[VELOCITY] = out[:, VELOCITY] = 0.0
     out[VELOCITY, VELOCITY] = np.eye(2) * model.speed_mps**2
@@ -209,7 +192,7 @@ def velocity_forgotten(model: Model, covariance: Array) -> Array:
 
 
 def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
-    """The same; position and velocity are reset where that is less certain than the map."""
+    """Position and velocity are reset where the position is less certain than the map."""
     spread = expected.covariance[POSITION, POSITION]
     # The sum of both variances is no less than the larger one of its axes.
     if spread[0, 0] + spread[1, 1] <= area_m2 or np.linalg.eigvalsh(spread)[-1] <= area_m2:
@@ -218,5 +201,5 @@ def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
 
 
 def after_bias_jump(model: Model, expected: Expected) -> Expected:
-    """The same after a bias jump: heading, scale and tilt are reset."""
+    """Heading, scale and tilt are reset."""
     return expected.without(slice(4, 8), model.initial_bias(model.off_tilt_rad))

@@ -20,49 +20,35 @@ from orthonav.core.register.window import Reference
 from orthonav.core.track import CameraDisplacement
 
 VIEW_PX = 160
-"""Views are compared at about so many pixels across: odometry needs half the resolution of a fix.
-Like the other values here without a source of their own, chosen on the flights of
-docs/tracking.md."""
-LEVELS = 3
-"""Levels of a view that serves as the map of the next one."""
+"""Across: half that of a fix. Values without a source: by the flights of docs/tracking.md."""
+LEVELS = 3  # of a view that serves as the map of the next one
 TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
-"""Spacing of headings and log scales in the search, which is refined from a coarse level: about
-that of `policy.SearchPolicy`."""
-MAX_SPEED_MPS = 80.0
-"""Largest speed over ground for which a displacement is sought."""
+"""Of the search from a coarse level: about that of `policy.SearchPolicy`."""
+MAX_SPEED_MPS = 80.0  # for which a displacement is sought
 MIN_SCORE_RATIO = 2.5
-"""Least score of a displacement over that of its strongest rival: right ones have at least 4 on
-Arroio and generated landscapes, wrong ones at most 1.7."""
+"""Over the strongest rival: at least 4 for right ones, at most 1.7 for wrong ones."""
 MIN_CORRELATION = 0.4
-"""Least correlation: right ones have at least 0.56, wrong ones at most 0.11
-(docs/decisions/tracking.md)."""
+"""Right ones have at least 0.56, wrong ones at most 0.11 (docs/decisions/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
 """An expected displacement that fits this well ends the search (docs/decisions/tracking.md)."""
-NOISE_PX, NOISE_SHARE = 0.4, 0.01
-"""Standard deviation of a displacement per axis: in pixels, and as a share of its length."""
+NOISE_PX, NOISE_SHARE = 0.4, 0.01  # per axis: in pixels, and as a share of its length
 CANDIDATES = 8
-"""Candidates of the search."""
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
-"""Refinement of the expected displacement at each level: most steps, and the step that ends it."""
+"""Of the expected displacement at each level: most steps, and the step that ends it."""
 TILT_SHARE = 0.6
-"""Share of the error by an independent error of the tilt that remains in the sum of many
-displacements: the next displacement cancels most of it."""
+"""Left of an independent error of the tilt in a sum: the next displacement cancels most of it."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
-"""Changes of the biases of heading, log scale, pitch and roll up to which a view need not be
-rectified again. Heading has no limit: views are rectified with their heading up."""
-LEVER_STEP_DEG = 0.05
-"""Step of the numerical derivatives by pitch and roll."""
+"""Changes of heading, log scale, pitch, roll up to which a view is not rectified again."""
+LEVER_STEP_DEG = 0.05  # of numerical derivatives by pitch and roll
 UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
-"""Usual slope of ground whose slope is unknown, and the share of it that a terrain leaves."""
-LEAST_SCALED = 0.5
-"""Least height or distance over the one expected: the rest is an error."""
+"""Of ground without a known slope, and the share of it that a terrain leaves."""
+LEAST_SCALED = 0.5  # least height or distance over the one expected: the rest is an error
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
 
 
 def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
-    """Telemetry corrected by estimated biases (4,) of heading (rad), log scale, pitch and roll
-    (rad)."""
+    """By (4,) of heading (rad), log scale, pitch and roll (rad)."""
     yaw_deg, pitch_deg, roll_deg = np.degrees(bias[[0, 2, 3]]).tolist()
     return replace(
         telemetry,
@@ -74,8 +60,7 @@ def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
 
 
 def tilt_lever_m(telemetry: Telemetry) -> Array:
-    """Metres east and north (2, 2) by which a camera seems displaced per rad that its pitch and its
-    roll are more than reported: how far the ground on its optical axis moves."""
+    """Metres east and north (2, 2) per rad of pitch and roll: how the ground on the axis moves."""
     angles, columns = np.array([telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg]), []
     for axis in (1, 2):
         step = np.zeros(3)
@@ -90,42 +75,33 @@ def tilt_lever_m(telemetry: Telemetry) -> Array:
 
 
 class _ViewAsMap(Reference):
-    """One rectified view in the role of the map. Not to be shared between threads.
+    """One rectified view in the role of the map, with the channels of its templates, in one thread.
 
-    Its evidence is that of its templates, so that it is made once for both roles. They differ by a
-    factor for each kind of evidence, which changes no correlation.
-    """
+    They differ by a factor for each kind, which changes no correlation."""
 
     def __init__(self, templates: ViewTemplates) -> None:
         self._templates = templates
 
     @property
     def levels(self) -> int:
-        """Number of levels."""
         return LEVELS
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
         return self._templates.shape(level)
 
     def caches(self, level: int) -> bool:
-        """All levels are small."""
         return True
 
     def whole(self, level: int, recipe: ChannelRecipe = FINE) -> NDArray[np.float32]:
-        """Evidence (H, W, 4) of a level."""
         return self._templates.at(level, recipe).values
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryView:
-    """A view rectified for odometry, heading up.
+    """A view rectified for odometry, heading up, of `pixel_m`.
 
-    `templates`: the rectified view, of `pixel_m` metres a pixel. `camera_px` (2,): the camera seen
-    from its middle, x to the right and y down. `telemetry`: that of the view, corrected by `bias`
-    (4,) of heading (rad), log scale, pitch and roll (rad). `view`: what it was made of, averaged
-    towards `pixel_m`.
-    """
+    `camera_px` (2,): the camera from its middle, right and down. `telemetry`: corrected by `bias`
+    (4,) of heading (rad), log scale, pitch and roll (rad). `view`: averaged towards `pixel_m`."""
 
     templates: ViewTemplates
     pixel_m: float
@@ -136,18 +112,16 @@ class OdometryView:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
         return self.templates.shape(0)
 
     @property
     def middle_px(self) -> tuple[float, float]:
-        """Middle of the view, x and y."""
         rows, cols = self.shape
         return cols / 2, rows / 2
 
     @property
     def en_from_px(self) -> Array:
-        """Matrix (2, 2) from pixels (x, y) to metres east and north, by the reported telemetry."""
+        """(2, 2) from x, y to metres east and north, by the reported telemetry."""
         heading = math.radians(self.view.telemetry.yaw_deg)
         cos, sin = math.cos(heading), math.sin(heading)
         metres = self.pixel_m * math.exp(-self.bias[1])
@@ -155,17 +129,12 @@ class OdometryView:
 
     @property
     def ahead_en_m(self) -> Array:
-        """Middle of the view (2,), metres east and north of the camera, by the same."""
+        """Middle of the view (2,) from the camera, by the same."""
         return np.asarray(self.en_from_px @ -self.camera_px)
 
     @classmethod
-    def of(
-        cls,
-        view: View,
-        pixel_m: float | None,
-        bias: Array = NO_BIAS,
-    ) -> "OdometryView | None":
-        """A view for odometry, None where it shows too little."""
+    def of(cls, view: View, pixel_m: float | None, bias: Array = NO_BIAS) -> "OdometryView | None":
+        """None where it shows too little."""
         camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
         pixel_m = pixel_m or side_m / VIEW_PX
@@ -185,11 +154,8 @@ class OdometryView:
         )
 
     def corrected(self, bias: Array) -> "OdometryView | None":
-        """The same view with the present estimate of the biases.
-
-        Both views of a displacement need the same estimate: otherwise what was learnt between
-        them, a tilt most of all, would appear as motion (docs/decisions/tracking.md).
-        """
+        """With the present biases: what was learnt between two views would else appear as motion
+        (docs/decisions/tracking.md)."""
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
             return OdometryView.of(self.view, self.pixel_m, bias)
         # Rectified with its heading up, so only the heading may change without rectifying again.
@@ -199,7 +165,7 @@ class OdometryView:
 
 @dataclass(frozen=True, eq=False)
 class ViewDisplacement:
-    """A displacement, and the `overlap`: share of the later view that the earlier one shows too."""
+    """`overlap`: share of the later view that the earlier one shows too."""
 
     displacement: CameraDisplacement
     overlap: float
@@ -212,14 +178,11 @@ def displacement(
     telemetry_noise: Array,
     expected_en_m: Array | None = None,
 ) -> ViewDisplacement | None:
-    """The displacement from one view to the next, both with the same `pixel_m`.
+    """From one view to the next, of the same `pixel_m`; None without enough common ground.
 
-    None where they do not show enough common ground. The displacement is rotated and scaled by the
-    telemetry reported with the view before. `tilt_noise_rad`: standard deviation of the error of a
-    reported tilt that is independent at every view. `telemetry_noise` (3,): variances of reported
-    heading (rad) and log scale between views; the third is not used. `expected_en_m` (2,) is tried
-    first: where it fits it saves the search, elsewhere it changes nothing.
-    """
+    Rotated and scaled by the telemetry reported with the view before. `tilt_noise_rad`: of a
+    reported tilt, independent at every view. `telemetry_noise` (3,): variances of heading (rad),
+    log scale. `expected_en_m` (2,): tried first, which saves the search where it fits."""
     reported_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
     if not math.isfinite(reported_turn):
         return None
@@ -252,11 +215,8 @@ def displacement(
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Ground that is not level.
-
-    `below`, `seen` (2,): its rise per metre east and north below the camera, and at the middle of
-    what both views show. `rise`: of the ground there over that below, as a share of the height.
-    """
+    """Ground that is not level: rise (2,) per metre below the camera and where both views look;
+    `rise`: of the ground there over that below, as a share of the height."""
 
     below: Array
     seen: Array
@@ -274,15 +234,13 @@ def over_terrain(
 ) -> ViewDisplacement:
     """A displacement over ground that is not level.
 
-    `agl_m`: heights reported with both views. `terrain`: None where it is unknown. `ahead_en_m`
-    (2,): middle of a view, from the camera.
+    `agl_m`: reported with both views. `terrain`: None: unknown. `ahead_en_m` (2,): middle of a
+    view.
 
-    The measurement assumes level ground. A slope along the displacement looks like a change of
-    scale, one across it like a turn, each by half, about the middle of the views: this parallax
-    displaces the camera, which is not there. The displacement is seen at the distance of the ground
-    there, and the height above the ground below changes by what this rises
-    (docs/decisions/terrain.md).
-    """
+    A slope along the displacement looks like a change of scale, one across it like a turn, each by
+    half, about the middle of the views: this parallax displaces the camera. The displacement is
+    seen at the distance of the ground there, and the height changes by what this rises
+    (docs/decisions/terrain.md)."""
     seen, ground = measured.displacement, terrain or LEVEL
     steep = max(1 + float(ground.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
     share_en = seen.moved_en_m / (agl_m[0] * steep)
@@ -314,7 +272,7 @@ def over_terrain(
 def _registered(
     before: OdometryView, now: OdometryView, prior: PosePrior, expected_en_m: Array | None
 ) -> Fit | None:
-    """The later view registered on the earlier one; None where no place stands out."""
+    """None where no place stands out."""
     templates, reference = now.templates, _ViewAsMap(before.templates)
     side_px = math.sqrt(float(templates.valid.sum()))
     placer = Placer(templates, Levels.of(side_px, LEVELS), prior, reference)
@@ -346,7 +304,7 @@ def _registered(
 def _as_expected(
     before: OdometryView, now: OdometryView, placer: Placer, expected_en_m: Array
 ) -> Fit:
-    """The later view refined from its expected place, from coarse to fine."""
+    """From its expected place, from coarse to fine."""
     turned = Pose(0.0, 0.0, placer.prior.turn_rad or 0.0, 0.0)
     moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)

@@ -1,8 +1,7 @@
 """Smoothing: the state at each view of a flight, given all views before and after it.
 
-The surviving hypotheses are followed back through their parents, with the fixed-interval smoother
-of Rauch, Tung and Striebel (1965). Where a track was born again, smoothing begins again.
-"""
+Hypotheses are followed back through their parents (Rauch, Tung and Striebel 1965); where a track
+was born again, smoothing begins again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +9,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthonav.core.track.hypotheses import Hypothesis
-from orthonav.core.track.mixture import Mixture
+from orthonav.core.track.mixture import Hypothesis, Mixture
 from orthonav.core.track.model import STATE, Array
 from orthonav.core.track.motion import Expected
 
 SIZES = [STATE, STATE**2] * 3 + [STATE**2]
-"""Numbers of a state, of its prediction and of the state before, and of their covariance."""
+"""Of a state, its prediction, the state before, and their covariance."""
 STARTS = np.cumsum(SIZES)[:-1]
 ROWS_OF_BLOCK = 256
-"""0.6 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A smoothed state: `mean` (10,), `covariance` (10, 10), and `belief` in its track."""
+    """A state (10,), (10, 10), and the `belief` in its track."""
 
     mean: Array
     covariance: Array
@@ -32,9 +29,6 @@ class Smoothed:
 
 
 class _Kept(NamedTuple):
-    """What is needed of a hypothesis: its parent and probability, its numbers in `_Rows`, and
-    whether these include a prediction."""
-
     parent: int
     share: float
     row: int
@@ -42,18 +36,13 @@ class _Kept(NamedTuple):
 
 
 class _Rows:
-    """Rows of numbers in large blocks of memory.
-
-    The arrays of hypotheses, kept between the larger ones of a view, would hold on to the memory
-    around them: four times as much as they need.
-    """
+    """Rows of numbers in large blocks: single arrays would hold on to four times the memory."""
 
     def __init__(self) -> None:
         self._blocks: list[Array] = []
         self._free: list[int] = []
 
     def add(self, parts: Sequence[Array]) -> int:
-        """Store arrays one after the other; the number of their row."""
         if not self._free:
             first = ROWS_OF_BLOCK * len(self._blocks)
             self._blocks.append(np.empty((ROWS_OF_BLOCK, sum(SIZES))))
@@ -64,16 +53,13 @@ class _Rows:
         return number
 
     def remove(self, number: int) -> None:
-        """Make room for another row."""
         self._free.append(number)
 
     def state(self, number: int) -> tuple[Array, Array]:
-        """Mean (10,) and covariance (10, 10), the first two parts of a row."""
         mean, covariance, *_ = np.split(self._row(number), STARTS)
         return mean.copy(), covariance.reshape(STATE, STATE).copy()
 
     def expected(self, number: int) -> Expected:
-        """The prediction, the other parts of a row."""
         _, _, mean, covariance, mean_before, covariance_before, cross = (
             part if part.size == STATE else part.reshape(STATE, STATE)
             for part in np.split(self._row(number), STARTS)
@@ -93,7 +79,6 @@ class History:
         self._rows = _Rows()
 
     def record(self, mixture: Mixture) -> None:
-        """Record the hypotheses after a view."""
         self._views.append({each.number: self._kept(each) for each in mixture.hypotheses})
         self._forget()
 
@@ -105,7 +90,7 @@ class History:
         return _Kept(each.parent, each.share, self._rows.add(parts), expected is not None)
 
     def _forget(self) -> None:
-        """Drop hypotheses without successors, except the most likely one of each view."""
+        """Without successors, except the most likely one of each view."""
         for at in range(len(self._views) - 1, 0, -1):
             parents = {each.parent for each in self._views[at].values()}
             view = self._views[at - 1]
@@ -117,7 +102,7 @@ class History:
                 self._rows.remove(view.pop(number).row)
 
     def smoothed(self, last: int | None = None) -> list[Smoothed | None]:
-        """Smoothed states of all views, or of the `last` ones; None where none exists even then."""
+        """Of all views, or the `last` ones; None where none exists even then."""
         out: list[Smoothed | None] = []
         after: _Kept | None = None
         later: Smoothed | None = None
@@ -136,12 +121,10 @@ class History:
 
 
 def _likeliest(view: dict[int, _Kept]) -> int:
-    """Number of the most likely hypothesis of a view."""
     return max(view, key=lambda number: view[number].share)
 
 
 def _one_back(expected: Expected, later: Smoothed) -> Smoothed:
-    """One step of the Rauch-Tung-Striebel smoother (AIAA Journal, 1965)."""
     gain = expected.cross @ np.linalg.pinv(expected.covariance)
     mean = expected.mean_before + gain @ (later.mean - expected.mean)
     covariance = expected.covariance_before

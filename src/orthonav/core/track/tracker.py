@@ -1,8 +1,7 @@
 """From the views of a flight to one track: registration measures, the mixture decides.
 
-Every view is registered around the predicted position, or anywhere on the map while that is not
-known; all its plausible places go to the mixture with their odds. Views that overlap are registered
-on each other too, which is odometry by the camera (`odometry`).
+Every view is registered around the predicted position, or anywhere while that is unknown; all
+plausible places go to the mixture with their odds. Overlapping views are registered on each other.
 """
 
 import math
@@ -60,54 +59,35 @@ from orthonav.core.track.odometry import (
 )
 from orthonav.core.track.smooth import History, Smoothed
 
-LOCAL_SHARE = 0.75
-"""Belief in one place from which on views are searched around it only. Like the other values here
-without a source of their own, chosen on the flights of docs/tracking.md."""
-LOCAL_SIGMAS = 4.0
-"""Half width of that search, in standard deviations of the predicted position."""
-MIN_LOCAL_M = 30.0
-"""Least half width of that search."""
+LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
+LOCAL_SIGMAS = 4.0  # half width of that search,
+MIN_LOCAL_M = 30.0  # and its least
 LEAST_NEW = 0.15
-"""Least share of a view that counts as new evidence, however much it overlaps the view before:
-noise, light and tilt differ (docs/decisions/tracking.md)."""
-LIKELY_NATS = 5.0
-"""Places so much less likely than the best one are not examined for their tilt."""
-UNSEEN_TILT_RAD = math.radians(20.0)
-"""Standard deviation of a tilt that a view does not show."""
-LEAST_TILT_STD_DEG = 0.1
-"""Least deviation of the tilt that a track expects of a view."""
+"""Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
+LIKELY_NATS = 5.0  # places so much less likely than the best one are not examined for their tilt
+UNSEEN_TILT_RAD = math.radians(20.0)  # standard deviation of a tilt that a view does not show
+LEAST_TILT_STD_DEG = 0.1  # least that a track expects of a view
 UNAIDED_STD_MPS, UNAIDED_S = 3.0, 15.0
-"""The error of a reported velocity with at least this deviation changes within so many seconds:
-that of an autopilot which nothing aids."""
-LEARNT_S = 10.0
-"""Time over which the error of a reported velocity is learnt from odometry, s."""
+"""A reported velocity with at least this deviation errs for so long: an autopilot without aids."""
+LEARNT_S = 10.0  # over which the error of a reported velocity is learnt from odometry
 LONGEST_GAP_S = 600.0
-"""Longer gaps between views are predicted as if they had this length: by then the position is
-known to no more than the map."""
-UNKNOWN_STEP_S = 1.0
-"""Time step where the clock stands still or jumps back."""
-NEAR_SHARE = 0.05
-"""Places closer to each other than this share of the side of a view are one place."""
-KNOWN_MPS = 5.0
-"""An estimated velocity with less uncertainty than this predicts the next displacement."""
-KNOWN_PLACE_M = 50.0
-"""The ground below and ahead is known where the position is known better than this."""
-SIGHT_STEPS = 4
-"""Steps along the line of sight to the ground that a view shows. Each leaves a share of the error:
-the slope of the ground over that of the line."""
+"""As which longer gaps are predicted: the position is then known to no more than the map."""
+UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
+NEAR_SHARE = 0.05  # of the side of a view: closer places are one
+KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
+KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
+SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a share of the error
 Array = NDArray[np.float64]
 
 
 class SearchArea(NamedTuple):
-    """The part of the map that is searched: a `circle` (middle (2,), radius in metres), None for
-    all of it; and whether a place found there `confirms` the track."""
+    """`circle`: middle (2,) and radius in metres, None: all; `confirms`: places found there do."""
 
     circle: tuple[Array, float] | None
     confirms: bool
 
     @property
     def area_m2(self) -> float:
-        """Its area, infinite for all of the map."""
         return math.inf if self.circle is None else math.pi * self.circle[1] ** 2
 
 
@@ -128,16 +108,13 @@ class Tracker:
         smooth: bool = False,
         lag: int | None = None,
     ) -> None:
-        """Begin a track on the map of a localizer, or on an opened map.
+        """`model`: None: the usual one, with a mount as good as the height asks for.
 
-        `model`: None for the usual one, with a mount as good as the height of the flight asks for.
-        With `use_prior` the track starts at the first view's prior; with `every_prior` the priors
-        of all views are position measurements, such as GNSS. With `smooth` the history that
-        `smoothed_track` needs is recorded: each view is smoothed over all of them, or, with `lag`,
-        over those before it and so many after it.
+        With `use_prior` the track starts at the first view's prior; with `every_prior` all priors
+        are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`;
+        with `lag` each view is smoothed over those before it and so many after it.
 
-        Raises `MapFileError` where the map has no registration layer or no confidence.
-        """
+        Raises `MapFileError` where the map has no registration layer or no confidence."""
         if isinstance(localizer, MapFile):
             localizer = Localizer(localizer)
         self._heading_known = heading_known
@@ -159,7 +136,7 @@ class Tracker:
         self.state = State.SEARCHING
 
     def _use(self, localizer: Localizer) -> tuple[float, float, float, float]:
-        """Use the map of a localizer: its extent (west, south, east, north) in metres."""
+        """Extent (west, south, east, north) in metres."""
         registration = localizer.registration
         if registration is None or registration.confidence is None:
             raise MapFileError("a track needs a map with a registration layer and its confidence")
@@ -170,8 +147,7 @@ class Tracker:
     def continue_on(self, localizer: Localizer) -> None:
         """Continue the track between two views on another map, which shows the aircraft too.
 
-        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor.
-        """
+        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor."""
         frame = self._localizer.sheet.frame
         self.mixture.move(frame, localizer.sheet.frame, self._use(localizer))
 
@@ -179,8 +155,7 @@ class Tracker:
         """The position of the aircraft, by this view and all before it.
 
         A view that shows nothing is bridged by dead reckoning. Raises `CameraError` if the camera
-        has another size than the picture.
-        """
+        has another size than the picture."""
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
         if self._usual_scale:
             self._usual_scale = False
@@ -211,8 +186,7 @@ class Tracker:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
         `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
-        reported velocity over ground. Raises as `View.of`.
-        """
+        reported velocity over ground. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
@@ -261,10 +235,8 @@ class Tracker:
     def _smoothed_fix(
         self, smoothed: Smoothed | None, filtered: tuple[Fix | NoFix, Telemetry]
     ) -> Fix | NoFix:
-        """The smoothed position of a view; the filtered one where smoothing makes it less certain.
-
-        That happens where the most likely track passes over a view that is far from its neighbours.
-        """
+        """The filtered one where smoothing makes it less certain, as where the most likely track
+        passes over a view far from its neighbours."""
         before, telemetry = filtered
         if smoothed is None:
             return NoFix("searching", "no position was found")
@@ -276,13 +248,11 @@ class Tracker:
         return self._fix(smoothed.mean, smoothed.covariance, belief, telemetry, {})
 
     def _radius_m(self, telemetry: Telemetry) -> float:
-        """The error that a confidence is about, m."""
         high = RADIUS_SHARE * telemetry.agl_m
         least = self._registration.radius_m
         return max(least, high) if math.isfinite(high) else least
 
     def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
-        """The estimate of the mixture as a fix, recorded for smoothing."""
         estimate = self.mixture.estimate(self._radius_m(telemetry))
         self.state = State.SEARCHING if estimate is None else estimate.state
         outcome: Fix | NoFix = refused or NoFix("searching", "no position has been found yet")
@@ -305,7 +275,7 @@ class Tracker:
         return outcome
 
     def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
-        """The heading under which this view was registered at a fix; NaN where it was not."""
+        """NaN where the view was not registered at the fix."""
         off_m, turn_rad = min(
             ((float(np.hypot(*(each.mean[:2] - mean[:2]))), each.mean[2]) for each in self._seen),
             default=(math.inf, math.nan),
@@ -313,11 +283,7 @@ class Tracker:
         return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
 
     def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
-        """Propagate the track to the time of this view.
-
-        Its measured overlap with the view before, 0..1, and the share of it that the view before
-        cannot have shown, 0..1.
-        """
+        """Overlap with the view before, and the share that this cannot have shown, 0..1."""
         before, now = self._before, None
         self._predicted = telemetry
         if view is not None and self._heading_known:
@@ -357,7 +323,7 @@ class Tracker:
         return 0.0, 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
-        """Share of a view that is new, by the expected displacement or the largest usual speed."""
+        """By the expected displacement or the largest usual speed."""
         moved_m = self.model.speed_mps * seconds
         if expected is not None:
             moved_m = float(np.hypot(*expected))
@@ -365,13 +331,11 @@ class Tracker:
         return min(moved_m / side_m, 1.0) if side_m > 0 else 1.0
 
     def _position_of(self, prior: Prior) -> tuple[Array, float]:
-        """Metres east and north (2,) of a prior, and its standard deviation."""
         frame = self._localizer.sheet.frame
         return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
 
     def _telemetry_noise(self, telemetry: Telemetry) -> Array:
-        """Variances (3,) of reported heading (rad) and log scale between views and of the horizon
-        (rad), or the usual."""
+        """Variances (3,) of heading (rad) and log scale between views and of the horizon (rad)."""
         noise = self.model.telemetry_noise.copy()
         if telemetry.yaw_std_deg is not None:
             noise[0] = math.radians(telemetry.yaw_std_deg) ** 2
@@ -382,7 +346,7 @@ class Tracker:
     def _odometry_view(
         self, view: View, before: OdometryView | None, bias: Array
     ) -> OdometryView | None:
-        """The view for odometry, in pixels of the one before unless they differ too much."""
+        """In pixels of the one before unless they differ too much."""
         if before is not None:
             made = OdometryView.of(view, before.pixel_m, bias)
             if made is None or math.prod(made.shape) < 4 * math.prod(before.shape):
@@ -390,7 +354,7 @@ class Tracker:
         return OdometryView.of(view, None, bias)
 
     def _reported_velocity(self, telemetry: Telemetry) -> ReportedVelocity | None:
-        """The reported velocity together with that of the view before, None where none is given."""
+        """None where none is given."""
         before, reported = self._velocity, telemetry.vel_en_mps
         self._velocity = None
         if reported is None or not np.isfinite(reported).all():
@@ -405,8 +369,7 @@ class Tracker:
     def _learn_velocity(
         self, velocity: ReportedVelocity | None, moved: CameraDisplacement, seconds: float
     ) -> None:
-        """Learn the variance of the reported velocity from odometry, less that of odometry itself:
-        a horizon that changes looks like motion."""
+        """Its variance, less that of odometry itself: a horizon that changes looks like motion."""
         if velocity is None or seconds > LEARNT_S:
             return
         bias, _ = self.mixture.bias()
@@ -424,7 +387,7 @@ class Tracker:
     def _expected_displacement(
         self, seconds: float, velocity: ReportedVelocity | None
     ) -> Array | None:
-        """Metres east and north (2,) by the reported or estimated velocity; None without one."""
+        """(2,) by the reported or estimated velocity; None without one."""
         if velocity is not None:
             return velocity.now_en_mps * seconds
         best = self.mixture.likeliest
@@ -439,7 +402,7 @@ class Tracker:
         telemetry_noise: Array,
         expected_en_m: Array | None,
     ) -> ViewDisplacement | None:
-        """The displacement since the last view by the camera, None where it cannot be measured."""
+        """None where it cannot be measured."""
         if before is None or now is None or before.pixel_m != now.pixel_m:
             return None
         white = WHITE_SHARE * math.sqrt(telemetry_noise[2])
@@ -454,8 +417,7 @@ class Tracker:
         return over_terrain(made, heights_m, terrain, ahead_en_m)
 
     def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
-        """The ground below, and that which a camera sees `ahead_en_m` (2,) of it on level ground
-        by the reported heading and height `agl_m`; None where it is unknown."""
+        """None where unknown. `ahead_en_m` (2,): as reported, on level ground."""
         best = self.mixture.likeliest
         if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
             return None
@@ -472,7 +434,7 @@ class Tracker:
         return Terrain(slopes[0], slopes[1], rise)
 
     def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
-        """Register the view and update the mixture; a `NoFix` where it shows too little."""
+        """`NoFix` where the view shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         if expected is not None and expected.followed and self._must_compete(expected):
@@ -508,8 +470,7 @@ class Tracker:
         return None
 
     def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
-        """Corrected telemetry, its height above the ground where the aircraft is expected: what it
-        was corrected by includes the error of the ground that was assumed before."""
+        """The correction includes the error of the ground assumed before."""
         relief = self._registration.relief
         height_m = float(relief.terrain.at_en_m(place_en_m))
         if relief.is_level or not math.isfinite(height_m):
@@ -519,11 +480,9 @@ class Tracker:
     def _correction(
         self, telemetry: Telemetry, expected: Estimate | None, prior: Prior | None
     ) -> tuple[Array, Array]:
-        """Mean (4,) and covariance (4, 4) of the biases by which telemetry is corrected.
+        """Mean (4,) and covariance (4, 4) of the track's biases, in its surroundings.
 
-        Those of the track in its surroundings. A search of the whole map has to find any place at
-        its own heading and height.
-        """
+        A search of the whole map has to find any place at its own heading and height."""
         if expected is None or prior is None:
             variances = self.model.initial_bias()
             variances += self._telemetry_noise(telemetry)[[0, 1, 2, 2]]
@@ -533,16 +492,13 @@ class Tracker:
     def _must_compete(self, expected: Estimate) -> bool:
         """Whether places near the track have to compete with the whole map to confirm it.
 
-        Not while a reported start is likely.
-        """
+        Not while a reported start is likely."""
         if expected.state is State.SEARCHING:
             return expected.belief < LOCAL_SHARE
         return not (expected.state.is_followed and expected.confirmed)
 
     def _search_area(self, expected: Estimate | None, *, whole_map: bool) -> SearchArea:
-        """The part of the map to search: the surroundings of the predicted position where that is
-        nearly certain, else all of it. `whole_map`: what to search where places there have to
-        compete with the whole map."""
+        """Around a nearly certain position, else all. `whole_map`: places there have to compete."""
         if expected is None or not expected.followed:
             return WHOLE_MAP  # an unconfirmed place must compete with the whole map
         competes = self._must_compete(expected)
@@ -558,7 +514,6 @@ class Tracker:
         return SearchArea((expected.mean[:2], reach_m), exact or not competes)
 
     def _prior(self, area: SearchArea) -> Prior | None:
-        """An area as the prior of a search."""
         if area.circle is None:
             return None
         middle, reach_m = area.circle
@@ -573,11 +528,7 @@ class Tracker:
         log_scale: float,
         searched_share: float,
     ) -> list[Sighting]:
-        """The places where the view may have been taken.
-
-        `telemetry`: corrected by the track; `log_scale`: what its height was corrected by.
-        `searched_share`: share of the map that was searched.
-        """
+        """`telemetry`: corrected, its height by `log_scale`. `searched_share`: of the map."""
         near_px = NEAR_SHARE * search.view.side_px
         places = places_of(best, self._confidence, near_px, searched_share)
         made = []
@@ -596,7 +547,7 @@ class Tracker:
     def _by_camera(
         self, prepared: PreparedView, camera: CameraFound, telemetry: Telemetry
     ) -> tuple[Array, Array]:
-        """Mean (6,) and covariance (6, 6) of a sighting by the view alone."""
+        """Mean (6,) and covariance (6, 6) by the view alone."""
         rad, agl_m = math.pi / 180, camera.agl_m
         east, north, up_m = camera.alone.position_m.tolist()
         heading, pitch, roll = np.radians(camera.alone.attitude_deg).tolist()
@@ -636,7 +587,7 @@ class Tracker:
         telemetry: Telemetry,
         more: dict[str, float],
     ) -> Fix:
-        """A state (10,) and its covariance (10, 10) as a fix; `more` goes into its evidence."""
+        """Of a state (10,), (10, 10); `more` goes into its evidence."""
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
@@ -668,7 +619,6 @@ class Tracker:
 
 
 def _bias_stds(covariance: Array) -> dict[str, float]:
-    """Standard deviations of the estimated biases of heading, scale, pitch and roll."""
     std = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0))
     names = (
         "heading_bias_std_deg",
@@ -681,7 +631,7 @@ def _bias_stds(covariance: Array) -> dict[str, float]:
 
 
 def _known(corrected: Telemetry, spread: Array) -> Telemetry:
-    """Corrected telemetry with the uncertainty (4, 4) of the correction: it bounds the search."""
+    """With the uncertainty (4, 4) of the correction: it bounds the search."""
     heading, scale, pitch, roll = np.sqrt(np.diag(spread)).tolist()
     return replace(
         corrected,

@@ -48,7 +48,7 @@ from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.mapfile.writer import write_map
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.gradients import OrientedGradients
+from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import variant_from_recipe
 from orthonav.ground.atlas.catalog import Atlas

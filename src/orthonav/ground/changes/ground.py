@@ -38,7 +38,6 @@ TILT_DEG = 5.0
 AGL_STD, YAW_STD_DEG = 0.03, 2.0
 """Standard deviations of the height (a share of it) and heading of a fix."""
 _GREY, _VALID = 2, 3
-"""Channels of the evidence."""
 
 Array = NDArray[np.float64]
 
@@ -57,7 +56,6 @@ class SeenCells:
 
 
 def cell_side_m(flights: Sequence[tuple[Camera, Sequence[ViewResult]]]) -> float | None:
-    """Side of the cells for these flights, by the median view; None without a confident fix."""
     sides = [
         result.outcome.agl_m * math.sqrt(math.prod(camera.extent))
         for camera, results in flights
@@ -74,11 +72,8 @@ def views_beside_map(
     results: Sequence[ViewResult],
     progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[SeenCells]:
-    """The confident views of a flight beside the map, those left out that hardly moved.
-
-    Pictures that cannot be decoded are left out. Raises `CameraError` where one has not the
-    camera's size.
-    """
+    """The confident views of a flight beside the map, without those that hardly moved or cannot be
+    decoded. Raises `CameraError` where one has not the camera's size."""
     confident: Mapping[str, Fix] = {
         result.frame: result.outcome
         for result in results
@@ -108,7 +103,6 @@ def views_beside_map(
 def beside_map(
     registration: RegistrationLocalizer, grid: ChangeGrid, view: View, fix: Fix
 ) -> SeenCells | None:
-    """A view beside the map where its fix puts it; None where it cannot be compared there."""
     pitch_deg, roll_deg = fix.tilt_deg(view.telemetry)
     telemetry = replace(
         view.telemetry,
@@ -211,7 +205,6 @@ def _cell_numbers(
 TONE_WEIGHT, STRUCTURE_WEIGHT, BIAS = 2.0, 2.0, 3.0
 """Logit of a score: weights of the logarithm of 1 + the tone's deviation and of the correlation."""
 CHANGED_SCORE = 0.5
-"""Cells count as changed from this score on."""
 SEVERAL_VIEWS = 2
 """With fewer views both kinds of evidence must say that a cell changed."""
 LONE_STRUCTURE, LONE_TONE = 0.15, 3.0
@@ -241,7 +234,6 @@ class _Tone:
 def changed_ground(
     views: Sequence[SeenCells], grid: ChangeGrid, *, map_name: str = "", map_sha256: str = ""
 ) -> ChangedGround:
-    """Scores of all cells of `grid` by these views of one or several flights over one map."""
     count = grid.rows * grid.cols
     shown = np.zeros(count, np.int32)
     score, structure, tone = (np.full(count, np.nan) for _ in range(3))

@@ -20,11 +20,9 @@ from orthonav.core.mapfile.manifest import SheetInfo
 
 FORMAT, VERSION = "orthonav-changes", 1
 MAX_CELLS = 1_000_000
-"""Limit of the cells of a grid, and of the features of a file."""
 MAX_BYTES = 400_000_000
 """Limit of a file: about 350 bytes for each of so many cells."""
 _CORNERS = np.array([(0, 0), (0, 1), (1, 1), (1, 0), (0, 0)])
-"""Ring of a cell as (column, row), counter-clockwise."""
 
 Array = NDArray[np.float64]
 
@@ -41,7 +39,6 @@ class CellGrid:
 
     @classmethod
     def over(cls, extent: tuple[float, float, float, float], side_m: float) -> "CellGrid":
-        """Cells over an extent (west, south, east, north)."""
         west, south, east, north = extent
         rows, cols = (max(1, math.ceil(d / side_m - 1e-9)) for d in (north - south, east - west))
         return cls(west, north, side_m, rows, cols)
@@ -54,7 +51,6 @@ class CellGrid:
         return np.stack(np.meshgrid(east, north), axis=-1).reshape(-1, 2)
 
     def drawn(self, rng: np.random.Generator) -> Array:
-        """A random point in every cell (rows * cols, 2)."""
         off = rng.uniform(-0.5, 0.5, (self.rows * self.cols, 2)) * self.side_m
         return np.asarray(self.centres_en_m + off)
 
@@ -70,7 +66,6 @@ class CellGrid:
         return np.where(inside, rows * width + cols, -1)
 
     def counts(self, points_en_m: Array) -> NDArray[np.int32]:
-        """Number (rows, cols) of points (N, 2) in each cell."""
         found = np.bincount(self.numbers(points_en_m) + 1, minlength=self.rows * self.cols + 1)
         return found[1:].astype(np.int32).reshape(self.rows, self.cols)
 
@@ -82,8 +77,6 @@ class CellGrid:
 
 @dataclass(frozen=True)
 class ChangeGrid(CellGrid):
-    """Cells in the plane `frame`. Raises `FlightError` for sizes that cannot be."""
-
     frame: LocalFrame
 
     def __post_init__(self) -> None:
@@ -97,7 +90,6 @@ class ChangeGrid(CellGrid):
 
     @classmethod
     def of_sheet(cls, sheet: SheetInfo, side_m: float) -> "ChangeGrid":
-        """Cells over a sheet of a map, of a side or as small as `MAX_CELLS` allows."""
         west, south, east, north = extent = sheet.grid.extent_en_m
         least_m = math.sqrt((east - west) * (north - south) / (0.9 * MAX_CELLS))
         return cls(**vars(CellGrid.over(extent, max(side_m, least_m))), frame=sheet.frame)
@@ -117,8 +109,6 @@ class ChangedGround:
 
     `score`: 0 to 1, larger where view and map disagree; NaN where no view was compared.
     `views`: number of views that showed the cell.
-    `changed`: whether the cell counts as changed.
-    `map_name`, `map_sha256`: the map; the digest is that of its manifest.
     """
 
     grid: ChangeGrid
@@ -130,12 +120,10 @@ class ChangedGround:
 
     @property
     def seen_m2(self) -> float:
-        """Area that was compared."""
         return float((self.views > 0).sum()) * self.grid.side_m**2
 
     @property
     def changed_m2(self) -> float:
-        """Area that changed."""
         return float(self.changed.sum()) * self.grid.side_m**2
 
     def covers(self, points_en_m: Array, frame: LocalFrame) -> NDArray[np.bool_]:
@@ -146,7 +134,6 @@ class ChangedGround:
         return np.asarray((numbers >= 0) & self.changed.ravel()[numbers])
 
     def text(self) -> str:
-        """A sentence for people."""
         if not self.seen_m2:
             return "no view could be compared with the map"
         return (

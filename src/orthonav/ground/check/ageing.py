@@ -35,11 +35,7 @@ MODEL = "persistence.json"
 
 @dataclass(frozen=True, eq=False)
 class PersistenceModel:
-    """Ridge regression on all products of two features.
-
-    `mean`, `spread` (F,): mean and standard deviation of the features over the training data.
-    `weights` (T,): weights of the `terms` of the standardized features.
-    """
+    """Ridge regression on all products of two of F standardized features; `weights` (T,)."""
 
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
@@ -51,13 +47,11 @@ class PersistenceModel:
         return np.asarray(np.clip(predicted, MIN_PERSISTENCE, MAX_PERSISTENCE), dtype=np.float32)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for a JSON file."""
         return {name: [float(f"{x:.6g}") for x in value] for name, value in vars(self).items()}
 
 
 @cache
 def default_model() -> PersistenceModel:
-    """The model that is installed with the package."""
     text = resources.files(__package__).joinpath(MODEL).read_text(encoding="utf-8")
     return PersistenceModel(
         **{name: np.array(values, np.float64) for name, values in json.loads(text)["model"].items()}
@@ -214,7 +208,6 @@ def _uniform(rng: np.random.Generator, size: int, cells: int) -> Array:
 
 
 def _normal(rng: np.random.Generator, size: int, cells: int) -> Array:
-    """A smooth random field (S, S) around 0."""
     return _enlarged(rng.standard_normal((cells, cells)), size)
 
 

@@ -48,7 +48,6 @@ class Recalibration:
         return np.asarray(np.clip(expit(self.slope * logit(share) + added), LEAST, MOST))
 
     def other_sensor(self) -> "Recalibration":
-        """For views of another sensor than the map's: a drone over satellite imagery, say."""
         std = math.hypot(self.std, OTHER_SENSOR_STD)
         return replace(self, shift=self.shift + OTHER_SENSOR_SHIFT, std=std)
 
@@ -60,7 +59,6 @@ def logit(share: Array) -> Array:
 
 
 def expit(value: Array) -> Array:
-    """The inverse of `logit`."""
     return np.asarray(1 / (1 + np.exp(-value)))
 
 
@@ -108,8 +106,6 @@ class Prediction:
 
 
 class Predictor:
-    """Interpolates the outcomes of trials."""
-
     def __init__(
         self,
         trials: "Sequence[Trial]",
@@ -161,7 +157,6 @@ class Predictor:
         return expit(bias + regressors @ slopes)
 
     def at(self, points_en_m: Array) -> Prediction:
-        """Predictions at places (N, 2)."""
         chunk = max(1, _PAIRS_AT_ONCE // max(len(self._points), 1))
         starts = range(0, max(len(points_en_m), 1), chunk)
         parts = [vars(self._part(points_en_m[start : start + chunk])) for start in starts]

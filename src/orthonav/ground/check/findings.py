@@ -1,8 +1,12 @@
-"""Tolerated errors of heading and height, and the best height to fly at."""
+"""What trials and predictions say: tolerated errors, heights, gaps, ambiguous places; the verdict.
+
+docs/check.md lists the rules of the verdict.
+"""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +20,9 @@ from orthonav.ground.check.outcome import (
     Conditions,
     Envelope,
     Lookalike,
+    Reason,
+    Verdict,
+    Word,
 )
 from orthonav.ground.check.trials import Trial, TrialPlan, Work
 from orthonav.ground.planning.area import Area
@@ -32,7 +39,6 @@ HEIGHTS = (0.5, 0.7, 1.4, 2.0)
 
 
 def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
-    """Trials at the same places for every error of heading and height."""
     return [
         (replace(plan, yaw_off_deg=yaw, agl_off=agl), places_en_m)
         for yaw in YAW_OFF_DEG
@@ -41,7 +47,6 @@ def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
 
 
 def envelope_of(trials: Sequence[Sequence[Trial]]) -> Envelope:
-    """The envelope from the trials of `envelope_work`."""
     shares = [right_share(each) for each in trials]
     share = np.array(shares, np.float64).reshape(len(YAW_OFF_DEG), len(AGL_OFF))
     middle = AGL_OFF.index(0.0)
@@ -58,14 +63,12 @@ def _last_without_gap(tolerated: NDArray[np.bool_]) -> int:
 
 
 def heights_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
-    """Trials at the same places from other heights."""
     return [(replace(plan, agl_m=plan.agl_m * part), places_en_m) for part in HEIGHTS]
 
 
 def heights_of(
     plan: TrialPlan, planned: Sequence[Trial], others: Sequence[Sequence[Trial]]
 ) -> tuple[Alternative, ...]:
-    """Alternatives from `planned` trials at `plan.agl_m` and those of `heights_work`, by height."""
     tried = sorted({1.0: planned, **dict(zip(HEIGHTS, others, strict=True))}.items())
     return tuple(
         Alternative("agl_m", plan.agl_m * part, right_share(each), part == 1.0)
@@ -74,19 +77,16 @@ def heights_of(
 
 
 def right_share(trials: Sequence[Trial]) -> float:
-    """Fraction of trials that were confident and correct; NaN without trials."""
     return float(np.mean([each.right for each in trials])) if trials else float("nan")
 
 
 SIMILAR = 0.8
-"""A rival place is ambiguous if it reaches this fraction of the best score."""
 MAX_PAIRS = 40
 _WRONG_CONFIDENCE = 0.5
 """One wrong trial of this confidence is enough; otherwise a second trial must agree."""
 
 
-@dataclass(frozen=True)
-class _Pair:
+class _Pair(NamedTuple):
     place: tuple[float, float]
     other: tuple[float, float]
     similarity: float
@@ -133,7 +133,6 @@ def _pair(trial: Trial, far_m: float) -> _Pair | None:
 
 
 def _same(one: _Pair, two: _Pair, within_m: float) -> bool:
-    """Whether both ends of two pairs, in either order, lie near each other."""
     straight = max(math.dist(one.place, two.place), math.dist(one.other, two.other))
     swapped = max(math.dist(one.place, two.other), math.dist(one.other, two.place))
     return min(straight, swapped) <= within_m
@@ -161,7 +160,6 @@ MAX_POINTS = 4000
 _REACHED = 1e-6
 """A shorter rest of the route, as a fraction of the distance between points, is none."""
 ACROSS = 5
-"""Points across the band at every point along it."""
 NEGLIGIBLE = 1e-9
 """Chances below this no longer change the expected drift."""
 
@@ -263,3 +261,130 @@ def blind_stretches(
         )
         found.append(stretch)
     return tuple(found)
+
+
+# Thresholds of a planner's judgement, not of a measurement.
+GO_LOW, NO_GO_MEAN = 0.6, 0.2
+"""Go from this lower end of the mean probability on, no-go below this mean probability."""
+GO_OUTSIDE, NO_GO_OUTSIDE = 0.005, 0.1
+"""Fraction of the route outside the map."""
+GO_WRONG, NO_GO_WRONG = 0.005, 0.02
+"""Fraction of trials that were false fixes."""
+MAX_CHANGED = 0.1
+"""Fraction of the ground that changed since the map was made, beyond which a route is marginal."""
+NARROW_PX = 140.0
+"""Views that show fewer pixels of the map across, without a prior, were located far less often than
+predicted on two of nine scenes: no go by predictions alone."""
+MIN_WRONG = 2
+"""A single wrong trial may be chance."""
+TOO_FAR = 2.0
+"""No-go where a drift is more than so many times the allowed one."""
+_ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
+
+
+class Findings(NamedTuple):
+    """What the verdict follows from.
+
+    `mean`, `low`: mean probability along the route, or over the map, and the low end of its
+    interval.
+    `calibrated`: the map carries a confidence model.
+    `wrong`: number of false fixes among `trials`.
+    `outside`: fraction of the route outside the map; `changed`: of the area since the map was made.
+    `allowed_m`: standard deviation of the prior, None without one.
+    `predicted_px`: width of a view in pixels of the map, None if tried on a second date.
+    """
+
+    along: Along | None
+    stretches: tuple[BlindStretch, ...]
+    lookalikes: tuple[Lookalike, ...]
+    mean: float
+    low: float
+    calibrated: bool
+    wrong: int
+    trials: int
+    outside: float
+    changed: float
+    allowed_m: float | None
+    predicted_px: float | None
+
+
+def verdict_of(found: Findings) -> Verdict:
+    """The worst of all reasons, worst first."""
+    where = "on the map" if found.along is None else "along the route"
+    reasons = [*_trust(found), _mean(found, where)]
+    if found.along is not None:
+        reasons += [*_outside(found.outside), _drift(found.along, found.allowed_m)]
+        reasons += _blind(found.stretches)
+    if found.allowed_m is None and found.predicted_px and found.predicted_px < NARROW_PX:
+        text = f"Views are {found.predicted_px:.0f} map pixels wide and there is no prior: they "
+        text += "may be localized far less often than predicted. Fly higher, give a prior, or "
+        text += "check with a second date."
+        reasons += [Reason("narrow_views", text, Word.MARGINAL)]
+    if found.changed > 0:  # a warning: it lowers the probability already
+        text = f"At least {100 * found.changed:.1f} % of the ground {where} changed since the map "
+        text += "was made: fixes are less likely there; build the map from newer imagery."
+        word = Word.MARGINAL if found.changed > MAX_CHANGED else Word.GO
+        reasons += [Reason("changed_ground", text, word)]
+    near = sum(each.within_prior and each.trials > 1 for each in found.lookalikes)
+    if near:
+        text = f"Ambiguous places within the prior, with fewer fixes (see the list): {near} pairs."
+        reasons += [Reason("lookalikes", text, Word.GO)]
+    reasons.sort(key=lambda reason: _ORDER.index(reason.word))
+    return Verdict(reasons[0].word, tuple(reasons))
+
+
+def _trust(found: Findings) -> list[Reason]:
+    if not found.calibrated:
+        text = "The map states no confidence, so no fix would be accepted. Build it again."
+        return [Reason("no_confidence", text, Word.NO_GO)]
+    fraction = found.wrong / max(found.trials, 1)
+    if found.wrong < MIN_WRONG or fraction < GO_WRONG:
+        return []
+    text = f"False fixes: {found.wrong} of {found.trials} trial views. Limit: {100 * GO_WRONG:g} %."
+    return [Reason("wrong", text, Word.NO_GO if fraction >= NO_GO_WRONG else Word.MARGINAL)]
+
+
+def _mean(found: Findings, where: str) -> Reason:
+    text = f"Mean probability of a confident, correct fix per image {where}: "
+    text += f"{100 * found.mean:.0f} % (90 % lower bound {100 * found.low:.0f} %"
+    if found.low >= GO_LOW:
+        return Reason("fixes", f"{text}).", Word.GO)
+    text += f"; GO requires {100 * GO_LOW:.0f} %)."
+    return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
+
+
+def _outside(fraction: float) -> list[Reason]:
+    if fraction <= GO_OUTSIDE:
+        return []
+    word = Word.NO_GO if fraction > NO_GO_OUTSIDE else Word.MARGINAL
+    text = f"{100 * fraction:.0f} % of the route is outside the map. Limit: {100 * GO_OUTSIDE:g} %."
+    return [Reason("outside_map", text, word)]
+
+
+def _drift(along: Along, allowed_m: float | None) -> Reason:
+    worst = int(np.argmax(along.drift_m))
+    drift_m, word = float(along.drift_m[worst]), Word.GO
+    text = f"Largest predicted position error (1 sigma): {drift_m:.0f} m, "
+    text += f"at km {along.distance_m[worst] / 1000:.1f}."
+    if allowed_m is not None:
+        text += f" Limit: {allowed_m:.0f} m (--prior-std-m)."
+        if drift_m > allowed_m:
+            word = Word.NO_GO if drift_m > TOO_FAR * allowed_m else Word.MARGINAL
+    return Reason("drift", text, word)
+
+
+def _blind(stretches: tuple[BlindStretch, ...]) -> list[Reason]:
+    if not stretches:
+        return []
+    longest = max(stretches, key=lambda each: each.length_m)
+    hard = [each for each in stretches if not each.recoverable]
+    word, end = Word.GO, "dead reckoning bridges them"
+    if hard:
+        worst = max(hard, key=lambda each: each.drift_m)
+        word = Word.NO_GO if worst.drift_m > TOO_FAR * worst.allowed_m else Word.MARGINAL
+        end = f"dead reckoning drifts by {worst.drift_m:.0f} m (limit {worst.allowed_m:.0f} m)"
+        if worst.ends_lost and word is Word.MARGINAL:
+            end = "the route ends in a gap"
+    text = f"Gaps without fixes: {len(stretches)}, the longest {longest.length_m:.0f} m "
+    text += f"({longest.end_s - longest.start_s:.0f} s), from km {longest.start_m / 1000:.1f}"
+    return [Reason("blind", f"{text}; {end}.", word)]

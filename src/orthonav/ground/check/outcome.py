@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 
 
 class Word(Enum):
-    """The verdict; its value is what is printed and written."""
-
     GO = "go"
     MARGINAL = "marginal"
     NO_GO = "no-go"
@@ -32,13 +30,17 @@ class Word(Enum):
         return {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}[self]
 
 
+OF_REQUEST = (
+    *("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "tilt_std_deg"),
+    "other_sensor",
+)
+
+
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions that a check assumes; fields that are not listed are those of `CheckRequest`.
+    """What a check assumes; fields that are not listed are those of `CheckRequest`.
 
-    `width_m`, `height_m`: footprint of a vertical view on the ground.
-    `agl_m`: height above ground, known here.
-    `radius_m`: largest error of a correct fix, from the map.
+    `width_m`, `height_m`: footprint of a vertical view; `radius_m`: largest error of a correct fix.
     """
 
     width_m: float
@@ -57,17 +59,10 @@ class Conditions:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Predictions for square cells; arrays are (rows, cols), row 0 in the north.
+    """Predictions for square cells; arrays are (rows, cols), row 0 in the north, as `CELL_VALUES`
+    says.
 
     `west_m`, `north_m`: north-west corner in the plane of the map's sheet.
-    `side_m`: side of a cell.
-    `probability`: probability of a correct, confident fix of one view in the cell, 0 to 1.
-    `low`, `high`: 80 % interval of `probability`.
-    `error_m`: expected error of such a fix (root mean square).
-    `wrong`: fraction of nearby trials that were false fixes.
-    `trials`: number of views tried in the cell, second date excluded.
-    `persistence`: expected correlation of the ground's gradients with another year, 0 to 1.
-    `changed`: fraction that changed since the map was made; 0 where nothing is known of it.
     """
 
     west_m: float
@@ -84,7 +79,6 @@ class Cells:
 
     @property
     def grid(self) -> CellGrid:
-        """The cells without their values."""
         return CellGrid(self.west_m, self.north_m, self.side_m, *self.probability.shape)
 
 
@@ -103,13 +97,10 @@ CELL_VALUES = {
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """Predictions at points (N,) along the route.
+    """Predictions at points (N,) along the route; fields that are not listed are as in `Cells`.
 
-    `distance_m`: distance from the start.
-    `points_en_m`: positions (N, 2), east and north in the plane of the map's sheet.
-    `probability`: as for `Cells`; `low`, `high`: its 80 % interval.
+    `points_en_m`: (N, 2) in the plane of the map's sheet.
     `across_low`: lowest probability across the band at that point.
-    `error_m`: expected error of a correct fix (root mean square).
     `drift_m`: expected position error (one standard deviation) when each fix arrives with its
     probability and dead reckoning drifts in between.
     """
@@ -126,10 +117,8 @@ class Along:
 
 @dataclass(frozen=True)
 class BlindStretch:
-    """A gap: a part of the route where a fix is unlikely.
+    """A gap: a part of the route where a fix is unlikely; distance and time are from its start.
 
-    `start_m`, `end_m`, `start_s`, `end_s`: distance and time from the start of the route.
-    `probability`: mean probability of a fix in it.
     `drift_m`: error of dead reckoning at its end.
     `allowed_m`: largest error there at which the next view is still searched in the right place;
     infinite without a prior.
@@ -147,12 +136,10 @@ class BlindStretch:
 
     @property
     def length_m(self) -> float:
-        """Length along the route."""
         return self.end_m - self.start_m
 
     @property
     def recoverable(self) -> bool:
-        """Whether views can be localized again after it."""
         return not self.ends_lost and self.drift_m <= self.allowed_m
 
 
@@ -160,8 +147,6 @@ class BlindStretch:
 class Lookalike:
     """A pair of ambiguous places, which can be mistaken for each other.
 
-    `place_latlon_deg`, `other_latlon_deg`: latitude and longitude.
-    `apart_m`: distance between them.
     `similarity`: score of the other place divided by that of the true one, 0 to 1.
     `trials`: number of trials that found the pair.
     `within_prior`: a view of one place would also be searched at the other.
@@ -177,13 +162,11 @@ class Lookalike:
 
 @dataclass(frozen=True, eq=False)
 class Envelope:
-    """Fraction of correct, confident fixes over errors of heading and height.
+    """Fraction `share` (A, B) of correct, confident fixes over errors added to heading and height.
 
-    `yaw_off_deg` (A,): heading errors added to the reported heading.
-    `agl_off` (B,): height errors added to the reported height, as a fraction of it.
-    `share` (A, B): fraction of correct, confident fixes.
-    `tolerated_yaw_deg`, `tolerated_agl_low`, `tolerated_agl_high`: largest error of each alone at
-    which `share` stays at 85 % or more of that without error.
+    `agl_off` (B,): as a fraction of the height.
+    `tolerated_*`: largest error of each alone at which `share` stays at 85 % or more of that
+    without.
     """
 
     yaw_off_deg: Array
@@ -196,11 +179,7 @@ class Envelope:
 
 @dataclass(frozen=True)
 class Alternative:
-    """The mean probability with another value of one planning parameter.
-
-    `what`: "agl_m" or "band_m"; `value`: its value in metres; `probability`: mean along the route,
-    or over the map; `chosen`: this is the value that was checked.
-    """
+    """Mean probability with another value, in metres, of one parameter: "agl_m" or "band_m"."""
 
     what: str
     value: float
@@ -229,9 +208,7 @@ class Verdict:
 class CheckedInputs:
     """What was checked, as text for reports; empty where it does not apply.
 
-    `map_sha256`: digest of the map's manifest, as `orthonav verify` prints it.
-    `height`: where the height above ground comes from.
-    `terms`: attribution and licence of each imagery source.
+    `map_sha256`: of the manifest; `terms`: attribution and licence of each imagery source.
     """
 
     map_name: str = ""
@@ -248,14 +225,10 @@ class CheckedInputs:
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """Everything that a check found.
+    """Everything that a check found; `frame` is the plane of the map's sheet.
 
-    `frame`: plane of the map's sheet.
-    `area_km2`: checked area; `mean`: mean probability over it.
-    `second_date`: views of a second date were tried as well.
-    `along`: predictions along the route; None without one.
+    `mean`: mean probability over `area_km2`; `second_date`: views of a second date were tried too.
     `route_en_m`: waypoints (M, 2); `band_m`: width of the widest band.
-    `envelope`: None where it was not requested.
     """
 
     about: CheckedInputs
@@ -278,10 +251,8 @@ class CheckResult:
 def summarize(result: CheckResult) -> dict[str, Any]:
     """The key figures of a check, which the page, the terminal and `check.json` share.
 
-    `route_share_from_0_9`: fraction of the length with a probability of `CONFIDENT` or more.
-    `error_m`: expected error of a correct fix (root mean square), along the route or over the map.
-    `longest_stretch`: number of the longest gap, from 1. Without a route its figures are
-    NaN, 0 or None.
+    `longest_stretch`: number of the longest gap, from 1. Without a route its figures are NaN, 0 or
+    None.
     """
     along, cells, stretches = result.along, result.cells, result.stretches
     route_m = likely = math.nan
@@ -312,7 +283,6 @@ def summarize(result: CheckResult) -> dict[str, Any]:
 
 
 def _rms(values: Array, weights: Array) -> float:
-    """Weighted root mean square of the known values; NaN for none."""
     known = np.isfinite(values) & np.isfinite(weights) & (weights > 0)
     if not known.any():
         return math.nan

@@ -22,7 +22,6 @@ MIN_TRIALS, MAX_TRIALS = 240, 1500
 TRIALS_PER_VIEW = 4.0
 """Trials per area of a view, within those limits."""
 FEWEST_TRIALS = 40
-"""Lower limit at any effort."""
 MASK_PX = 2048
 """The coverage of the map is read at the finest level no larger than this."""
 _REDRAWS = 6
@@ -41,7 +40,6 @@ class MapCoverage:
 
     @classmethod
     def of(cls, layer: GreyPyramid, grid: TileGrid) -> "MapCoverage":
-        """Coverage by the registration layer of a sheet."""
         level = 0
         while level < layer.levels - 1 and max(layer.shape(level)) > MASK_PX:
             level += 1
@@ -50,14 +48,12 @@ class MapCoverage:
         return cls(CellGrid(grid.west_m, grid.north_m, grid.gsd_m * 2**level, rows, cols), valid)
 
     def without(self, changes: ChangedGround | None, frame: LocalFrame) -> "MapCoverage":
-        """The coverage without the ground that changed; `frame` is the plane of the sheet."""
         if changes is None:
             return self
         changed = changes.covers(self.pixels.centres_en_m, frame).reshape(self.valid.shape)
         return replace(self, valid=self.valid & ~changed)
 
     def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
-        """Which of points (N, 2) lie on imagery."""
         numbers = self.pixels.numbers(points_en_m)
         return np.asarray((numbers >= 0) & self.valid.ravel()[numbers])
 
@@ -87,7 +83,6 @@ class MapCoverage:
 
     @property
     def extent_en_m(self) -> Extent:
-        """West, south, east, north of the imagery."""
         rows, cols = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
         if not len(rows):
             raise AreaError("the map has no imagery; build it again from an orthophoto with data")
@@ -100,7 +95,6 @@ class MapCoverage:
 
     @property
     def area_m2(self) -> float:
-        """Area of the imagery."""
         return float(self.valid.sum()) * self.pixels.side_m**2
 
 
@@ -129,7 +123,6 @@ def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
 
 
 def cell_side_m(area_m2: float, view_side_m: float) -> float:
-    """Side of cells for views of a side over an area, at most about `MAX_CELLS`."""
     return max(view_side_m / CELLS_PER_VIEW, math.sqrt(area_m2 / MAX_CELLS))
 
 

@@ -32,25 +32,20 @@ class CheckRequest:
     `map_path`: map file with a registration layer.
     `route`: planned route; None: the whole map.
     `band_m`: width of the band for legs without one; None: derived from the prior.
-    `other_date`: orthophoto of the same ground that the map was not built from; optional.
-    `camera`: camera calibration.
+    `other_date`: orthophoto of the same ground that the map was not built from.
     `agl_m`: height above ground, 1 to 50,000 m; None: the shorter side of a view covers one tile.
     `yaw_std_deg`: standard deviation of the reported heading, 0 to 90; None: heading unknown.
     `agl_std`: standard deviation of the reported height, a fraction of it, 0 to 0.5.
     `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
     `accept`: confidence that a fix needs, 0.01 to 0.999.
-    `speed_mps`: ground speed.
     `drift`: error of dead reckoning per metre flown, 0 to 1.
     `relief_m`: standard deviation of the height of houses and trees.
     `effort`: factor on the number of trials, 0.05 to 50.
     `extras`: also try other errors of heading and height, and other heights.
     `workers`: processes; None: one per core.
-    `seed`: of the trials.
     `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
     `other_sensor`: the camera differs from the map's sensor by more than years do.
-    `recalibration`: of what trials predict.
-    `changes`: ground that changed since the map was made, as a flight saw it; optional.
-    `about`: texts for the report.
+    `changes`: ground that changed since the map was made, as a flight saw it.
     """
 
     map_path: Path
@@ -77,7 +72,6 @@ class CheckRequest:
     about: CheckedInputs = field(default_factory=CheckedInputs)
 
     def __post_init__(self) -> None:
-        """Raise `CheckError` for values out of range."""
         with_paths(self, "map_path", "other_date")
         if self.other_sensor and self.other_date is not None:
             raise CheckError("--other-sensor is for checks without --other-date, which shows it")

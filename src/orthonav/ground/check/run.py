@@ -19,6 +19,7 @@ from orthonav.core.records import MAP_STD_M
 from orthonav.ground.changes.record import CellGrid
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
+    Findings,
     blind_stretches,
     envelope_of,
     envelope_work,
@@ -26,8 +27,10 @@ from orthonav.ground.check.findings import (
     heights_of,
     heights_work,
     predicted_along,
+    verdict_of,
 )
 from orthonav.ground.check.outcome import (
+    OF_REQUEST,
     Along,
     Alternative,
     Cells,
@@ -35,12 +38,7 @@ from orthonav.ground.check.outcome import (
     Conditions,
     Envelope,
 )
-from orthonav.ground.check.places import (
-    MapCoverage,
-    cell_side_m,
-    checked_m2,
-    trial_places,
-)
+from orthonav.ground.check.places import MapCoverage, cell_side_m, checked_m2, trial_places
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.trials import (
     MIN_VALID,
@@ -50,7 +48,6 @@ from orthonav.ground.check.trials import (
     require_overlap,
     run_many,
 )
-from orthonav.ground.check.verdict import verdict_of
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
@@ -59,13 +56,9 @@ Array = NDArray[np.float64]
 ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
 """Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
-"""Narrower bands that are compared, as parts of the planned one."""
 MIN_VIEWS = 20
-"""A check of fewer trial views is refused."""
 MAX_ASPECT = 8.0
-"""Largest ratio of the sides of a view."""
 MIN_COVERED = 0.25
-"""A cell of which the map covers less than this fraction counts as outside the map."""
 MAX_CELLS_AROUND = 250_000
 """Limit of cells in the box around a band, most of them empty."""
 
@@ -109,15 +102,8 @@ class _Check:
             self.plan.width_m,
             self.plan.height_m,
             self.plan.agl_m,
-            request.yaw_std_deg,
-            request.agl_std,
-            request.prior_std_m,
-            request.accept,
-            self.radius_m,
-            request.speed_mps,
-            request.drift,
-            request.tilt_std_deg,
-            request.other_sensor,
+            radius_m=self.radius_m,
+            **{name: getattr(request, name) for name in OF_REQUEST},
         )
         self.bands_m = self._leg_bands_m()
         self.area = self._area()
@@ -145,21 +131,15 @@ class _Check:
         return plan
 
     def _leg_bands_m(self) -> tuple[float, ...]:
-        """Width of the band of every leg of the route, which is validated."""
-        route, band_m, prior_std_m = (
-            self.request.route,
-            self.request.band_m,
-            self.request.prior_std_m,
-        )
+        route, band_m = self.request.route, self.request.band_m
         if route is None:
             return ()
         if band_m is None:
-            band_m = default_band_m(self.plan.side_m, prior_std_m)
+            band_m = default_band_m(self.plan.side_m, self.request.prior_std_m)
         Area.from_route(route, band_m)
         return route.bands_m(band_m) or ()
 
     def _area(self) -> Area | None:
-        """The band of the route in the plane of the map."""
         route = self.request.route
         if route is None:
             return None
@@ -171,7 +151,6 @@ class _Check:
         return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
 
     def result(self) -> CheckResult:
-        """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
         places = trial_places(
@@ -198,7 +177,7 @@ class _Check:
             radius_m=self.radius_m,
             prior_std_m=request.prior_std_m,
         )
-        verdict = verdict_of(
+        findings = Findings(
             along,
             stretches,
             lookalikes,
@@ -218,7 +197,7 @@ class _Check:
             conditions=self.conditions,
             frame=self.sheet.frame,
             cells=cells,
-            verdict=verdict,
+            verdict=verdict_of(findings),
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
             mean=mean,
             second_date=bool(other),
@@ -254,18 +233,15 @@ class _Check:
 
     @property
     def _least_error_m(self) -> float:
-        """Errors of a fix that trials do not show, root mean square.
-
-        How well orthophotos of two dates agree, the displacement of the map as a whole, and the
-        unreported tilt of the camera, at a height that may be off.
-        """
+        """Errors of a fix that trials do not show, root mean square: two orthophotos against each
+        other, the displacement of the map as a whole, the unreported tilt at a height that may be
+        off."""
         floor_m = self.floor_px * self.sheet.grid.gsd_m
         high_m = self.plan.agl_m * math.hypot(1.0, self.request.agl_std)
         tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
         return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
 
     def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
-        """Trials with the map's imagery, and with that of the second date."""
         other_date, plan = self.request.other_date, self.plan
         work = [(plan, places)]
         if other_date is not None:
@@ -285,7 +261,6 @@ class _Check:
     def _extra_trials(
         self, own: Sequence[Trial], rng: np.random.Generator
     ) -> tuple[Envelope | None, list[list[Trial]]]:
-        """The envelope of errors, and trials from other heights."""
         # Where views are not placed, errors of heading and height make no difference.
         placed = [each.en_m for each in own if each.right]
         order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
@@ -355,7 +330,6 @@ class _Check:
     def _alternatives(
         self, heights: list[list[Trial]], own: Sequence[Trial], cells: Cells
     ) -> tuple[Alternative, ...]:
-        """Other heights, where these were tried, and narrower bands, where all legs have one."""
         found: tuple[Alternative, ...] = ()
         if heights:
             found = heights_of(self.plan, own, heights)

@@ -47,15 +47,13 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """How trial views are made.
+    """How trial views are made; the seed of `request` and the number of a trial give its random
+    numbers.
 
-    `request`: map, camera, accuracy of the telemetry, and the seed of all random numbers together
-    with the number of the trial.
-    `agl_m`: height above ground.
     `second_date`: views are cut from the orthophoto of a second date, not from the map's imagery
     with simulated ageing.
-    `yaw_off_deg`: additional heading error, to either side at random.
-    `agl_off`: additional height error, a fraction of the height.
+    `yaw_off_deg`: additional heading error, to either side at random; `agl_off`: height error, a
+    fraction of the height.
     """
 
     request: CheckRequest
@@ -81,7 +79,6 @@ class TrialPlan:
 
     @property
     def footprint_text(self) -> str:
-        """The footprint in words, for messages."""
         return f"a view from {self.agl_m:.0f} m covers {self.width_m:.0f} x {self.height_m:.0f} m"
 
 
@@ -143,25 +140,20 @@ def mirrored_donor(rng: np.random.Generator, layer: GreyPyramid, size: int, leve
 
 
 class OrthoPyramid:
-    """Grey levels of an orthophoto in the plane and at the resolutions of a map's sheet.
-
-    Files stay open until `close`. Not safe to share between threads.
-    """
+    """Grey levels of an orthophoto in the plane and at the resolutions of a map's sheet. Not safe
+    to share between threads."""
 
     def __init__(self, path: Path, sheet: SheetInfo, levels: int) -> None:
-        """Open the file; raises `ImageryError` where it is not an orthophoto."""
         self.levels = levels
         self._sheet, self._mosaic = sheet, Mosaic.open([path])
         self._opened: dict[int, SheetRaster] = {}
         self._stack = ExitStack()
 
     def close(self) -> None:
-        """Close the files."""
         self._stack.close()
         self._opened.clear()
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level: those of the map."""
         return level_shape(self._sheet.grid.height_px, self._sheet.grid.width_px, level)
 
     def read(
@@ -189,7 +181,6 @@ class OrthoPyramid:
 
 
 def require_overlap(path: Path, sheet: SheetInfo) -> None:
-    """Raise `AreaError` where an orthophoto does not overlap a sheet."""
     lat_lon = Mosaic.open([path]).outline_latlon_deg
     points = sheet.frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
     west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
@@ -199,7 +190,6 @@ def require_overlap(path: Path, sheet: SheetInfo) -> None:
 
 
 def view_of(rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: float) -> View:
-    """A vertical view of the middle of a picture with a random heading."""
     size = picture.shape[0]
     width = max(8, round(plan.width_m / gsd_m))
     height = max(8, round(plan.height_m / gsd_m))
@@ -223,7 +213,6 @@ def view_of(rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: flo
 
 
 def _telemetry(rng: np.random.Generator, plan: TrialPlan, yaw_deg: float) -> Telemetry:
-    """Heading and height with the errors of the plan."""
     yaw_error_deg = plan.yaw_off_deg if rng.random() < 0.5 else -plan.yaw_off_deg
     if plan.request.yaw_std_deg is not None:
         yaw_error_deg += float(rng.normal(0, plan.request.yaw_std_deg))
@@ -254,14 +243,11 @@ Work = tuple[TrialPlan, NDArray[np.float64]]
 class Trial:
     """The outcome of one trial. Positions are metres in the plane of the map's sheet.
 
-    `en_m`: true position.
-    `error_m`: error of the fix; NaN without one.
-    `confidence`: of the fix; 0 without one.
+    `error_m`: error of the fix, NaN without one; `confidence`: 0 without one.
     `expected`: mean persistence of the view; NaN for a second date.
     `right`, `wrong`: the fix is accepted, and within the radius of the map or not.
-    `found_en_m`: position of the fix.
-    `rival_en_m`: best other place at least a quarter of a view away.
-    `rival_share`: its score divided by the best score; NaN without a rival.
+    `rival_en_m`: best other place at least a quarter of a view away; `rival_share`: its score
+    divided by the best score.
     """
 
     en_m: tuple[float, float]
@@ -340,7 +326,6 @@ _trier: "Trier"
 
 
 def _start_worker(plans: list[TrialPlan], stop: Event) -> None:
-    """Set up a worker, which ends when its parent does."""
     global _stop, _trier
     _stop, _trier = stop, Trier(plans)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -360,7 +345,6 @@ def _work(job: _Job) -> _Outcome:
 
 
 def registration_of(opened: MapFile) -> RegistrationLocalizer:
-    """Registration over level ground; raises `MapFileError` where the map has no layer for it."""
     found = Localizer(opened, level_ground=True).registration
     if found is None:
         raise MapFileError(f"only maps with a registration layer can be checked: {opened.path}")
@@ -368,24 +352,17 @@ def registration_of(opened: MapFile) -> RegistrationLocalizer:
 
 
 class Trier:
-    """Runs trials of plans that share a map.
-
-    Files are opened by the first trial, so that errors of a worker reach its parent.
-    """
+    """Runs trials. Files are opened by the first one, so that errors of a worker reach its
+    parent."""
 
     def __init__(self, plans: Sequence[TrialPlan]) -> None:
         self._plans = plans
         self._files = ExitStack()
 
     def close(self) -> None:
-        """Close the orthophoto of the second date."""
         self._files.close()
 
     def __call__(self, job: _Job) -> _Outcome:
-        """Run a job: number of the plan, index, metres east and north.
-
-        Raises as `registration_of` does.
-        """
         number, index, east, north = job
         plan = self._plans[number]
         rng = np.random.default_rng([plan.request.seed + plan.second_date, index])
@@ -397,7 +374,6 @@ class Trier:
 
     @cached_property
     def _other(self) -> OrthoPyramid:
-        """The orthophoto of the second date."""
         path, registration = self._plans[0].request.other_date, self._registration
         assert path is not None
         other = OrthoPyramid(path, registration.sheet, registration.pyramid.levels)

@@ -18,7 +18,6 @@ from scipy.special import gammaincinv
 from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, share_of, wilson
 
 N_BINS = 10
-"""Of the reliability diagram, as usual for a few hundred fixes."""
 NEES_LEVELS = (0.5, 0.9, 0.99)
 _LEAST_INDEPENDENCE = 1e-12  # of east and north, 1 - rho^2: below it a covariance is singular
 _ASYMMETRY = 1e-6  # share of the largest element that two mirrored ones may differ by
@@ -26,11 +25,7 @@ _ASYMMETRY = 1e-6  # share of the largest element that two mirrored ones may dif
 
 @dataclass(frozen=True)
 class Bin:
-    """Fixes whose confidence is at least `lower` and below `upper`; the last bin includes 1.
-
-    `mean_confidence`, `share_right`: mean stated confidence, and share of right fixes, 0 to 1.
-    `right_low`, `right_high`: Wilson's 95 % interval of `share_right`.
-    """
+    """Fixes of a confidence in [lower, upper), the last bin in [0.9, 1]; interval: Wilson, 95 %."""
 
     lower: float
     upper: float
@@ -45,11 +40,8 @@ class Bin:
 class ConfidenceCalibration:
     """Agreement of stated confidence with the outcome, over the fixes that state one.
 
-    `n_fixes`: number of these fixes; `n_own_radius`: how many state a radius of their own.
+    `n_own_radius`: how many state a radius of their own.
     `ece`: expected calibration error, 0 at best; above 0 for few fixes even if calibrated.
-    `brier`: Brier score, 0 at best.
-    `mean_confidence`, `share_right`: the first above the second is over-confidence.
-    `bins`: the reliability diagram.
     """
 
     n_fixes: int
@@ -65,9 +57,8 @@ class ConfidenceCalibration:
 class CovarianceConsistency:
     """Agreement of stated covariances with the errors of the right fixes.
 
-    `n_right`: number of right fixes.
-    `n_without`: how many of them state no covariance, or one with null values.
-    `n_unusable`: how many state one that is singular, not positive definite or not symmetric.
+    `n_without`: right fixes without covariance, or with null values in it; `n_unusable`: with one
+    that is singular, not positive definite or not symmetric.
     `nees` (K,): normalized estimation error squared e^T C^-1 e of the others, ascending.
     `within`: for each of `NEES_LEVELS` the share of `nees` inside its bound.
     """
@@ -194,7 +185,6 @@ def nees_mean_bounds(n: float) -> tuple[float, float]:
 
 
 def _correlation(cov_en_m2: FloatArray) -> FloatArray:
-    """(N,) correlation of east and north."""
     scale = np.sqrt(cov_en_m2[:, 0, 0]) * np.sqrt(cov_en_m2[:, 1, 1])
     rho: FloatArray = 0.5 * (cov_en_m2[:, 0, 1] + cov_en_m2[:, 1, 0]) / scale
     return rho

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
 N_ROWS = 6
 SIDE_PX = 260
-"""Width of each image in pixels."""
 UNKNOWN = GroundWindow(200.0, SIDE_PX, (0.0, 0.0))
-"""The window of the map images where the footprint of the view is unknown."""
 _NOTHING = "#F0E6D2"
 _GREY_LEVELS = 40
 
@@ -44,13 +42,9 @@ Picture = np.ma.MaskedArray[Any, np.dtype[np.uint8]]
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One view of the contact sheet: its figures, and three images (H, W) of its window, masked
-    where there is no imagery.
+    """One view of the contact sheet, with three images (H, W), masked where there is no imagery.
 
-    `state`, `error_m`, `sigma_m`, `confidence`: of the fix.
-    `shift_en_m` (2,): from the true to the estimated position.
-    `view`, `at_estimate`, `at_truth`: the rectified view, and the map at both positions.
-    `why_not`: why the view is None.
+    `shift_en_m` (2,): from the true to the estimated position; `why_not`: why `view` is None.
     """
 
     frame: str
@@ -73,11 +67,8 @@ def worst_rows(
     sheet: SheetImagery,
     count: int = N_ROWS,
 ) -> list[Row]:
-    """The `count` fixes with the largest errors, those of state tracking first.
-
-    `comparison` is made of `results`, in the plane of `sheet`. Raises `MapFileError` where a chunk
-    of the map is damaged.
-    """
+    """The `count` fixes with the largest errors, those of state tracking first, in the plane of
+    `sheet`."""
     by_frame = {result.frame: result for result in results}
     chosen = worst_first(comparison, results, count)
     wanted = {comparison.frames[i] for i in chosen}
@@ -91,7 +82,6 @@ def worst_rows(
 def worst_first(
     comparison: Comparison, results: Sequence[ViewResult], count: int = N_ROWS
 ) -> list[int]:
-    """Indices of the views of `comparison` to show: tracking before others, large errors first."""
     states = {result.frame: result.state for result in results}
     fixes = [i for i, error_m in enumerate(comparison.errors_m) if math.isfinite(error_m)]
     fixes.sort(key=lambda i: (states[comparison.frames[i]] != "tracking", -comparison.errors_m[i]))
@@ -141,7 +131,6 @@ def _picture(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Picture:
 
 
 def row_text(row: Row) -> str:
-    """The title of a row."""
     known = [row.frame, f"error {row.error_m:.1f} m"]
     known.append(f"sigma {row.sigma_m:.1f} m" if math.isfinite(row.sigma_m) else "sigma unknown")
     stated = math.isfinite(row.confidence)
@@ -150,8 +139,6 @@ def row_text(row: Row) -> str:
 
 
 def sheet_picture(rows: Sequence[Row]) -> Drawing:
-    """The rows as one drawing: view, map at the fix, map at the true position."""
-
     def draw(figure: "Figure") -> None:
         if not rows:
             axes = figure.add_subplot()
@@ -208,7 +195,6 @@ def _draw_picture(axes: "Axes", window: GroundWindow, picture: Picture) -> None:
 
 
 def _draw_mark(axes: "Axes", mark: str, at: NDArray[np.float64], colour: str, size: float) -> None:
-    """A cross at the estimate, a ring at the true position, where they lie within the picture."""
     for width, tone in ((5.0, "white"), (2.6, colour)):
         axes.plot(
             *at,

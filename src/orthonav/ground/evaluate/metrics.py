@@ -2,7 +2,7 @@
 
 Names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
 criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined. Confidence and
-covariance are checked in `calibration`, standard figures of the field are in `standard`.
+covariance are checked in `calibration`, standard figures of the field are in `figures`.
 """
 
 import logging
@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight import read_truth
-from orthonav.core.flight.fixes import read_results
+from orthonav.core.flight import FlightFolder, read_truth
+from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
+from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     ConfidenceCalibration,
@@ -30,9 +31,11 @@ from orthonav.ground.evaluate.calibration import (
     check_covariance,
 )
 from orthonav.ground.evaluate.figures import (
+    RPE_DISTANCE_M,
     BoolArray,
     FloatArray,
     Longest,
+    StandardFigures,
     frozen,
     longest,
     path_so_far_m,
@@ -40,10 +43,10 @@ from orthonav.ground.evaluate.figures import (
     seconds_since_first,
     share,
     share_of,
+    standard_figures,
     upper_bound,
     wilson,
 )
-from orthonav.ground.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 
 Positions = Mapping[str, tuple[float, float]]
 """Frame name -> (latitude, longitude) in degrees."""
@@ -51,7 +54,6 @@ Positions = Mapping[str, tuple[float, float]]
 FAR_M = 35.0
 """A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
 NO_RESULT = "no_result"
-"""Reason of true positions that no result belongs to."""
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
@@ -72,15 +74,11 @@ log = logging.getLogger(__name__)
 class Comparison:
     """Results with their truth: N views that have both, in the order of the results.
 
-    `lat_deg`, `lon_deg`: origin of the east-north plane of positions.
-    `frames`, `time_ns`: name and time of each view.
-    `truth_en_m`, `fix_en_m` (N, 2): positions in metres; fixes NaN where there is none.
+    `lat_deg`, `lon_deg`: origin of the east-north plane of `truth_en_m`, `fix_en_m` (N, 2).
     `errors_m` (N,): distance between them, NaN without a fix.
     `cov_en_m2` (N, 2, 2), `own_radius_m` (N,): as each fix states, NaN where unknown.
-    `confident` (N,): whether the fix may be relied on; any other one is a best guess.
     `criteria`: for each name of `CRITERIA` values (N,), NaN where unknown or without a fix.
     `reasons`: code of each view without a fix, "" for a fix.
-    `latency_ms` (N,): processing time of each view.
     `n_without_truth`, `n_without_result`: results without truth, and the reverse.
     `starts`: index at which each pooled flight begins.
     """
@@ -115,13 +113,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class CriterionRow:
-    """What one threshold of a criterion accepts. Shares are NaN where they are not defined.
+    """What one threshold of a criterion accepts, NaN where undefined.
 
-    `share_accepted`: share of all views accepted.
-    `accuracy`: share of the accepted views that are right.
-    `n_accepted`, `n_right`: number of accepted views, and of right ones among them.
-    `recall`: share of all right fixes that is accepted.
-    `far_m`, `n_far`, `share_far`: accepted views wrong by more than `far_m`.
+    `share_accepted`: of all views; `accuracy`: right ones among the accepted; `recall`: accepted
+    ones among all right fixes; `n_far`, `share_far`: accepted views wrong by more than `far_m`.
     """
 
     name: str
@@ -151,9 +146,7 @@ class Metrics:
     """Metrics of one flight, or of several pooled; undefined ones are NaN.
 
     `radius_m`: a fix within it is right.
-    `n_views`, `n_fixes`, `n_without_truth`, `n_without_result`: counts, see `Comparison`.
-    `n_confident`, `n_confident_wrong`: confident fixes, and those of them that err by more than
-    `wrong_above_m` and the radius they state.
+    `n_confident_wrong`: confident fixes that err by more than `wrong_above_m` and their own radius.
     `wrong_upper_95`: one-sided 95 % upper bound of the rate of wrong ones among confident fixes.
     `availability`: share of the true positions with a confident fix; `availability_95`: its 95 %
     interval. Both bounds are those of independent views.
@@ -161,11 +154,8 @@ class Metrics:
     `gap`: the longest stretch without a confident fix, of one flight.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
     `accuracy_of_confident`: share of the confident fixes within `radius_m`.
-    `latency_*_ms`: of all views.
     `reasons`: number of views without a fix by reason.
-    `criteria`, `curves`: what thresholds of the confidence criteria accept.
-    `calibration`, `consistency`: of confidence and covariance; right is within the own radius.
-    `standard`, `of_confident`: errors of all and of confident fixes: APE, RPE, CEP50 and CEP95.
+    `standard`, `of_confident`: errors of all and of confident fixes.
     """
 
     radius_m: float
@@ -206,12 +196,10 @@ class Metrics:
 
 
 def radius_key(radius_m: float) -> str:
-    """The name of the accuracy at a radius: `acc_at_15m`."""
     return f"acc_at_{radius_m:g}m"
 
 
 def wrong_key(far_m: float) -> str:
-    """The name of the share that is wrong by more than a distance: `wrong_by_35m`."""
     return f"wrong_by_{far_m:g}m"
 
 
@@ -256,6 +244,18 @@ def check_truth(
         raise FlightError(f"{far}; {HINT}: {path}")
     if far_m > _OTHER_FLIGHT_M:
         log.warning("%s; are these of the same flight?: %s", far, path)
+
+
+def warn_of_another_run(fixes: Path, opened: MapFile | None, flight: FlightFolder | None) -> None:
+    """Log a warning where fixes were computed from another map or flight than the given ones."""
+    given = Identity(
+        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
+    )
+    other = read_identity(fixes).differences(
+        given, opened.path if opened else None, flight.path if flight else None
+    )
+    if other:
+        log.warning("fixes are of %s: %s", other, fixes)
 
 
 def compare(
@@ -305,10 +305,7 @@ def compare(
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
-    """Several flights as one, for metrics; positions stay in their own planes.
-
-    Raises `ValueError` for no flight at all.
-    """
+    """Several flights as one, for metrics; positions stay in their own planes."""
     if not comparisons:
         raise ValueError("no results: expected at least one flight")
     lengths = [len(part.frames) for part in comparisons]
@@ -327,7 +324,6 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
 
 
 def _joined(values: list[Any]) -> Any:
-    """Values of one field of several comparisons as one: joined, or counts added."""
     if isinstance(values[0], np.ndarray):
         return np.concatenate(values)
     if isinstance(values[0], Mapping):
@@ -426,7 +422,6 @@ def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> Crite
 
 
 def worst_views(comparison: Comparison, n: int = 10, wrong_above_m: float = FAR_M) -> list[int]:
-    """Indices of the `n` fixes with the largest error, false fixes first."""
     fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
     wrong = comparison.confident_wrong(wrong_above_m)
     order = np.lexsort((-comparison.errors_m[fixes], ~wrong[fixes]))
@@ -498,7 +493,6 @@ def _criterion(outcome: Fix | NoFix, name: str) -> float:
 
 
 def _local(local: LocalFrame, positions: Sequence[tuple[float, float]]) -> FloatArray:
-    """(N, 2) metres east and north; NaN where a position is NaN."""
     lat_lon_deg = np.array(positions, dtype=np.float64)
     en_m = np.full(lat_lon_deg.shape, np.nan)
     known = np.isfinite(lat_lon_deg).all(axis=1)

@@ -22,6 +22,7 @@ from orthonav.ground.evaluate.calibration import (
 from orthonav.ground.evaluate.figures import BoolArray, FloatArray, runs, seconds_since_first
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics
 from orthonav.ground.evaluate.tables import (
+    LABELS,
     percentiles_text,
     spread_text,
     track_consistency_text,
@@ -58,16 +59,13 @@ CURVE_STYLES: dict[str, tuple[str, Any, str, float]] = {
     "peak_ratio": ("#009E73", (0, (5, 3)), "s", 2.1),
     "lowe_ratio": ("#B8558F", (0, (1.5, 1.5)), "^", 2.2),
 }
-LABELS = {"confidence": "confidence", "peak_ratio": "peak ratio", "lowe_ratio": "Lowe's ratio"}
 MAIN = ("confidence", 0.9)
-"""The criterion and threshold that is highlighted."""
 STATE_STYLES = {
     "searching": ("#E69F00", "^"),
     "tracking": (RIGHT, "o"),
     "coasting": ("#56B4E9", "s"),
     "lost": ("#B8558F", "X"),
 }
-"""State -> colour and mark."""
 MOST_ELLIPSES = 40
 _DASHED: dict[str, Any] = {"color": GREY, "linestyle": (0, (4, 3))}
 _SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}
@@ -95,10 +93,6 @@ def fix_classes(
 def map_picture(
     comparison: Comparison, radius_m: float, background: Background | None = None
 ) -> Drawing:
-    """Map of true positions and fixes, joined by lines; north is up.
-
-    Of fixes far outside the flight only the lines to the edge are visible.
-    """
     box = view_box(comparison, radius_m)
 
     def draw(axes: "Axes") -> None:
@@ -110,8 +104,6 @@ def map_picture(
 
 
 def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
-    """Share of all views with a fix within an error, over that error; the radius marked."""
-
     def draw(axes: "Axes") -> None:
         radius_m = metrics.radius_m
         errors_m = np.sort(comparison.errors_m[np.isfinite(comparison.errors_m)])
@@ -137,8 +129,6 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
 
 
 def criteria_picture(metrics: Metrics) -> Drawing:
-    """Accuracy over the share of views accepted, per criterion, with its thresholds."""
-
     def draw(axes: "Axes") -> None:
         drawn = [curve for curve in metrics.curves if curve.thresholds.size]
         for curve in drawn:
@@ -163,8 +153,6 @@ def criteria_picture(metrics: Metrics) -> Drawing:
 
 
 def over_time_picture(comparison: Comparison, radius_m: float) -> Drawing:
-    """Error of each view over time, or in their order; views without a fix are shaded."""
-
     def draw(axes: "Axes") -> None:
         errors_m = comparison.errors_m
         x, name = _time_axis(seconds_since_first(comparison.time_ns))
@@ -208,21 +196,18 @@ def view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, flo
 
 
 def inside_box(positions_en_m: FloatArray, box: tuple[float, ...]) -> BoolArray:
-    """Which of positions (N, 2) lie in a box: west, east, south, north."""
     east, north = positions_en_m.T
     inside: BoolArray = (box[0] <= east) & (east <= box[1]) & (box[2] <= north) & (north <= box[3])
     return inside
 
 
 def _time_axis(seconds_s: FloatArray) -> tuple[FloatArray, str]:
-    """Positions of views (N,) and the name of the axis: their numbers where times are unknown."""
     if np.isfinite(seconds_s).all():
         return seconds_s, "time since the first view (s)"
     return np.arange(1.0, seconds_s.size + 1), "view, in order of the flight"
 
 
 def _plain_numbers(axis: "Axis") -> None:
-    """Numbers of a logarithmic axis without powers."""
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter("")
 
@@ -256,7 +241,6 @@ def _draw_positions(
 
 
 def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
-    """A mark and a number for each threshold, placed without overlap."""
     rows = [row for row in metrics.criteria if math.isfinite(row.accuracy)]
     rows.sort(key=lambda row: list(CURVE_STYLES).index(row.name))
     spots = [(100 * row.share_accepted, 100 * row.accuracy) for row in rows]
@@ -281,13 +265,11 @@ def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
 
 
 def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    """Whether two boxes (left, bottom, right, top) share more than an edge."""
     across = min(one[2], other[2]) > max(one[0], other[0])
     return across and min(one[3], other[3]) > max(one[1], other[1])
 
 
 def _draw_main(axes: "Axes", at: tuple[float, float], colour: str) -> None:
-    """A ring around the point, with lines to both axes."""
     lead: dict[str, Any] = {"color": colour, "linewidth": 1.0, "alpha": 0.55, "zorder": 1.5}
     axes.plot([at[0], at[0], 0], [0, at[1], at[1]], linestyle=(0, (1, 2)), **lead)
     ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5, "zorder": 4}
@@ -298,8 +280,6 @@ def _draw_main(axes: "Axes", at: tuple[float, float], colour: str) -> None:
 
 
 def reliability_picture(calibration: ConfidenceCalibration) -> Drawing:
-    """Share of right fixes over confidence per bin, with 95 % intervals; below, fixes per bin."""
-
     def draw(figure: "mpl.Figure") -> None:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
         above.plot([0, 1], [0, 1], linewidth=1.2, **_DASHED)
@@ -353,8 +333,6 @@ def _draw_counts(axes: "Axes", calibration: ConfidenceCalibration) -> None:
 
 
 def nees_picture(consistency: CovarianceConsistency) -> Drawing:
-    """Cumulative share of right fixes over NEES, compared with chi-square (2 dof)."""
-
     def draw(axes: "Axes") -> None:
         nees = np.clip(consistency.nees, _NEES_AXIS[0], None)  # a log axis has no zero
         high = float(min(max([50.0, *(1.3 * nees[-1:])]), _NEES_AXIS[1]))
@@ -388,7 +366,6 @@ def nees_picture(consistency: CovarianceConsistency) -> Drawing:
 
 
 def _draw_levels(axes: "Axes", consistency: CovarianceConsistency) -> None:
-    """Bounds as lines, the shares found inside them as points, and both as text."""
     for level in NEES_LEVELS:
         bound, found = nees_bound(level), 100 * consistency.within[level]
         axes.plot([bound] * 2, [0, 104], color=GREY, linewidth=0.9, zorder=1.5)
@@ -410,7 +387,6 @@ def _draw_levels(axes: "Axes", consistency: CovarianceConsistency) -> None:
 def track_figures(
     comparison: Comparison, track: TrackMetrics, radius_m: float, background: Background | None
 ) -> list[Figure]:
-    """Track on the map; error, state and confidence; signed errors; estimated biases."""
     series = track.series
     figures = [
         Figure(
@@ -454,7 +430,6 @@ def track_map_picture(
     radius_m: float,
     background: Background | None = None,
 ) -> Drawing:
-    """True path, estimates coloured by state, 95 % ellipses of some, lines from wrong ones."""
     box = view_box(comparison, radius_m)
     wrong = comparison.errors_m > radius_m
     size = 7.0 if len(series.states) < 120 else 5.0
@@ -477,8 +452,6 @@ def track_map_picture(
 
 
 def error_picture(comparison: Comparison, series: TrackSeries, radius_m: float) -> Drawing:
-    """Error with its stated 1 sigma and 95 % bounds, state and confidence over time."""
-
     def draw(figure: "mpl.Figure") -> None:
         above, band, below = figure.subplots(3, 1, sharex=True, height_ratios=(6, 0.5, 2))
         x, name = _time_axis(series.seconds_s)
@@ -495,8 +468,6 @@ def error_picture(comparison: Comparison, series: TrackSeries, radius_m: float) 
 
 
 def signed_picture(series: TrackSeries) -> Drawing:
-    """Errors ahead and to the right of the ground truth over time, scaled to the tracking views."""
-
     def draw(figure: "mpl.Figure") -> None:
         parts = figure.subplots(2, 1, sharex=True)
         x, name = _time_axis(series.seconds_s)
@@ -524,7 +495,6 @@ def signed_picture(series: TrackSeries) -> Drawing:
 
 
 def biases_picture(series: TrackSeries) -> Drawing:
-    """Estimated biases of heading, height and tilt over time, as far as they are known."""
     found = series.biases
     panels: list[tuple[str, dict[str, FloatArray]]] = [
         ("heading (deg)", {"": found["heading_bias_deg"]}),
@@ -551,7 +521,6 @@ def biases_picture(series: TrackSeries) -> Drawing:
 
 
 def _by_state(states: Sequence[str]) -> list[tuple[str, BoolArray, str, str]]:
-    """Name, mask (N,), colour and mark of each state that occurs."""
     masks = {state: np.array([each == state for each in states]) for state in STATE_STYLES}
     return [(state, masks[state], *STATE_STYLES[state]) for state in masks if masks[state].any()]
 
@@ -559,7 +528,6 @@ def _by_state(states: Sequence[str]) -> list[tuple[str, BoolArray, str, str]]:
 def _draw_ellipses(
     axes: "Axes", comparison: Comparison, series: TrackSeries, box: tuple[float, ...]
 ) -> None:
-    """The 95 % ellipses of up to `MOST_ELLIPSES` estimates, evenly along the flight."""
     from matplotlib.patches import Ellipse
 
     side_m = max(box[1] - box[0], box[3] - box[2])
@@ -599,7 +567,6 @@ def _draw_errors(
 
 
 def _draw_states(axes: "Axes", x: FloatArray, states: Sequence[str]) -> None:
-    """A coloured band per state, labelled where it is wide enough."""
     edges = np.append(x, _limits(x)[1])
     whole = float(edges[-1] - edges[0])
     for state, here, colour, _ in _by_state(states):
@@ -614,7 +581,6 @@ def _draw_states(axes: "Axes", x: FloatArray, states: Sequence[str]) -> None:
 
 
 def _limits(x: FloatArray) -> tuple[float, float]:
-    """Ends of the axis, with room after the last view."""
     step = float(np.median(np.diff(x))) if x.size > 1 else 1.0
     return float(x[0]), float(x[-1]) + max(step, 1e-3)
 
@@ -623,8 +589,6 @@ def _limits(x: FloatArray) -> tuple[float, float]:
 
 
 def gnss_figure(found: GnssMetrics) -> Figure:
-    """Errors of both and their difference over time; alarms are shaded."""
-
     def draw(figure: "mpl.Figure") -> None:
         above, below = figure.subplots(2, 1, sharex=True)
         x, name = _time_axis(found.seconds_s)

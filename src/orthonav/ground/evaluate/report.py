@@ -1,15 +1,16 @@
 """The evaluation of flights as one self-contained page, and its figures as files."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from orthonav.ground.evaluate import plots
 from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
 from orthonav.ground.evaluate.figures import share
 from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
 from orthonav.ground.evaluate.tables import (
+    STANDARD_HEADER,
     FlightReport,
     bins_rows,
     confidence_text,
@@ -35,8 +36,6 @@ _N_WORST = 10
 
 @dataclass(frozen=True)
 class MadeFrom:
-    """What a report was made from, as text; empty where unknown."""
-
     map_name: str = ""
     recipe: str = ""
     imagery: str = ""
@@ -45,28 +44,21 @@ class MadeFrom:
     version: str = ""
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """The figures of one section: general, of its track, of its worst views."""
-
+class _Drawn(NamedTuple):
     general: tuple[Figure, ...]
     track: tuple[Figure, ...] = ()
     worst: tuple[Figure, ...] = ()
 
     def named(self, name: str, file_name: str) -> "_Drawn":
-        """The same with the flight's name in texts and, if given, in file names.
-
-        Two dashes separate it: neither `file_names` nor the names of figures contain any.
-        """
+        """With the flight's name in texts and, if given, in file names, set off by two dashes,
+        which neither `file_names` nor the names of figures contain."""
         start = f"{file_name}--" if file_name else ""
-
-        def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
-            return tuple(
-                replace(each, name=f"{start}{each.name}", alt=f"{name}: {each.alt}")
-                for each in figures
+        return _Drawn(
+            *(
+                tuple(replace(f, name=f"{start}{f.name}", alt=f"{name}: {f.alt}") for f in figures)
+                for figures in self
             )
-
-        return _Drawn(named(self.general), named(self.track), named(self.worst))
+        )
 
 
 def write_report(
@@ -77,10 +69,8 @@ def write_report(
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
-    `whole`: what `total` gives for these flights, computed where it is None. Figures are also
-    written beside the page, as `orthonav.ground.report.page.write_page` does. Raises `ValueError`
-    as `total`, `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot
-    be written.
+    `whole`: what `total` gives, computed where it is None. Figures are also written beside it.
+    Raises `ValueError` as `total` and `OutputError` as `write_figures`.
     """
     whole = whole or total(flights)
     several = len(flights) > 1
@@ -114,7 +104,7 @@ def write_report(
         figures = {"name": "all flights", "figures": drawn[-1].general}
         values["total_section"] = {**figures, **_trust(whole)}
     page = render("orthonav.ground.evaluate", "report.html", values)
-    shown = [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    shown = [figure for each in drawn for figures in each for figure in figures]
     return write_page(out_dir, page, shown)
 
 
@@ -150,7 +140,6 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
 
 
 def _compared(metrics: Metrics) -> list[tuple[str, ...]]:
-    """Confident and all fixes side by side."""
     kinds = (
         ("confident fixes", metrics.accuracy_of_confident, metrics.of_confident),
         ("all fixes", metrics.accuracy_of_fixes, metrics.standard),
@@ -182,7 +171,6 @@ def _notes(metrics: Metrics) -> list[str]:
 
 
 def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
-    """What the template shows of one flight."""
     return {
         "name": flight.name,
         "view_command": flight.view_command,
@@ -200,8 +188,8 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
 
 
 def _trust(metrics: Metrics) -> dict[str, Any]:
-    """Standard figures, criteria and calibration, for one flight or all."""
     return {
+        "standard_header": STANDARD_HEADER,
         "standard": standard_rows(metrics),
         "standard_more": [
             ("ECE", plain_text(metrics.calibration.ece)),
@@ -209,7 +197,7 @@ def _trust(metrics: Metrics) -> dict[str, Any]:
             ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
         ],
         "criteria_header": criteria_header(metrics),
-        "criteria": criteria_rows(metrics, plots.LABELS),
+        "criteria": criteria_rows(metrics),
         "confidence": confidence_text(metrics),
         "bins": bins_rows(metrics),
         "covariance": covariance_text(metrics.consistency),
@@ -258,23 +246,18 @@ def _drawn(flight: FlightReport) -> _Drawn:
     )
     of_track = plots.track_figures(comparison, track, radius_m, background) if track else []
     of_gnss = [plots.gnss_figure(flight.gnss)] if flight.gnss else []
-    return _Drawn(general, (*of_track, *of_gnss), _contact_sheet(flight))
-
-
-def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:
-    """The worst views as images; empty where these were not requested."""
     if not flight.worst:
-        return ()
+        return _Drawn(general, (*of_track, *of_gnss))
     caption = (
         "The worst fixes, those in state tracking first: the view rectified with heading and "
         "height of its fix, north up, beside the map at the same scale; + fix, ○ true position."
     )
     alt = "The worst views. " + "; ".join(map(row_text, flight.worst))
-    return (Figure("worst-views", alt, caption, sheet_picture(flight.worst)),)
+    sheet = Figure("worst-views", alt, caption, sheet_picture(flight.worst))
+    return _Drawn(general, (*of_track, *of_gnss), (sheet,))
 
 
 def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
-    """The figures without positions, which can be drawn of several flights too."""
     return (
         Figure(
             "error-curve",

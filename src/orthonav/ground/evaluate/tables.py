@@ -14,7 +14,7 @@ from orthonav.ground.evaluate.calibration import (
     nees_mean_bounds,
 )
 from orthonav.ground.evaluate.contact_sheet import Row
-from orthonav.ground.evaluate.figures import FloatArray, Longest, percentile
+from orthonav.ground.evaluate.figures import RPE_FRAMES, FloatArray, StandardFigures, percentile
 from orthonav.ground.evaluate.metrics import (
     Comparison,
     CriterionRow,
@@ -24,35 +24,31 @@ from orthonav.ground.evaluate.metrics import (
     radius_key,
     wrong_key,
 )
-from orthonav.ground.evaluate.standard import RPE_FRAMES, ErrorStatistics, StandardFigures
 from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
 from orthonav.ground.report.drawing import Background
-from orthonav.ground.report.numbers import measure_text, percent_text, plain_text, to_plain
+from orthonav.ground.report.numbers import aligned, measure_text, percent_text, plain_text, to_plain
 
 Plain = dict[str, Any]
 _COLUMNS = (
     *("flight", "views", "confident", "wrong", "low confidence", "coverage", "right", "of fixes"),
     *("median m", "95 % m", "max m", "latency ms"),
 )
+STANDARD_HEADER = ("", "fixes", "RMSE m", "mean m", "median m", "std m", "max m", "number")
+LABELS = {"confidence": "confidence", "peak_ratio": "peak ratio", "lowe_ratio": "Lowe's ratio"}
 _EAST, _NORTH, _PITCH, _ROLL, _LATENCY = GNSS_BIASES
 _LEARNT = {
     "learnt displacement of the map": ((_EAST, 1, "m east"), (_NORTH, 1, "m north")),
     "learnt error of the mount": ((_PITCH, 2, "deg pitch"), (_ROLL, 2, "deg roll")),
     "learnt latency": ((_LATENCY, 0, "ms"),),
 }
-"""Learnt biases as they are shown: keys, digits and units."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlightReport:
-    """One evaluated flight.
+    """One evaluated flight, and what its report shows beside the metrics.
 
-    `comparison`: results with their true positions; `metrics`: figures of these.
-    `background`: image in the plane of `comparison`; optional.
-    `track`: metrics of the track; None where views were localized one by one.
-    `worst`: rows of the contact sheet; empty where images were not requested.
-    `gnss`: GNSS beside the map; None where it was not recorded.
-    `view_command`: command that shows single views; empty without a map.
+    `background`: image in the plane of `comparison`; `worst`: rows of the contact sheet;
+    `track`, `gnss`: None where there is none; `view_command`: shows single views, "" without a map.
     """
 
     name: str
@@ -84,7 +80,6 @@ def total(flights: Sequence[FlightReport]) -> Metrics:
 
 
 def metrics_to_json(metrics: Metrics) -> Plain:
-    """`metrics` as values for strict JSON; undefined ones become None."""
     same = (
         *("n_views", "n_fixes", "n_confident", "n_confident_wrong", "wrong_above_m"),
         *("wrong_upper_95", "availability", "availability_95", "n_without_truth"),
@@ -158,10 +153,7 @@ def _standard_to_json(standard: StandardFigures) -> Plain:
 
 
 def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> Plain:
-    """The figures of all flights together, and of several also of each, for strict JSON.
-
-    `whole`: what `total` gives. Of several tracks only sums and maxima are given.
-    """
+    """The figures of all flights together, and of several also of each, for strict JSON."""
     plain = metrics_to_json(whole)
     if len(flights) == 1:
         track, gnss = flights[0].track, flights[0].gnss
@@ -175,10 +167,6 @@ def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> Plain:
 
 
 def track_to_json(track: TrackMetrics) -> Plain:
-    """`track` as values for strict JSON, units in the names; undefined ones become None.
-
-    `over_time` has one value per compared view, rounded to milliseconds and millimetres.
-    """
     plain: Plain = to_plain({name: each for name, each in vars(track).items() if name != "series"})
     plain["first_view"] = plain["first_view"] and int(plain["first_view"])
     plain["consistency"]["verdict"] = plain["consistency"]["verdict"] or None
@@ -190,10 +178,7 @@ def track_to_json(track: TrackMetrics) -> Plain:
 
 
 def tracks_to_json(tracks: Sequence[TrackMetrics]) -> Plain:
-    """Sums, shares of views and maxima over several tracks.
-
-    Medians, biases and consistency are given per flight only.
-    """
+    """Sums and maxima over several tracks; medians, biases and consistency are given per flight."""
 
     def most(values: Iterable[float]) -> float | None:
         return max((value for value in values if math.isfinite(value)), default=None)
@@ -226,7 +211,6 @@ def tracks_to_json(tracks: Sequence[TrackMetrics]) -> Plain:
 
 
 def gnss_to_json(found: GnssMetrics) -> Plain:
-    """The figures of GNSS as values for strict JSON."""
     values = {
         f"{name}_{label}_m": percentile(each, percent)
         for name, each in (("error", found.errors_m), ("difference", found.differences_m))
@@ -244,7 +228,6 @@ def gnss_to_json(found: GnssMetrics) -> Plain:
 
 
 def verdict(metrics: Metrics) -> str:
-    """A sentence that answers whether any confident fix was wrong."""
     confident, wrong = metrics.n_confident, metrics.n_confident_wrong
     above = f"{metrics.wrong_above_m:g} m and the stated radius"
     if not confident:
@@ -263,50 +246,28 @@ def verdict(metrics: Metrics) -> str:
 
 
 def wrong_bound_text(metrics: Metrics) -> str:
-    """The upper bound of the rate of false fixes."""
     return f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
 
 
 def table(flights: Sequence[FlightReport], whole: Metrics) -> str:
-    """The figures in aligned columns for a terminal: a row per flight, and a total of several.
-
-    `whole`: what `total` gives.
-    """
-    rows = [table_header(whole), *table_rows(flights, whole)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        first, *others = zip(row, widths, strict=True)
-        cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]
-        lines.append("  ".join(cells).rstrip())
+    lines = aligned([table_header(whole), *table_rows(flights, whole)])
     if len(flights) > 1:
         lines.insert(-1, "-" * max(map(len, lines)))
     return "\n".join(lines)
 
 
 def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
-    """Standard figures, confidence and covariance of all flights, and metrics of each track.
-
-    `whole`: what `total` gives.
-    """
-    standard, of_confident = whole.standard, whole.of_confident
     low, high = map(percent_text, whole.availability_95)
+    gap = f"{measure_text(whole.gap.seconds_s, ' s')}, {measure_text(whole.gap.path_m, ' m')}"
     lines = [
         f"availability: {percent_text(whole.availability)} of views have a confident fix (95 % "
-        f"interval {low} to {high}); longest gap {_longest_text(whole.gap)}",
-        *(
-            f"{name}: {measure_text(confident, ' m')} of confident fixes, "
-            f"{measure_text(of_all, ' m')} of all"
-            for name, confident, of_all in (
-                ("CEP50", of_confident.cep50_m, standard.cep50_m),
-                ("CEP95", of_confident.cep95_m, standard.cep95_m),
-            )
-        ),
-        f"APE: {_statistics_text(standard.ape)}",
-        f"RPE over {RPE_FRAMES} frame: {_statistics_text(standard.rpe_frames)}",
-        f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
+        f"interval {low} to {high}); longest gap {gap}",
+        "",
+        *aligned([STANDARD_HEADER, *standard_rows(whole)]),
+        "",
+        *aligned([criteria_header(whole), *criteria_rows(whole)]),
+        "",
         f"confidence: {confidence_text(whole)}",
-        *(_criterion_line(row, whole.radius_m) for row in _stated(whole)),
         f"covariance: {covariance_text(whole.consistency)}",
     ]
     for flight in flights:
@@ -321,33 +282,7 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
     return "\n".join(lines)
 
 
-def _stated(metrics: Metrics) -> list[CriterionRow]:
-    """Rows of confidence, where any fix states one."""
-    found = [row for row in metrics.criteria if row.name == "confidence"]
-    return found if metrics.calibration.n_fixes else []
-
-
-def _criterion_line(row: CriterionRow, radius_m: float) -> str:
-    return (
-        f"  >= {row.threshold:g}: {percent_text(row.share_accepted)} of views accepted, precision "
-        f"within {radius_m:g} m {percent_text(row.accuracy)}, recall {percent_text(row.recall)}; "
-        f"{row.n_far} of {row.n_accepted} wrong by more than {row.far_m:g} m "
-        f"({percent_text(row.share_far)})"
-    )
-
-
-def _statistics_text(found: ErrorStatistics) -> str:
-    if not found.n:
-        return "not defined"
-    return (
-        f"RMSE {measure_text(found.rmse_m)}, mean {measure_text(found.mean_m)}, "
-        f"median {measure_text(found.median_m)}, std {measure_text(found.std_m)}, "
-        f"max {measure_text(found.max_m)} m ({found.n} values)"
-    )
-
-
 def confidence_text(metrics: Metrics) -> str:
-    """A sentence that compares stated confidence with the share of right fixes."""
     calibration = metrics.calibration
     if not calibration.n_fixes:
         return "unknown, no fix states one"
@@ -362,14 +297,12 @@ def confidence_text(metrics: Metrics) -> str:
 
 
 def covariance_verdict(consistency: CovarianceConsistency) -> str:
-    """A sentence that answers whether the stated covariances can be used."""
     if not consistency.nees.size:
         return "Whether covariances are right is unknown: no correct fix states one."
     return f"Covariances are {_judged(consistency)}."
 
 
 def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str, str]:
-    """A word on the stated covariances, its explanation, and "bad" where they are too small."""
     if not consistency.nees.size:
         return "-", "covariance: no correct fix states one", ""
     word, _, times = _judged(consistency).partition(": ")
@@ -378,7 +311,6 @@ def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str, str]:
 
 
 def covariance_text(consistency: CovarianceConsistency) -> str:
-    """Consistency of the covariance in a sentence."""
     if not consistency.n_right:
         return "unknown, no fix is correct"
     counts = ((consistency.n_without, "without one"), (consistency.n_unusable, "unusable"))
@@ -394,7 +326,6 @@ def covariance_text(consistency: CovarianceConsistency) -> str:
 
 
 def within_text(consistency: CovarianceConsistency) -> str:
-    """Percentages of NEES within the bounds of chi-square."""
     levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
     found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
     return f"{found} % within the bounds of {levels} %"
@@ -405,7 +336,6 @@ def _judged(consistency: CovarianceConsistency) -> str:
 
 
 def nees_text(nees: float, low: float, high: float) -> str:
-    """What a mean NEES says, given the 95 % interval of that of a consistent covariance."""
     times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
     if nees > high:
         return f"too small: {times}"
@@ -416,12 +346,10 @@ def nees_text(nees: float, low: float, high: float) -> str:
 
 
 def table_header(whole: Metrics) -> list[str]:
-    """Names of the columns of `table_rows`."""
     return [f"acc@{whole.radius_m:g} m" if name == "right" else name for name in _COLUMNS]
 
 
 def table_rows(flights: Sequence[FlightReport], whole: Metrics) -> list[list[str]]:
-    """A row per flight, and the total `whole` of several."""
     named = [(" ".join(flight.name.split()), flight.metrics) for flight in flights]
     return [
         [
@@ -443,7 +371,6 @@ def table_rows(flights: Sequence[FlightReport], whole: Metrics) -> list[list[str
 
 
 def standard_rows(metrics: Metrics) -> list[tuple[str, ...]]:
-    """APE and RPE of confident and of all fixes."""
     return [
         (name, kind, *map(measure_text, list(vars(found).values())[1:]), str(found.n))
         for kind, standard in (("confident", metrics.of_confident), ("all", metrics.standard))
@@ -456,18 +383,16 @@ def standard_rows(metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def criteria_header(metrics: Metrics) -> tuple[str, ...]:
-    """Column names of `criteria_rows`."""
     far = f"{metrics.criteria[0].far_m:g} m" if metrics.criteria else ""
     within = f"precision within {metrics.radius_m:g} m"
     names = ("criterion", "at least", "accepted", "of all views")
     return (*names, within, "recall", f"wrong by > {far}")
 
 
-def criteria_rows(metrics: Metrics, labels: dict[str, str]) -> list[tuple[str, ...]]:
-    """What each threshold of each criterion accepts; `labels` are names to show."""
+def criteria_rows(metrics: Metrics) -> list[tuple[str, ...]]:
     return [
         (
-            labels[row.name],
+            LABELS[row.name],
             f"{row.threshold:g}",
             str(row.n_accepted),
             percent_text(row.share_accepted),
@@ -480,7 +405,6 @@ def criteria_rows(metrics: Metrics, labels: dict[str, str]) -> list[tuple[str, .
 
 
 def bins_rows(metrics: Metrics) -> list[tuple[str, ...]]:
-    """Rows of the reliability diagram; empty where no fix states a confidence."""
     return [
         (
             f"{b.lower:g} to {b.upper:g}",
@@ -493,7 +417,6 @@ def bins_rows(metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def levels_rows(consistency: CovarianceConsistency) -> list[tuple[str, ...]]:
-    """Rows of the bounds of chi-square; empty where no covariance is usable."""
     return [
         (f"{100 * level:g} %", f"{nees_bound(level):.2f}", percent_text(level), percent_text(share))
         for level, share in consistency.within.items()
@@ -502,7 +425,6 @@ def levels_rows(consistency: CovarianceConsistency) -> list[tuple[str, ...]]:
 
 
 def track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
-    """The metrics of a track as names and texts."""
     after, errors, found = track.after, "unknown", "never"
     if math.isfinite(track.first_view):
         first = f"view {track.first_view:.0f} of {track.n_views}"
@@ -541,7 +463,6 @@ def track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
 
 
 def track_consistency_text(found: TrackConsistency) -> str:
-    """Consistency of a track in a sentence."""
     if not found.n_views:
         return "unknown, no tracking view has a usable one and a true position"
     left_out = f"; {found.n_left_out} without a usable one" if found.n_left_out else ""
@@ -557,7 +478,6 @@ def track_consistency_text(found: TrackConsistency) -> str:
 
 
 def spread_text(spread: Spread) -> str:
-    """Bias and spread of signed errors in a sentence."""
     if not spread.n_views:
         return "unknown"
     return (
@@ -567,7 +487,6 @@ def spread_text(spread: Spread) -> str:
 
 
 def gnss_rows(found: GnssMetrics) -> list[tuple[str, str]]:
-    """The figures of GNSS as names and texts."""
     named = [found.faults[first] for first, _ in found.alarms]
     rows = [
         ("error of GNSS", percentiles_text(found.errors_m)),
@@ -584,13 +503,8 @@ def gnss_rows(found: GnssMetrics) -> list[tuple[str, str]]:
 
 
 def percentiles_text(values: FloatArray) -> str:
-    """Median, 95 % and maximum of errors in metres."""
     median, p95, most = (measure_text(percentile(values, q), " m") for q in (50, 95, 100))
     return f"median {median}, 95 % {p95}, largest {most}"
-
-
-def _longest_text(longest: Longest) -> str:
-    return f"{measure_text(longest.seconds_s, ' s')}, {measure_text(longest.path_m, ' m')}"
 
 
 def _unit(value: float, unit: str) -> str:

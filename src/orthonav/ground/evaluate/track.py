@@ -42,23 +42,16 @@ if TYPE_CHECKING:
     pass
 
 RADII_M = (25.0, 60.0)
-"""Radii of accuracy: a usual and a large error of a track."""
 COURSE_M = 5.0
 """Minimum distance over which a course is measured, in the median."""
 STILL_M = 1.0
 """Below this distance the aircraft is stationary and has no course."""
 BIASES = ("heading_bias_deg", "log_scale_bias", "pitch_bias_deg", "roll_bias_deg")
-"""Evidence of a track: estimated biases of the telemetry."""
 
 
 @dataclass(frozen=True)
 class After:
-    """Errors from the first confirmed fix on, in any state.
-
-    `n_views`, `n_fixes`: number of views, and of fixes among them.
-    `error_*_m`: of the fixes.
-    `acc_at_m`: for each radius the share of views with a fix within it.
-    """
+    """Errors from the first confirmed fix on, in any state."""
 
     n_views: int
     n_fixes: int
@@ -80,14 +73,12 @@ class Spread:
 
 @dataclass(frozen=True)
 class TrackConsistency:
-    """Consistency of a track: NEES (2 degrees of freedom, 2 expected) of the tracking views.
+    """NEES (2 degrees of freedom, 2 expected) of the tracking views.
 
-    `n_views`, `n_left_out`: views with and without a usable covariance.
-    `nees_mean`: mean NEES; `nees_within_95`: share below the 95 % bound.
-    `independent_low`, `independent_high`: 95 % interval of the mean of independent views.
-    `n_effective`: effective number of views, as errors of consecutive views are correlated.
-    `effective_low`, `effective_high`: the interval for that number, which decides the verdict.
-    `verdict`: "consistent", "over-confident" or "under-confident"; "" without views.
+    `n_left_out`: views without a usable covariance; `nees_within_95`: share below the 95 % bound.
+    `independent_*`: 95 % interval of the mean of independent views.
+    `n_effective`: effective number of views, as errors of consecutive views are correlated;
+    `effective_*`: the interval for that number, which decides the verdict ("" without views).
     """
 
     n_views: int
@@ -106,9 +97,8 @@ class TrackConsistency:
 class TrackSeries:
     """Time series over the compared views (N,), for figures.
 
-    `seconds_s`: time since the first view; `states`: state of the track.
-    `sigma_m`: standard deviation along the longer axis of the covariance.
-    `bound_95_m`: the same axis of the 95 % ellipse; a larger error has a NEES above 5.99.
+    `sigma_m`: standard deviation along the longer axis of the covariance; `bound_95_m`: the same
+    axis of the 95 % ellipse.
     `along_m`, `across_m`: error ahead and to the right of the true position.
     `biases`: estimated biases by the name of their evidence.
     """
@@ -124,21 +114,15 @@ class TrackSeries:
 
 @dataclass(frozen=True, eq=False)
 class TrackMetrics:
-    """Metrics of one track.
+    """Metrics of one track; `n_compared` of its views have a true position.
 
-    `n_views`, `n_compared`: all views, and those with a true position.
     `first_view`, `first_s`: number (from 1) and time of the first confirmed fix, that is, one in
     state tracking.
-    `after`: errors from then on.
-    `share_of_views`, `share_of_time`: by state; `n_lost`: number of times the track was lost.
     `low_confidence`: longest stretch without a confident fix (not tracking, or not confident);
     `low_confidence_after`: the same from the first confirmed fix on.
-    `far_m`: the larger of `FAR_M` and the radius of the evaluation.
     `n_confident_wrong`: views that are tracking, or confident, with an error above `far_m` and
-    above the radius that the fix states.
-    `n_false_locks`, `false_lock_longest_s`: stretches of such views.
+    above the radius that the fix states; `n_false_locks`: stretches of such views.
     `along`, `across`: errors ahead and to the right, of the tracking views.
-    `consistency`, `series`: NEES, and time series for figures.
     """
 
     n_views: int
@@ -164,10 +148,7 @@ class TrackMetrics:
 def measure_track(
     comparison: Comparison, results: Sequence[ViewResult], radius_m: float
 ) -> TrackMetrics | None:
-    """All metrics of a track; None where no result has a state.
-
-    `comparison` is made of these `results`; raises `ValueError` where it is not.
-    """
+    """All metrics of a track; None where no result has a state."""
     if not any(result.state for result in results):
         return None
     number = {result.frame: i for i, result in enumerate(results)}
@@ -354,13 +335,10 @@ def _series(
 
 @dataclass(frozen=True, eq=False)
 class GnssMetrics:
-    """GNSS and map against ground truth, over the compared views (N,).
+    """GNSS and map against ground truth, over the compared views (N,); NaN where one is missing.
 
-    `seconds_s`: time since the first view. `errors_m`: of GNSS. `map_errors_m`: of the fixes.
-    `differences_m`: distance between both; NaN where one of them is missing, as above.
-    `faults`: reason of the monitor, "" without one.
-    `learnt`: biases of GNSS minus map at the last view that has them, each with its standard
-    deviation, by their keys in evidence; empty where nothing was learnt.
+    `differences_m`: distance between GNSS and fix; `faults`: reason of the monitor, "" without one.
+    `learnt`: biases of GNSS minus map at the last view that has them, by their keys in evidence.
     """
 
     seconds_s: FloatArray
@@ -377,7 +355,6 @@ class GnssMetrics:
 
 
 def measure_gnss(comparison: Comparison, results: Sequence[ViewResult]) -> GnssMetrics | None:
-    """Figures of GNSS; None where no result has a GNSS position."""
     by_frame = {result.frame: result.outcome.evidence for result in results}
     evidence = [by_frame[frame] for frame in comparison.frames]
     places = [gnss_of(each) for each in evidence]

@@ -37,14 +37,12 @@ from orthonav.ground.imagery.mosaic import WHOLLY_VALID
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 
-CELL_PX = 512
-"""GDAL's block size for COG, so a cell is usually one block."""
+CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
 """Largest block, unpacked: one of a tiled file has at most a few megabytes."""
 ALIGNED_PX = 0.02
 """Grids that differ by less count as one: a fiftieth of a pixel is below any error of imagery."""
-_PACKED_SHARE = 0.35
-"""Size of a usual JPEG block relative to its pixels, for the estimate."""
+_PACKED_SHARE = 0.35  # size of a usual JPEG block relative to its pixels, for the estimate
 _DTYPES = ("uint8", "uint16", "int16", "float32")
 
 
@@ -120,7 +118,6 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
 
 @contextmanager
 def _opened(web: Web, url: str, level: int | None = None) -> Iterator[Any]:
-    """A file, or its overview, as an open dataset. Raises `FetchError`, also while it is read."""
     checked_url(url.replace("{", "").replace("}", ""))
     settings = GDAL_OPTIONS | {
         "GDAL_HTTP_MAX_RETRY": web.limits.attempts - 1,
@@ -143,7 +140,6 @@ def _opened(web: Web, url: str, level: int | None = None) -> Iterator[Any]:
 
 
 def _inspect(web: Web, url: str, options: ImageryOptions, frame: LocalFrame) -> CogLevel:
-    """A file at the level that fits `options`, read from its head. Raises `FetchError`."""
     level = None
     with _opened(web, url) as whole:
         if whole.crs is None:
@@ -172,7 +168,6 @@ def _inspect(web: Web, url: str, options: ImageryOptions, frame: LocalFrame) -> 
 def _read(
     web: Web, file: CogLevel, grid: CellGrid, cell: tuple[int, int], bands: tuple[int, ...]
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Pixels (C, H, W) and validity (H, W) of a file in a cell. Raises `FetchError`."""
     with _opened(web, file.url, file.level) as dataset:
         has_alpha = MaskFlags.alpha in dataset.mask_flag_enums[0]
         adds_alpha = dataset.nodata is None and not has_alpha

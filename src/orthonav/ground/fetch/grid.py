@@ -18,8 +18,7 @@ MERCATOR_HALF_M = math.pi * 6378137.0
 """Half the width of the square of EPSG:3857, metres of that projection."""
 MAX_CANDIDATES = 40_000_000
 """Cells of the box around an area that are examined: some hundred megabytes at one row a time."""
-_ROUND = 1.02
-"""Allowance for the change of scale across an area."""
+_ROUND = 1.02  # allowance for the change of scale across an area
 _EDGE = np.linspace(0, 1, 21)
 """Points along an edge that are projected, as rasterio's `transform_bounds` does."""
 
@@ -121,7 +120,6 @@ def select(grid: CellGrid, area: Area, margin_m: float) -> Selection:
 
 
 def _box(grid: CellGrid, area: Area, margin_m: float) -> tuple[int, int, int, int]:
-    """First row and column, last row and column of the box around the area."""
     west, south, east, north = area.extent_en_m
     u = (west - margin_m) + _EDGE * (east - west + 2 * margin_m)
     v = (south - margin_m) + _EDGE * (north - south + 2 * margin_m)

@@ -8,6 +8,7 @@ They are split 7z archives, which 7-Zip unpacks (`7z x NAME.7z.001`).
 import hashlib
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -20,19 +21,17 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web
 
 SERVICE = "https://data.geopf.fr/telechargement"
-PAGE = 50
-"""Packages per page, the most that the service returns."""
+PAGE = 50  # packages per page, the most that the service returns
 MAX_PAGES = 200
 ATTRIBUTION = "IGN, BD ORTHO; Licence Ouverte / Open Licence 2.0 (Etalab)"
 _ASKED = re.compile(r"^(D?\d{2,3}|D?\d[AB]|D?0\d[AB]):(\d{4})(?::(RVB|IRC))?$", re.IGNORECASE)
 
 
 class Package(NamedTuple):
-    """A package: its name, address, zone such as D003, and date of edition."""
+    """A package: its name, address, and date of edition."""
 
     name: str
     url: str
-    zone: str
     date: str
 
 
@@ -65,13 +64,17 @@ def find_package(
         term = place.get("term") if place is not None else None
         if term == zone and f"_{kind}-" in name and link is not None:
             date = entry.findtext("editionDate", "").strip()
-            here.append(Package(name.strip(), linked(url, link.get("href", "")), zone, date))
+            here.append(Package(name.strip(), linked(url, link.get("href", "")), date))
     dated = [package for package in here if package.date.startswith(year)]
     if not dated:
         years = sorted({package.date[:4] for package in here})
         raise FetchError(f"no {kind} package of {zone} of {year}; available: {listed(years)}")
-    newest_first = sorted(dated, reverse=True)
-    return min(newest_first, key=_centimetres)
+
+    def centimetres(package: Package) -> int:  # 0M20 is 20 cm
+        found = re.search(r"-(\d+)M(\d+)_", package.name)
+        return int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6
+
+    return min(sorted(dated, reverse=True), key=centimetres)
 
 
 def package_files(web: Web, package: Package) -> list[PackageFile]:
@@ -121,7 +124,14 @@ def download_package(
             try:
                 with part.open("wb") as stream:
                     web.download(file.url, stream, max_bytes=file.size_bytes, received=received)
-                _check(file, part)
+                with part.open("rb") as written:
+                    md5 = hashlib.file_digest(written, partial(hashlib.md5, usedforsecurity=False))
+                    size = written.tell()
+                if file.size_bytes not in (None, size) or file.md5 not in (None, md5.hexdigest()):
+                    raise FetchError(
+                        f"file has {size} bytes instead of {file.size_bytes}, or another MD5 than "
+                        f"the service states; it was removed, run the command again: {file.url}"
+                    )
                 part.replace(folder / file.name)
             except OSError as error:
                 part.unlink(missing_ok=True)
@@ -132,26 +142,7 @@ def download_package(
     return [folder / file.name for file in files]
 
 
-def _check(file: PackageFile, part: Path) -> None:
-    """Raise `FetchError` where the size or MD5 of a downloaded file is wrong."""
-    size = part.stat().st_size
-    if file.size_bytes not in (None, size):
-        problem = f"has {size} bytes instead of {file.size_bytes}"
-    elif file.md5 not in (None, _md5(part)):
-        problem = "has another MD5 than the service states"
-    else:
-        return
-    raise FetchError(f"file {problem}; it was removed, run the command again: {file.url}")
-
-
-def _md5(path: Path) -> str:
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, lambda: hashlib.md5(usedforsecurity=False))
-    return digest.hexdigest()
-
-
 def _entries(web: Web, url: str, parameters: dict[str, str]) -> list[Element]:
-    """Entries of all pages of a feed. Raises `FetchError`."""
     found: list[Element] = []
     for number in range(1, MAX_PAGES + 1):
         feed = web.get_xml(with_query(url, parameters | {"page": str(number), "limit": str(PAGE)}))
@@ -160,9 +151,3 @@ def _entries(web: Web, url: str, parameters: dict[str, str]) -> list[Element]:
         if not pages.isdecimal() or number >= int(pages):
             return found
     raise FetchError(f"feed has more pages than are read: {url}")
-
-
-def _centimetres(package: Package) -> int:
-    """Pixel width in a name: 0M20 is 20 cm."""
-    found = re.search(r"-(\d+)M(\d+)_", package.name)
-    return int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6

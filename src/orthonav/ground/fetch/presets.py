@@ -177,7 +177,6 @@ def _options(values: dict[str, Any]) -> ImageryOptions:
 
 
 def _secrets(url: str, key_env: str | None, literal: str | None) -> tuple[Secret, ...]:
-    """The key for `{key}` in an address. Raises `FetchError` where it is missing."""
     if literal is None and key_env is None:
         if KEY in url:
             raise FetchError(

@@ -1,23 +1,35 @@
-"""From a request to a file: read the capabilities, plan, estimate the cost, fetch, write."""
+"""From a request to a cloud-optimized GeoTIFF: read the capabilities, plan, fetch, write."""
 
+import hashlib
+import json
 import logging
 import math
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import rasterio
+import rasterio.shutil
+from rasterio.enums import ColorInterp
+from rasterio.errors import RasterioError
+from rasterio.windows import Window
+
+from orthonav import __version__
 from orthonav.core.errors import AreaError, FetchError, OutputError
-from orthonav.core.files import Progress, no_progress, not_written, with_paths
+from orthonav.core.files import Progress, no_progress, not_written, replacing, with_paths
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.ground.fetch.cog import cog_source
 from orthonav.ground.fetch.grid import Selection, select
-from orthonav.ground.fetch.mosaic import CellCounts, Packing, write_mosaic
 from orthonav.ground.fetch.options import Provenance, SourceSpec
-from orthonav.ground.fetch.service import CellSource
+from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
 from orthonav.ground.fetch.stac import find_files
 from orthonav.ground.fetch.web import RequestLimits, Web
 from orthonav.ground.fetch.wms import wms_cells
@@ -30,12 +42,12 @@ DEFAULT_MAX_TILES = 50_000
 DEFAULT_MAX_MB = 4000.0
 DEFAULT_MARGIN_M = 200.0
 """Reference tiles at the border of a map reach beyond its area by less than this."""
-_SECONDS_PER_TILE = 0.3
-"""Usual latency of a tile service; an assumption for the estimate."""
-_BYTES_PER_SECOND = 3e6
-"""Usual throughput of a connection; an assumption for the estimate."""
-_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")
-"""Names in a cache that GDAL and this program make."""
+_SECONDS_PER_TILE = 0.3  # usual latency of a tile service; an assumption for the estimate
+_BYTES_PER_SECOND = 3e6  # usual throughput of a connection; an assumption for the estimate
+_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")  # names in a cache that GDAL and this program make
+BLOCK_PX = 512  # GDAL's default block of a COG
+GIVE_UP_AFTER = 20  # failed cells in a row after which the service counts as down
+_BATCH_PER_THREAD = 8  # cells that may wait in memory until they are written
 log = logging.getLogger(__name__)
 
 
@@ -47,7 +59,8 @@ class FetchRequest:
     area: Area
     out: Path  # the GeoTIFF, .tif or .tiff
     margin_m: float = DEFAULT_MARGIN_M  # fetched beyond the area
-    packing: Packing = field(default_factory=Packing)
+    compress: str = "jpeg"  # or deflate
+    quality: int = 90  # of JPEG, 1 to 100
     cache: Path | None = None  # folder of tiles; None: beside `out`, removed at the end
     max_tiles: int = DEFAULT_MAX_TILES  # a fetch of more is refused before it starts
     max_mb: float = DEFAULT_MAX_MB  # likewise, as estimated
@@ -76,6 +89,43 @@ class CostEstimate:
         return (
             f"{self.tiles} tiles, {self.width_px} x {self.height_px} px of {self.gsd_m:.3g} m, "
             f"about {max(self.megabytes, 0.1):.3g} MB, {minutes}"
+        )
+
+
+@dataclass(eq=False)
+class CellCounts:
+    """What became of the cells of a selection."""
+
+    images: int = 0
+    absent: int = 0  # without imagery, as the service reports
+    blank: int = 0  # wholly black or white
+    placeholders: int = 0  # with the same image as another: no two orthophotos agree
+    failed: Counter[str] = field(default_factory=Counter)  # by reason
+    examples: dict[str, str] = field(default_factory=dict)  # a whole message for each reason
+    valid_px: int = 0
+
+    def holes(self) -> str:
+        """Cells without imagery by reason, on one line; empty where there are none."""
+        names = ("failed", "not covered", "blank", "placeholders")
+        numbers = (self.failed.total(), self.absent, self.blank, self.placeholders)
+        counted = zip(numbers, names, strict=True)
+        return ", ".join(f"{number} {name}" for number, name in counted if number)
+
+    def add_failure(self, error: FetchError) -> None:
+        """Count a cell that failed."""
+        reason = str(error).partition(" (")[0].partition(": http")[0]
+        self.failed[reason] += 1
+        self.examples.setdefault(reason, str(error))
+        log.info("not fetched: %s", error)
+
+    def failure(self, cells: int) -> str:
+        """Why nothing was written."""
+        common = self.failed.most_common(4)
+        reasons = ", ".join(f"{reason}: {count}" for reason, count in common)
+        return (
+            f"{self.failed.total()} of {cells} tiles failed ({reasons}; for example "
+            f"{self.examples[common[0][0]]}); nothing was written; --allow-holes writes the file "
+            "without them"
         )
 
 
@@ -143,17 +193,8 @@ def fetch(
         try:
             cache.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:
-                cells = write_mosaic(
-                    request.out,
-                    source,
-                    selection,
-                    source.reader(web, selection, cache),
-                    Path(folder),
-                    request.packing,
-                    progress,
-                    parallel=request.limits.parallel,
-                    allow_holes=request.allow_holes,
-                )
+                read = source.reader(web, selection, cache)
+                cells = _write_mosaic(request, source, selection, read, Path(folder), progress)
         except FetchError as error:
             if any(cache.iterdir()):
                 stored = f"fetched tiles are stored, rerun the command to resume: {cache}"
@@ -211,14 +252,12 @@ def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
 
 
 def _selected(source: CellSource, request: FetchRequest) -> Selection:
-    """The cells of the area. Raises `AreaError`, which names swapped coordinates as the cause."""
     frame = request.area.frame
 
     def covered(lat_deg: float, lon_deg: float) -> bool:
-        half_deg = 1e-4
-        place = (lon_deg - half_deg, lat_deg - half_deg, lon_deg + half_deg, lat_deg + half_deg)
+        west, south, east, north = lon_deg - 1e-4, lat_deg - 1e-4, lon_deg + 1e-4, lat_deg + 1e-4
         try:
-            select(source.grid, Area.from_bounds(place), 0.0)
+            select(source.grid, Area.from_bounds((west, south, east, north)), 0.0)
         except (AreaError, FetchError):
             return False
         return True
@@ -235,10 +274,168 @@ def _check_out(out: Path) -> None:
         raise FetchError(f"--out must be a .tif file, got: {out}")
     if out.exists() and not out.is_file():
         raise OutputError(f"cannot write over a folder or a device: {out}")
+
+
+def _write_mosaic(
+    request: FetchRequest,
+    source: CellSource,
+    selection: Selection,
+    read: CellReader,
+    folder: Path,
+    progress: Progress,
+) -> CellCounts:
+    """Read the cells and write them as one GeoTIFF, with missing ones masked.
+
+    The raw mosaic is written into `folder` first. Raises `FetchError` where cells failed, unless
+    holes are allowed, and where no pixel is valid; `OutputError` where it cannot be written.
+    """
+    raw = folder / "mosaic.tif"
     try:
-        out.resolve().parent.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(out.resolve().parent).free
-    except OSError as error:
-        raise OutputError(f"cannot write ({error.strerror or error}): {out}") from error
-    if free < 2**20:
-        raise OutputError(f"disk full; nothing was written: {out}")
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK="YES", GDAL_CACHEMAX=128 * 2**20):
+            with rasterio.open(raw, "w", **_profile(source, selection)) as dataset:
+                dataset.update_tags(**_tags(source.provenance, selection))
+                if source.bands == 3:
+                    dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+                counts = _write_cells(dataset, selection, read, request.limits.parallel, progress)
+            if counts.failed and not request.allow_holes:
+                raise FetchError(counts.failure(len(selection.cells)))
+            if counts.valid_px == 0:
+                raise FetchError("the service has no imagery of this area in this layer")
+            progress("pack", 0.1)
+            with replacing(request.out) as temporary:
+                _pack(raw, temporary, request)
+            progress("pack", 1.0)
+    except (RasterioError, MemoryError) as error:
+        raise not_written(error.__cause__ or error, request.out) from error
+    return counts
+
+
+def _write_cells(
+    dataset: Any, selection: Selection, read: CellReader, parallel: int, progress: Progress
+) -> CellCounts:
+    counts, (row0, col0) = CellCounts(), selection.first
+    written: dict[bytes, list[tuple[Window, int]]] = {}
+    in_a_row = 0
+    for number, ((row, col), found) in enumerate(_read_cells(selection, read, parallel), start=1):
+        progress("fetch", number / len(selection.cells))
+        in_a_row = in_a_row + 1 if isinstance(found, FetchError) else 0
+        if in_a_row >= GIVE_UP_AFTER:
+            raise FetchError(f"{in_a_row} requests in a row failed, the last: {found}")
+        if isinstance(found, FetchError):
+            counts.add_failure(found)
+        elif not found.valid.any():
+            counts.absent += 1
+        elif found.blank:
+            counts.blank += 1
+        else:
+            height, width = found.valid.shape
+            window = Window((col - col0) * width, (row - row0) * height, width, height)
+            _write(dataset, window, found)
+            digest = hashlib.sha256(found.bands.tobytes()).digest()
+            written.setdefault(digest, []).append((window, int(found.valid.sum())))
+    for same in written.values():
+        if len(same) == 1:
+            counts.images += 1
+            counts.valid_px += same[0][1]
+            continue
+        counts.placeholders += len(same)
+        for window, _ in same:
+            shape = window.height, window.width
+            nothing = np.zeros((dataset.count, *shape), dataset.dtypes[0])
+            _write(dataset, window, CellPixels(nothing, np.zeros(shape, dtype=bool)))
+    return counts
+
+
+def _read_cells(
+    selection: Selection, read: CellReader, parallel: int
+) -> Iterator[tuple[list[int], CellPixels | FetchError]]:
+
+    def read_one(cell: list[int]) -> tuple[list[int], CellPixels | FetchError]:
+        try:
+            return cell, read(*cell)
+        except FetchError as error:
+            return cell, error
+
+    cells, batch = selection.cells.tolist(), parallel * _BATCH_PER_THREAD
+    # Its threads are daemons and are not joined. Those of `ThreadPoolExecutor` would delay the
+    # end of the program after an error or an interrupt until the last server has answered.
+    with ThreadPool(parallel) as pool:
+        for start in range(0, len(cells), batch):
+            yield from pool.imap_unordered(read_one, cells[start : start + batch])
+
+
+def _write(dataset: Any, window: Window, pixels: CellPixels) -> None:
+    dataset.write(np.where(pixels.valid, pixels.bands, 0), window=window)
+    dataset.write_mask(np.where(pixels.valid, 255, 0).astype(np.uint8), window=window)
+
+
+def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
+    """How the raw file is laid out: blocks that are not written take no space."""
+    height, width = selection.shape_px
+    return {
+        "driver": "GTiff",
+        "width": width,
+        "height": height,
+        "count": source.bands,
+        "dtype": source.dtype,
+        "crs": selection.grid.crs,
+        "transform": selection.grid.transform(*selection.first),
+        "tiled": True,
+        "bigtiff": "YES",
+        "sparse_ok": True,
+        "interleave": "pixel",
+        "photometric": "RGB" if source.bands == 3 else "MINISBLACK",
+    }
+
+
+def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
+    """Copy into a cloud-optimized file; JPEG takes one or three bands of bytes only.
+
+    Raises `OutputError` unless its size, place and bands are those of the raw one.
+    """
+    options: dict[str, Any] = {
+        "BLOCKSIZE": BLOCK_PX,
+        "BIGTIFF": "IF_SAFER",
+        "OVERVIEW_RESAMPLING": "AVERAGE",
+        "SPARSE_OK": "YES",
+        "NUM_THREADS": "2",
+        "COMPRESS": "DEFLATE",
+        "PREDICTOR": "YES",
+    }
+    with rasterio.open(raw) as written:
+        bytes_only = set(written.dtypes) == {"uint8"} and written.count in (1, 3)
+        if request.compress == "jpeg" and bytes_only:
+            options |= {"COMPRESS": "JPEG", "QUALITY": request.quality, "PREDICTOR": "NO"}
+        rasterio.shutil.copy(raw, out, driver="COG", **options)
+        with rasterio.open(out) as packed:
+            for name in ("shape", "transform", "crs", "count"):
+                if getattr(packed, name) != getattr(written, name):
+                    raise OutputError(f"the packed file differs from the mosaic: {out}")
+
+
+def _tags(provenance: Provenance, selection: Selection) -> dict[str, str]:
+    """Origin, terms and dates as tags of the file, without keys.
+
+    ACQUISITION_DATE is the date of the imagery as far as it is known; TIFFTAG_DATETIME exists only
+    where the day is known, because that tag has no shorter form.
+    """
+    tags = {
+        "ORTHONAV_SOURCE": provenance.source,
+        "ORTHONAV_LAYER": provenance.layer,
+        "ORTHONAV_LICENCE": provenance.licence or "unknown",
+        "ORTHONAV_ATTRIBUTION": provenance.attribution or "",
+        "ORTHONAV_NOTE": provenance.note or "",
+        "ORTHONAV_VERTICAL_DATUM": provenance.datum or "",
+        "ORTHONAV_FETCHED": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "ORTHONAV_GSD_M": json.dumps(round(selection.gsd_m, 4)),
+        "TIFFTAG_COPYRIGHT": provenance.attribution or "",
+        "TIFFTAG_SOFTWARE": f"orthonav {__version__}",
+    }
+    date = provenance.date
+    if date is not None:
+        tags["ACQUISITION_DATE"] = date.partition("/")[0]
+        if "/" in date:
+            tags["ORTHONAV_DATES"] = date
+        elif len(date) == 10:
+            tags["TIFFTAG_DATETIME"] = date.replace("-", ":") + " 00:00:00"
+    return {name: value for name, value in tags.items() if value}

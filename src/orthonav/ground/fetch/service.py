@@ -147,7 +147,6 @@ def _xml(tag: str, content: Any) -> str:
 
 
 def _read(web: Web, description: str, window: Window, where: str) -> NDArray[Any]:
-    """Bands of a window, requested again after a temporary failure. Raises `FetchError`."""
     for attempt in range(web.limits.attempts):
         web.limits.pause(attempt)
         try:

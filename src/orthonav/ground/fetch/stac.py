@@ -18,12 +18,9 @@ from orthonav.ground.fetch.options import (
 from orthonav.ground.fetch.urls import TOKEN, Secret, linked, origin_of, with_query
 from orthonav.ground.fetch.web import Web
 
-MAX_ITEMS = 500
-"""Files of one fetch: an open dataset each, per thread."""
-MAX_DOCUMENTS = 2000
-"""Documents of one search."""
-PAGE = 100
-"""Items per page; APIs allow at least this many."""
+MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
+MAX_DOCUMENTS = 2000  # documents of one search
+PAGE = 100  # items per page; APIs allow at least this many
 _TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
 _PREFERRED = ("visual", "image", "ortho", "data", "rgb")
 Box = tuple[float, float, float, float]
@@ -83,7 +80,6 @@ def _signed(web: Web, token_url: str, urls: list[str]) -> list[str]:
 
 
 def _features(web: Web, url: str, box_deg: Box, options: ImageryOptions) -> Features:
-    """Items that may touch a box, each with the address of its document."""
     root = web.get_json(url)
     search, listing = _related(root, "search"), _related(root, "items")
     query: dict[str, Any] = {"bbox": list(box_deg), "limit": PAGE}
@@ -121,7 +117,6 @@ def _paged(web: Web, url: str, body: dict[str, Any] | None) -> Features:
 
 
 def _walked(web: Web, url: str, root: dict[str, Any]) -> Features:
-    """Items of a static catalogue, depth first, each document once."""
     stack, known = [(url, root)], {url}
     for _ in range(MAX_DOCUMENTS):
         if not stack:
@@ -169,7 +164,6 @@ def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str
 
 
 def _touches(feature: dict[str, Any], box_deg: Box) -> bool:
-    """Whether an item's box meets the box; one without a valid box may."""
     try:
         box = [float(value) for value in feature["bbox"]]
         west, south, east, north = box if len(box) == 4 else (*box[:2], *box[3:5])
@@ -179,7 +173,6 @@ def _touches(feature: dict[str, Any], box_deg: Box) -> bool:
 
 
 def _time(feature: dict[str, Any]) -> str:
-    """Time of an item, or its start; empty where there is none."""
     properties = feature.get("properties")
     known = properties if isinstance(properties, dict) else {}
     return str(known.get("datetime") or known.get("start_datetime") or "")
@@ -197,7 +190,6 @@ def _in_time(time: str, wanted: str | None) -> bool:
 
 
 def _related(document: dict[str, Any], *kinds: str) -> list[dict[str, Any]]:
-    """Links of a document of these kinds, each with its `href`."""
     links = document.get("links")
     known = [link for link in links if isinstance(link, dict)] if isinstance(links, list) else []
     return [

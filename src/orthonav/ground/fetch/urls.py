@@ -10,8 +10,7 @@ from urllib.parse import parse_qsl, quote, urlencode, urljoin, urlsplit, urlunsp
 from orthonav.core.errors import FetchError
 
 KEY = "{key}"
-TOKEN = "{token}"
-"""Placeholder of a query string that a signing service issued for a file server."""
+TOKEN = "{token}"  # placeholder of a query string that a signing service issued for a file server
 MAX_URL = 4096
 """Longest address, characters: half of what servers accept by default (8 KB of header)."""
 _SECRET_NAME = re.compile(

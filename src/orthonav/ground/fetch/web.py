@@ -162,7 +162,6 @@ class Web:
         raise FetchError(self.redacted(f"{failure}: {shown(url)}"))
 
     def _excerpt(self, body: bytes) -> str:
-        """The beginning of an answer as text on one line, for an error."""
         text = body[:2000].decode("utf-8", errors="replace")
         if "\0" in text or 10 * text.count("\ufffd") > len(text):
             return f"{len(body)} bytes that are not text"

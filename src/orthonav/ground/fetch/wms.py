@@ -24,8 +24,7 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web, texts
 from orthonav.ground.planning.area import Area
 
-CELL_PX = 1024
-"""Width of the images requested: services render several per second at this size."""
+CELL_PX = 1024  # width of the images requested: services render several per second at this size
 _MIN_CELL_PX = 64
 _VERSIONS = ("1.3.0", "1.1.1")
 
@@ -91,7 +90,6 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
 
 
 def _layers(root: Element) -> dict[str, list[Element]]:
-    """Layers by name, each with the layers that it lies in, whose properties it inherits."""
     found: dict[str, list[Element]] = {}
     stack = [[layer] for layer in root.findall("Capability/Layer")]
     while stack:
@@ -110,7 +108,6 @@ def _times(chain: list[Element]) -> list[str]:
 
 
 def _crs_names(options: list[str]) -> dict[str, str]:
-    """Names of coordinate systems in the document by EPSG name."""
     crs: dict[str, str] = {}
     for option in (name for text in options for name in text.split()):
         try:

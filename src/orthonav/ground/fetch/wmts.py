@@ -34,12 +34,10 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web, texts
 from orthonav.ground.planning.area import Area
 
-PIXEL_M = 0.28e-3
-"""Width of the standardized pixel of scale denominators (OGC 07-057r7, 6.1)."""
+PIXEL_M = 0.28e-3  # width of the standardized pixel of scale denominators (OGC 07-057r7, 6.1)
 METRES_PER_DEGREE = 6378137.0 * math.pi / 180
 """At the equator of WGS84, as scale denominators are defined (OGC 07-057r7, 6.1)."""
-MAX_TILE_PX = 4096
-"""Largest tile that is accepted; usual ones have 256 or 512 px."""
+MAX_TILE_PX = 4096  # largest tile that is accepted; usual ones have 256 or 512 px
 
 
 def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
@@ -89,7 +87,6 @@ def _id(element: Element) -> list[str]:
 
 
 def _style(layer: Element, name: str, options: ImageryOptions) -> str:
-    """The style requested, else the preferred one, else the default."""
     elements = sorted(layer.iterfind("Style"), key=lambda each: each.get("isDefault") != "true")
     styles = [style for element in elements for style in _id(element)] or ["default"]
     preferred = options.preferred_style if options.preferred_style in styles else None
@@ -111,7 +108,6 @@ def _dimensions(layer: Element, name: str, options: ImageryOptions) -> dict[str,
 
 
 def _kvp_url(root: Element) -> str | None:
-    """Address of requests by parameters, if the service takes them."""
     for method in root.iterfind("OperationsMetadata/Operation[@name='GetTile']/DCP/HTTP/Get"):
         encodings = texts(method, "Constraint[@name='GetEncoding']/AllowedValues/Value")
         if not encodings or "KVP" in encodings:
@@ -122,7 +118,6 @@ def _kvp_url(root: Element) -> str | None:
 def _grids(
     root: Element, layer: Element, name: str, options: ImageryOptions
 ) -> tuple[str, dict[str, CellGrid]]:
-    """Name of the matrix set that fits the options, and the grids of its zoom levels by name."""
     known = {name: each for each in root.iterfind("Contents/TileMatrixSet") for name in _id(each)}
     links = {}
     by_crs: dict[str, str] = {}
@@ -199,7 +194,6 @@ def _whole(element: Element, tag: str) -> int:
 def _chosen_zoom(
     grids: dict[str, CellGrid], name: str, options: ImageryOptions, frame: LocalFrame
 ) -> str:
-    """The zoom level requested, else the one whose resolution fits."""
     scale = mean_scale(next(iter(grids.values())).crs, frame)
     gsds_m = [scale * grid.res_x for grid in grids.values()]
     named = zip(grids, gsds_m, strict=True)
@@ -219,6 +213,5 @@ def _number(zoom: str) -> int | None:
 
 
 def _is_within(zoom: str, options: ImageryOptions) -> bool:
-    """Whether a zoom lies within those that the preset names."""
     number, low, high = _number(zoom), options.min_zoom, options.max_zoom
     return number is None or ((low or 0) <= number and (high is None or number <= high))

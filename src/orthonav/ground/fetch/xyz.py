@@ -12,8 +12,7 @@ from orthonav.ground.fetch.options import SourceSpec, finest_fitting
 from orthonav.ground.fetch.service import CellSource, service_source
 from orthonav.ground.planning.area import Area
 
-MAX_ZOOM = 24
-"""Finest zoom level, 9 mm per pixel at the equator: finer than any orthophoto."""
+MAX_ZOOM = 24  # finest zoom level, 9 mm per pixel at the equator: finer than any orthophoto
 _PARTS = {"z", "x", "y", "-y", "q", "s", "r", "key"}
 
 

@@ -56,6 +56,7 @@ _TOPICS = [
     "distance_sensor",
     "home_position",
 ]
+DAMAGED = "log is damaged: views from the damage on may lack telemetry"
 Columns = dict[str, NDArray[Any]]
 
 
@@ -217,55 +218,30 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
     """
     core = needed("pyulog.core", "PX4 logs")
     with reading("PX4 log", path, silent=True), path.open("rb") as stream:
-        log = _watched(core.ULog)(stream, _TOPICS)
+        log = core.ULog(stream, _TOPICS)
         topics: dict[str, Columns] = {one.name: one.data for one in reversed(log.data_list)}
         gps = topics.get("vehicle_gps_position") or topics.get("sensor_gps") or {}
         shift_us = _utc_shift_us(gps)
         attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
         if attitude is None:
-            damaged = "" if log.damaged_us is None else ", and is damaged"
+            damaged = ", and is damaged" if log.file_corruption else ""
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")
-        position = _position(gps, topics, shift_us)
+        position, local = _position(gps, topics, shift_us), topics.get("vehicle_local_position", {})
         return RecordedTrack(
             attitude=attitude,
-            heights=_heights(topics, shift_us),
-            home=_home(topics, shift_us),
+            heights=_heights(local, topics.get("distance_sensor", {}), shift_us),
+            home=_home(local, topics, shift_us),
             amsl=altitude_series(position),
             hae=_hae(gps, shift_us),
             position=position,
-            velocity=_velocity(topics.get("vehicle_local_position", {}), shift_us),
+            velocity=None
+            if "vx" not in local
+            else _series(
+                local, [local["vy"], local["vx"]], shift_us, _flag(local, "v_xy_valid", 1) != 0
+            ),
             origin_ns=int(attitude.time_ns[0]),
-            warnings=_damage(log.damaged_us, int(attitude.time_ns[0]), shift_us),
+            warnings=(DAMAGED,) if log.file_corruption else (),
         )
-
-
-def _watched(reader: type[Any]) -> type[Any]:
-    """The reader of pyulog, which notes the time of the message at which it finds corruption."""
-
-    class WatchedULog(reader):  # type: ignore[misc]
-        damaged_us: int | None = None
-
-        @property
-        def _file_corrupt(self) -> bool:
-            return self.damaged_us is not None
-
-        @_file_corrupt.setter
-        def _file_corrupt(self, found: bool) -> None:
-            if found and self.damaged_us is None:
-                self.damaged_us = getattr(self, "_last_timestamp", 0)
-
-    return WatchedULog
-
-
-def _damage(damaged_us: int | None, first_ns: int, shift_us: int) -> tuple[str, ...]:
-    """A warning about the time from which a log is damaged, after its first attitude."""
-    if damaged_us is None:
-        return ()
-    after_s = max(0.0, ((damaged_us + shift_us) * 1000 - first_ns) / 1e9)
-    return (
-        f"log is damaged from {after_s:.1f} s after its first attitude: views from then on may "
-        "lack telemetry",
-    )
 
 
 def _utc_shift_us(gps: Columns) -> int:
@@ -291,59 +267,49 @@ def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> TimeSeries 
 
 
 def _series(
-    columns: Columns, values: list[NDArray[Any]], sound: NDArray[Any], shift_us: int
+    columns: Columns, values: list[NDArray[Any]], shift_us: int, sound: NDArray[Any] | None = None
 ) -> TimeSeries | None:
-    """The series of these columns of values where they are sound."""
-    table = np.stack(values, axis=1).astype(np.float64)
-    return series_of(_time_ns(columns, shift_us)[sound], table[sound])
+    table, times = np.stack(values, axis=1).astype(np.float64), _time_ns(columns, shift_us)
+    return series_of(times, table) if sound is None else series_of(times[sound], table[sound])
 
 
-def _valid(columns: Columns, name: str) -> NDArray[np.bool_]:
-    """Where a flag is set; everywhere where it was not logged."""
-    return np.asarray(columns.get(name, np.ones(len(columns["timestamp"]))) != 0)
+def _flag(columns: Columns, name: str, otherwise: float) -> NDArray[Any]:
+    """A column, or one value everywhere where it was not logged."""
+    return np.asarray(columns.get(name, np.full(len(columns["timestamp"]), otherwise)))
 
 
-def _has_fix(columns: Columns) -> NDArray[np.bool_]:
-    return np.asarray(columns.get("fix_type", np.full(len(columns["timestamp"]), 3)) >= 3)
-
-
-def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[TimeSeries, ...]:
+def _heights(local: Columns, sensor: Columns, shift_us: int) -> tuple[TimeSeries, ...]:
     """Heights above ground by distance sensor: the estimator's, then the raw one."""
-    local = topics.get("vehicle_local_position", {})
-    sensor = topics.get("distance_sensor", {})
     found = []
     if "dist_bottom" in local:
-        valid = _valid(local, "dist_bottom_valid")
         # Without a sensor the estimator guesses, and calls its guess valid.
-        sensors = local.get("dist_bottom_sensor_bitfield", np.full(len(valid), len(sensor)))
-        found.append(_series(local, [local["dist_bottom"]], valid & (sensors != 0), shift_us))
+        sound = _flag(local, "dist_bottom_sensor_bitfield", len(sensor)) != 0
+        sound &= _flag(local, "dist_bottom_valid", 1) != 0
+        found.append(_series(local, [local["dist_bottom"]], shift_us, sound))
     if "current_distance" in sensor:
         distance = sensor["current_distance"]
-        valid = sensor.get("orientation", np.full(len(distance), _DOWNWARD)) == _DOWNWARD
-        valid &= distance > sensor.get("min_distance", np.zeros(len(distance)))
-        valid &= distance < sensor.get("max_distance", np.full(len(distance), np.inf))
-        found.append(_series(sensor, [distance], valid, shift_us))
+        sound = _flag(sensor, "orientation", _DOWNWARD) == _DOWNWARD
+        sound &= distance > _flag(sensor, "min_distance", 0)
+        sound &= distance < _flag(sensor, "max_distance", np.inf)
+        found.append(_series(sensor, [distance], shift_us, sound))
     return tuple(series for series in found if series is not None)
 
 
-def _home(topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
+def _home(local: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
     """Height above home, or above the origin of the local frame, which is where PX4 started."""
-    local = topics.get("vehicle_local_position", {})
     place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
     if "alt" in place and "alt" in home:
         above = place["alt"].astype(np.float64) - float(home["alt"][-1])
-        return _series(place, [above], np.ones(len(above), dtype=bool), shift_us)
+        return _series(place, [above], shift_us)
     if "z" not in local:
         return None
-    return _series(local, [-local["z"]], _valid(local, "z_valid"), shift_us)
+    return _series(local, [-local["z"]], shift_us, _flag(local, "z_valid", 1) != 0)
 
 
 def _hae(gps: Columns, shift_us: int) -> TimeSeries | None:
-    """Height of the GPS receiver above the ellipsoid."""
-    if "altitude_ellipsoid_m" in gps:  # since PX4 1.14
-        return _series(gps, [gps["altitude_ellipsoid_m"]], _has_fix(gps), shift_us)
-    if "alt_ellipsoid" in gps:
-        return _series(gps, [gps["alt_ellipsoid"] * 1e-3], _has_fix(gps), shift_us)
+    for name, metres in (("altitude_ellipsoid_m", 1), ("alt_ellipsoid", 1e-3)):  # since PX4 1.14
+        if name in gps:
+            return _series(gps, [gps[name] * metres], shift_us, _flag(gps, "fix_type", 3) >= 3)
     return None
 
 
@@ -358,11 +324,5 @@ def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSe
         if "lat" not in gps:
             return None
         parts = gps["lat"], gps["lon"], gps["alt"]
-    place, sound = np.stack(parts, axis=1).astype(np.float64), _has_fix(gps)
+    place, sound = np.stack(parts, axis=1).astype(np.float64), _flag(gps, "fix_type", 3) >= 3
     return position_series(_time_ns(gps, shift_us)[sound], place[sound])
-
-
-def _velocity(local: Columns, shift_us: int) -> TimeSeries | None:
-    if "vx" not in local:
-        return None
-    return _series(local, [local["vy"], local["vx"]], _valid(local, "v_xy_valid"), shift_us)

@@ -37,12 +37,9 @@ from orthonav.onboard.motion import (
     explained_share,
 )
 
-GAP_S = 1.0
-"""Longest interval between views over which telemetry is interpolated."""
-EVERY_S = 10.0
-"""Interval of estimates."""
-LEAST = 3
-"""Number of estimates that must agree."""
+GAP_S = 1.0  # longest interval between views over which telemetry is interpolated
+EVERY_S = 10.0  # interval of estimates
+LEAST = 3  # number of estimates that must agree
 AGREE_S, AGREE_SIGMAS = 0.1, 4.0
 NEEDED = (
     "fly at least two minutes at a height where the ground is textured, with turns of 10 deg/s or "
@@ -57,14 +54,12 @@ PAIR_SHARE, KNOWN_SHARE = 0.9, 0.6
 candidate."""
 SCALE_STD, ACROSS_STD, MOUNT_STD_RAD = 0.25, 0.2, 0.08
 """Prior of errors: height (share), direction of the velocity, orientation of the camera (rad)."""
-ANY_STD = 1.5
-"""Prior of scale and direction where the heading is not known."""
+ANY_STD = 1.5  # prior of scale and direction where the heading is not known
 CONSTANT_STD, FREE_STD = 0.01, 0.5
 """Prior of a constant shift per second: by the tilt of the mount; by an unknown velocity."""
 SHARE_STD = 0.08
 """Standard deviation of the shift by velocity as a share of it: relief, changes of height."""
-NEAR_S, NEAR_MASS = 0.35, 0.99
-"""A latency is found where this probability lies this close to it."""
+NEAR_S, NEAR_MASS = 0.35, 0.99  # a latency is found where this probability lies this close to it
 LARGEST_STD_S, FLOOR_S = 0.3, 0.025
 """Largest standard deviation of an answer; least one: half an interval of the stored states."""
 EXPLAINED, STANDS_OUT = 0.6, 2.0
@@ -75,10 +70,8 @@ deviations, are explained by less than this share at any latency."""
 SCALES, ACROSS, CLEAR_STD = (0.5, 2.0), 0.6, 0.3
 """Fitted scale and direction (rad) of the velocity beyond which pictures contradict the autopilot,
 and the standard deviation of the scale below which they can."""
-LEAST_WEIGHT = 0.5
-"""Least mean weight of the pairs: 1 without outliers."""
-OUTLIER, MAD_TO_STD = 3.0, 1.4826
-"""Scale of the Cauchy weights, in standard deviations."""
+LEAST_WEIGHT = 0.5  # least mean weight of the pairs: 1 without outliers
+OUTLIER, MAD_TO_STD = 3.0, 1.4826  # scale of the Cauchy weights, in standard deviations
 ALIKE = 4.0
 """Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
 the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""

@@ -33,7 +33,7 @@ _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0x
 _ZOOM = 0xA404
 _QUARTER_HOUR = timedelta(minutes=15)
 _FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
-_BODY_YAW, _CAMERA_PITCH, _CAMERA_YAW, _CAMERA_ROLL = 7, 9, 10, 11
+_BODY_YAW, _CAMERA_ANGLES = 7, (10, 9, 11)  # yaw, pitch, roll
 _VALUE = re.compile(
     r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
     r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
@@ -58,8 +58,7 @@ class PhotoPose:
     yaw_deg: float = math.nan
     pitch_deg: float = math.nan
     roll_deg: float = math.nan
-    yaw_std_deg: float | None = None
-    """Standard deviation of the heading, None for the usual one."""
+    yaw_std_deg: float | None = None  # standard deviation of the heading, None for the usual one
     tilt_std_deg: float | None = None
     """Standard deviation of pitch and roll by what recorded them, None where they are unknown."""
 
@@ -69,44 +68,29 @@ class Photo:
     """Metadata of one photograph; NaN and None where it has none."""
 
     path: Path
-    width_px: int
-    """Columns of the image."""
-    height_px: int
-    """Rows of the image."""
-    time_ns: int | None
-    """Time of exposure, UTC."""
+    width_px: int  # columns of the image
+    height_px: int  # rows of the image
+    time_ns: int | None  # time of exposure, UTC
     zone_known: bool
     """Whether the time zone was known; otherwise the camera's clock is assumed to be UTC."""
-    latlon_deg: tuple[float, float] | None
-    """Recorded position."""
-    alt_m: float
-    """Recorded altitude; its reference differs between makers."""
+    latlon_deg: tuple[float, float] | None  # recorded position
+    alt_m: float  # recorded altitude; its reference differs between makers
     gimbal_deg: tuple[float, float, float] | None
     """Yaw, pitch, roll of the gimbal as recorded, of a camera that looks ahead at 0, 0, 0."""
     rotation: NDArray[np.float64] | None
     """Attitude as `enu_from_camera` of a camera without a gimbal."""
-    body_yaw_deg: float
-    """Heading of the aircraft."""
-    home_m: float
-    """Height above take-off."""
-    amsl_m: float
-    """Height above mean sea level, where its reference is stated."""
-    hae_m: float
-    """Height above the ellipsoid, where its reference is stated."""
-    vel_en_mps: tuple[float, float] | None
-    """Velocity over ground, east and north."""
-    optics: Optics
-    """Camera and lens."""
-    software: str
-    """Programs that wrote the file; of a camera its firmware."""
-    agl_m: float = math.nan
-    """Height above ground, where a table states it."""
+    body_yaw_deg: float  # heading of the aircraft
+    home_m: float  # height above take-off
+    amsl_m: float  # height above mean sea level, where its reference is stated
+    hae_m: float  # height above the ellipsoid, where its reference is stated
+    vel_en_mps: tuple[float, float] | None  # velocity over ground, east and north
+    optics: Optics  # camera and lens
+    software: str  # programs that wrote the file; of a camera its firmware
+    agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
-    row: ImageRow | None = None
-    """What a table says of it."""
-    pose: PhotoPose = PhotoPose()
-    """Its attitude, once all photographs of the flight are known."""
+    row: ImageRow | None = None  # what a table says of it
+    pose: PhotoPose = PhotoPose()  # its attitude, once all photographs of the flight are known
 
 
 def read_photo(path: Path) -> Photo:
@@ -131,7 +115,7 @@ def read_photo(path: Path) -> Photo:
     time_ns, zone_known = xmp.time_ns, True
     if time_ns is None:
         time_ns, zone_known = _time(tags, more, gps)
-    latlon, alt = _place(gps)
+    latlon, alt, unsigned = _place(gps)
     rtk = xmp.first("drone-dji:RtkFlag") > 0
     north, east = (
         xmp.first(f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
@@ -140,7 +124,7 @@ def read_photo(path: Path) -> Photo:
     if math.isnan(body_yaw) and not xmp.unread:
         body_yaw = heading
     doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
-    if latlon is None and _lacks_references(gps):
+    if unsigned:
         doubts.append("GPS position without N or S, or without E or W")
     return Photo(
         path=path,
@@ -224,31 +208,22 @@ def _gps_time(gps: dict[int, Any]) -> datetime | None:
         return None
 
 
-def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float]:
-    """Latitude and longitude in degrees, and altitude (tags 1 to 6)."""
+def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, bool]:
+    """Latitude and longitude in degrees, altitude, and whether N, S, E or W is missing (tags 1 to
+    6)."""
     alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, b"\x01") else 1))
     try:
         lat, lon = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
     except (KeyError, ValueError, TypeError, ZeroDivisionError):
-        return None, alt
-    if _lacks_references(gps):
-        return None, alt
-    south, west = (_reference(gps, tag) in ("S", "W") for tag in (1, 3))
-    lat, lon = -lat if south else lat, -lon if west else lon
+        return None, alt, False
+    references = [gps.get(tag, "") for tag in (1, 3)]
+    texts = [one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in references]
+    north, east = (text.upper().strip("\0 ")[:1] for text in texts)
+    if north not in tuple("NS") or east not in tuple("EW"):
+        return None, alt, True
+    lat, lon = -lat if north == "S" else lat, -lon if east == "W" else lon
     sound = abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0)
-    return ((lat, lon) if sound else None), alt
-
-
-def _reference(gps: dict[int, Any], tag: int) -> str:
-    value = gps.get(tag, "")
-    text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
-    return text.upper().strip("\0 ")[:1]
-
-
-def _lacks_references(gps: dict[int, Any]) -> bool:
-    """Whether latitude or longitude have no sign: no N, S, E or W."""
-    placed = 2 in gps and 4 in gps
-    return placed and not (_reference(gps, 1) in tuple("NS") and _reference(gps, 3) in tuple("EW"))
+    return ((lat, lon) if sound else None), alt, False
 
 
 def _number(value: Any) -> float:
@@ -267,29 +242,20 @@ def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float]
     """
     if make.upper() != "DJI":
         return None, math.nan
-    # Programs that rewrite EXIF may change its byte order but not that of the notes.
-    values = next(filter(None, (_floats(data, order) for order in "<>")), {})
-    yaw, pitch, roll = (
-        values.get(tag, math.nan) for tag in (_CAMERA_YAW, _CAMERA_PITCH, _CAMERA_ROLL)
-    )
+    values: dict[int, float] = {}
+    for (
+        order
+    ) in "<>":  # programs that rewrite EXIF may change its byte order, not that of the notes
+        count = struct.unpack_from(f"{order}H", data.ljust(2, b"\0"))[0]
+        if values or not 1 <= count <= _MAX_ENTRIES or len(data) < 2 + count * _ENTRY_BYTES:
+            continue
+        for number in range(count):
+            entry = struct.unpack_from(f"{order}HHIf", data, 2 + number * _ENTRY_BYTES)
+            if entry[1:3] == (_FLOAT, 1) and abs(entry[3]) <= 360:
+                values[entry[0]] = entry[3]
+    yaw, pitch, roll = (values.get(tag, math.nan) for tag in _CAMERA_ANGLES)
     known = math.isfinite(yaw + pitch + roll)
     return (yaw, pitch, roll) if known else None, values.get(_BODY_YAW, math.nan)
-
-
-def _floats(data: bytes, order: str) -> Mapping[int, float]:
-    """Single floats by tag; empty where this is no IFD of that byte order."""
-    if len(data) < 2:
-        return {}
-    (count,) = struct.unpack_from(f"{order}H", data)
-    if not 1 <= count <= _MAX_ENTRIES or len(data) < 2 + count * _ENTRY_BYTES:
-        return {}
-    found = {}
-    for number in range(count):
-        entry = struct.unpack_from(f"{order}HHIf", data, 2 + number * _ENTRY_BYTES)
-        tag, kind, values, value = entry
-        if kind == _FLOAT and values == 1 and abs(value) <= 360:
-            found[tag] = value
-    return found
 
 
 @dataclass(frozen=True)
@@ -297,10 +263,8 @@ class Xmp:
     """The values of a packet by prefix and name, and what they mean; NaN and None for missing."""
 
     values: Mapping[str, float]
-    time_ns: int | None
-    """UTC at exposure."""
-    writer: str
-    """Program that wrote the packet, empty where it is not named."""
+    time_ns: int | None  # UTC at exposure
+    writer: str  # program that wrote the packet, empty where it is not named
     unread: tuple[str, ...] = ()
     """Angles, heights and positions that are not numbers, as name and value."""
 
@@ -365,7 +329,6 @@ class Xmp:
 
 
 def _stated(text: str) -> float:
-    """The number in a text, NaN where it is none."""
     found = _NUMBER.fullmatch(text)
     if found is None:
         return math.nan
@@ -379,8 +342,8 @@ def _exposed_ns(text: str) -> int | None:
     if found is None:
         return None
     try:
-        year, month, day, hour, minute, second = map(int, found.groups()[:6])
-        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+        whole = datetime.strptime(" ".join(found.groups()[:6]), "%Y %m %d %H %M %S")
     except ValueError:
         return None
+    whole = whole.replace(tzinfo=UTC)
     return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import escape
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import VariantError
 from orthonav.core.files import write_text
@@ -27,8 +25,7 @@ from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.records import MAP_STD_M, Fix, ViewResult
 
 _XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
-_YEAR_2000_NS = 946_684_800 * 10**9
-"""Earlier times count from something else than 1970."""
+_YEAR_2000_NS = 946_684_800 * 10**9  # earlier times count from something else than 1970
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
 
 
@@ -81,57 +78,48 @@ def export_of(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
-def export(path: Path, name: str, positions: Sequence[CameraPosition]) -> None:
-    """Write positions in the format `name`, replacing an existing file atomically."""
-    write_text(path, FORMATS[name](positions))
-
-
 def export_all(
     exports: Sequence[tuple[str, Path]],
     results: Sequence[ViewResult],
     terrain: TerrainHeights | None,
 ) -> None:
-    """Write the camera positions of a flight in formats and to paths of `export_of`."""
+    """Write the camera positions of a flight in formats and to paths of `export_of`.
+
+    Existing files are replaced atomically.
+    """
     positions = camera_positions(results, terrain) if exports else []
     for name, path in exports:
-        export(path, name, positions)
+        write_text(path, FORMATS[name](positions))
+
+
+def _fixed(value: float, decimals: int = 3) -> str:
+    return "" if math.isnan(value) else f"{value:.{decimals}f}"
 
 
 def _csv(positions: Sequence[CameraPosition]) -> str:
-    rows = [
-        [
-            each.frame,
-            f"{each.fix.lat_deg:.8f}",
-            f"{each.fix.lon_deg:.8f}",
-            *(
-                "" if math.isnan(value) else f"{value:.3f}"
-                for value in (each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m)
-            ),
-        ]
-        for each in positions
-    ]
-    return _table([CSV_COLUMNS, *rows])
+    rows: list[Sequence[str]] = [CSV_COLUMNS]
+    for each in positions:
+        place = _fixed(each.fix.lat_deg, 8), _fixed(each.fix.lon_deg, 8)
+        values = each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m
+        rows.append([each.frame, *place, *map(_fixed, values)])
+    return _table(rows)
 
 
 def _geojson(positions: Sequence[CameraPosition]) -> str:
-    """Points (RFC 7946), with heights above sea where they are known."""
     features = []
     for each in positions:
         point = [round(each.fix.lon_deg, 8), round(each.fix.lat_deg, 8)]
         if not math.isnan(each.height_m):
             point.append(round(each.height_m, 3))
-        about: dict[str, Any] = {
-            "frame": each.frame,
+        numbers = {
             "agl_m": round(each.fix.agl_m, 3),
             "heading_deg": round(each.fix.heading_deg, 3),
             "std_m": round(each.std_m, 3),
             "confidence": round(each.fix.confidence, 4),
         }
-        about = {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in about.items()
-        }
+        known = {key: value if math.isfinite(value) else None for key, value in numbers.items()}
         geometry = {"type": "Point", "coordinates": point}
+        about = {"frame": each.frame, **known}
         features.append({"type": "Feature", "geometry": geometry, "properties": about})
     return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
 
@@ -160,31 +148,20 @@ def _exif(positions: Sequence[CameraPosition]) -> str:
         *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
         *("GPSHPositioningError", "GPSMapDatum"),
     )
-    rows = []
+    rows: list[Sequence[str]] = [header]
     for each in positions:
-        height = ["", ""]
-        if not math.isnan(each.height_m):
-            height = [
-                f"{abs(each.height_m):.3f}",
-                "Above Sea Level" if each.height_m >= 0 else "Below Sea Level",
-            ]
-        heading = ["", ""]
-        if not math.isnan(each.fix.heading_deg):
-            heading = [f"{each.fix.heading_deg:.2f}", "True North"]
+        lat, lon, height_m = each.fix.lat_deg, each.fix.lon_deg, each.height_m
+        level = f"{'Below' if height_m < 0 else 'Above'} Sea Level"
+        heading = _fixed(each.fix.heading_deg, 2)
         rows.append(
             [
-                each.frame,
-                f"{abs(each.fix.lat_deg):.8f}",
-                "North" if each.fix.lat_deg >= 0 else "South",
-                f"{abs(each.fix.lon_deg):.8f}",
-                "East" if each.fix.lon_deg >= 0 else "West",
-                *height,
-                *heading,
-                f"{each.std_m:.3f}",
-                "WGS-84",
+                *(each.frame, _fixed(abs(lat), 8), "North" if lat >= 0 else "South"),
+                *(_fixed(abs(lon), 8), "East" if lon >= 0 else "West"),
+                *(_fixed(abs(height_m)), "" if math.isnan(height_m) else level),
+                *(heading, heading and "True North", _fixed(each.std_m), "WGS-84"),
             ]
         )
-    return _table([header, *rows])
+    return _table(rows)
 
 
 def _tum(positions: Sequence[CameraPosition]) -> str:
@@ -202,22 +179,13 @@ def _tum(positions: Sequence[CameraPosition]) -> str:
     for each in positions:
         east, north = plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()
         up = each.height_m if above_sea else each.fix.agl_m
-        angles = np.nan_to_num(
-            [each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg]
-        ).tolist()
-        numbers = " ".join(f"{value:.9f}" for value in _quaternion(enu_from_camera(*angles)))
+        angles = np.nan_to_num([each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg])
+        rotation = Rotation.from_matrix(enu_from_camera(*angles.tolist()))
+        numbers = " ".join(f"{value:.9f}" for value in rotation.as_quat(canonical=True))
         lines.append(
             f"{Decimal(each.view.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
         )
     return "\n".join(lines) + "\n"
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation (3, 3)."""
-    vector, _ = cv2.Rodrigues(rotation)
-    angle = float(np.linalg.norm(vector))
-    x, y, z = (vector.ravel() * (math.sin(angle / 2) / angle if angle else 0.0)).tolist()
-    return x, y, z, math.cos(angle / 2)
 
 
 def _are_above_sea(positions: Sequence[CameraPosition]) -> bool:

@@ -43,8 +43,7 @@ from orthonav.ground.recordings.recording import (
     with_options,
 )
 
-MAX_VIEWS = 500_000
-"""Ten a second for 14 hours; a small damaged file can claim far more."""
+MAX_VIEWS = 500_000  # ten a second for 14 hours; a small damaged file can claim far more
 MAX_MESSAGES = 10 * MAX_VIEWS
 MAX_NAME = 200
 MAX_THUMBNAIL_BYTES = 2**20
@@ -208,9 +207,10 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
 
 def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is given."""
+    folder = path if path.is_dir() else path.parent
+    files = sorted(file for file in folder.glob("*.mcap") if profile_of(file) == PROFILE)
+    found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
     if path.is_dir():
-        files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
-        found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
         runs = {run: file for file, run in reversed(found.items())}
         if len(runs) > 1:
             names = ", ".join(sorted(file.name for file in runs.values())[:5])
@@ -218,17 +218,11 @@ def files_of_run(path: Path) -> list[Path]:
                 f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
             )
         return list(found)
-    match = _NUMBERED.fullmatch(path.name)
-    run = run_of(path)
-    if match is None or run is None:
+    name, number = _order(path)
+    if _NUMBERED.fullmatch(path.name) is None or path not in found:
         return [path]
-    name, number = match[1], int(match[2])
-    later = []
-    for file in path.parent.glob("*.mcap"):
-        other = _NUMBERED.fullmatch(file.name)
-        if other and other[1] == name and int(other[2]) > number and profile_of(file) == PROFILE:
-            later.append(file)
-    return [path, *(file for file in sorted(later, key=_order) if run_of(file) == run)]
+    numbered = [each for each in found if found[each] == found[path] and _order(each)[0] == name]
+    return [each for each in numbered if _order(each)[1] >= number]
 
 
 def _order(path: Path) -> tuple[str, int]:
@@ -246,7 +240,6 @@ def run_of(path: Path) -> str | None:
 
 
 def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
-    """Read a file; warnings about its damage."""
     before, warnings = content.broken, []
     content.read(file)
     damaged, broken = file.walk.damaged, content.broken - before
@@ -263,7 +256,6 @@ def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
 
 
 def _session(data: bytes, path: Path) -> dict[str, Any]:
-    """The session of a log. Raises `FlightError` where it is damaged, or of a newer format."""
     plain = from_json(data)
     number = plain.get("format")
     if isinstance(number, int) and number > FORMAT:
@@ -358,14 +350,12 @@ def _unusable(where: str) -> Grey:
 def _arrivals(
     content: LogContent, camera: Camera, options: SourceOptions
 ) -> Iterator[tuple[SourceView, float]]:
-    """Views with an image, and the latency (s) that was subtracted from their arrival."""
     for each in content.views:
         if _has_image(each, content):
             yield _view(each, content, camera, options), (each.camera_latency_ms or 0.0) / 1e3
 
 
 def _results(files: list[Path]) -> Iterator[ViewResult]:
-    """The results of the flight; damaged ones are skipped."""
     for path in files:
         channels: dict[int, str] = {}
         for _, data in chunks(path, Walk()):

@@ -16,8 +16,7 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 MAX_FIELD_DEG = 110.0
 """Field of view along the longer side that is believed: wider lenses are fisheyes, whose pictures
 need a calibration."""
-_WIDE_ASPECT = 1.65
-"""Pictures at least as wide are parts of a sensor of 4:3."""
+_WIDE_ASPECT = 1.65  # pictures at least as wide are parts of a sensor of 4:3
 _FOUR_THIRDS = 4 / 3
 _GIVEN_STD, _PLANE_STD, _FILM_STD, _CROPPED_STD = 0.02, 0.03, 0.03, 0.06
 """Standard deviations by rule: focal lengths are rounded to 1 or 2 digits (2 to 3 %); whether a
@@ -35,8 +34,7 @@ class Sensor:
     height_px: int
     width_mm: float | None
     """Width of the sensor, for `FocalLength`; None: the 35 mm equivalent is the better value."""
-    std: float
-    """Standard deviation of the focal length, as a share of it."""
+    std: float  # standard deviation of the focal length, as a share of it
 
 
 _DJI_12MP = Sensor(4000, 3000, 6.2, 0.02)  # 1/2.3 inch, 1.55 um: the published fields of view
@@ -69,12 +67,9 @@ with their fields of view (docs/flights.md)."""
 class FocalLength:
     """A focal length for pictures of one size."""
 
-    px: float
-    """In pixels, above 0."""
-    std: float
-    """Its standard deviation, as a share of it."""
-    source: str
-    """Where it comes from, for people."""
+    px: float  # in pixels, above 0
+    std: float  # its standard deviation, as a share of it
+    source: str  # where it comes from, for people
 
     def field_deg(self, longer_px: int) -> float:
         """Field of view along a side of so many pixels."""
@@ -88,16 +83,11 @@ class Optics:
     make: str
     model: str
     focal_mm: float
-    film_mm: float
-    """Equivalent focal length on 35 mm film."""
-    plane: float
-    """`FocalPlaneXResolution`."""
-    plane_unit: int
-    """`FocalPlaneResolutionUnit`."""
-    taken_px: float
-    """Width of the picture as taken."""
-    zoom: float
-    """`DigitalZoomRatio`."""
+    film_mm: float  # equivalent focal length on 35 mm film
+    plane: float  # `FocalPlaneXResolution`
+    plane_unit: int  # `FocalPlaneResolutionUnit`
+    taken_px: float  # width of the picture as taken
+    zoom: float  # `DigitalZoomRatio`
 
 
 def focal_length(

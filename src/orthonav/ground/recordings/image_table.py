@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.folder import number_of
+from orthonav.core.flight.folder import check_latlon, number_of
 from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.attitude import (
     AUTOPILOT_TILT_STD_DEG,
@@ -23,7 +23,6 @@ from orthonav.core.geo.attitude import (
     enu_from_gimbal_camera,
 )
 from orthonav.core.geo.camera import attitude_of
-from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 
 MAX_BYTES = 100_000_000
@@ -52,8 +51,7 @@ _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
 _DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
-_COMPACT = re.compile(r"(19|20)\d{12}")
-"""A date and time in 14 digits."""
+_COMPACT = re.compile(r"(19|20)\d{12}")  # a date and time in 14 digits
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _LARGEST_S = 9e9
 
@@ -171,7 +169,6 @@ def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
 
 
 def _plain(name: str) -> str:
-    """A name of a column without unit, case and separators."""
     words = re.findall(r"[a-z0-9]+", _BRACKETS.sub("", name.lower()))
     if len(words) > 1 and words[-1] in _UNITS:
         words.pop()
@@ -191,7 +188,6 @@ def _numbers(
     comma: bool,
     path: Path,
 ) -> dict[str, float]:
-    """The numbers of a row, in metres and degrees; raises `FlightError` for other text."""
     values = {}
     for field, (name, metres) in columns.items():
         text = texts[field]
@@ -204,16 +200,14 @@ def _numbers(
             raise FlightError(f"line {line}: {name} is not a number, got {text!r:.40}: {path}")
         values[field] = measured(metres * value) if field in _HEIGHTS else value
     lat, lon = values.get("lat", math.nan), values.get("lon", math.nan)
-    if abs(lat) > 90 or abs(lon) > 360:
-        hint = swapped_hint(lat, lon)
-        raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
+    if not math.isnan(lat + lon):
+        check_latlon(lat, lon, line, path)
     return values
 
 
 def _is_gimbal(
     columns: Mapping[str, tuple[str, float]], rows: Sequence[Mapping[str, float]]
 ) -> bool:
-    """Whether the pitch counts from the horizon, as that of a gimbal does."""
     if "pitch" not in columns:
         return False
     known = [values["pitch"] for values in rows if "pitch" in values]
@@ -277,7 +271,6 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
 
 
 def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
-    """A warning that names the values a view needs and the table has not."""
     lacks = [
         f"{what} ({spelt})"
         for what, spelt, fields in (

@@ -38,8 +38,7 @@ _SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
 MAX_BYTES = 500_000_000
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
-_ENDS = (">", "]", ")")
-"""What blocks end with that are whole, besides the end of a line."""
+_ENDS = (">", "]", ")")  # what blocks end with that are whole, besides the end of a line
 _TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
 _GPS = re.compile(
@@ -63,6 +62,10 @@ _COLUMNS = {
 }
 """Columns of a table by the series of `RecordedTrack`."""
 _HEIGHTS = ("height", "home", "amsl", "hae")
+UNCLEAR_ORDER = (
+    "subtitles do not show whether GPS(..) begins with the latitude or the longitude: positions "
+    "are left out"
+)
 
 
 def log_kind(path: Path) -> str:
@@ -110,18 +113,13 @@ def read_log(path: Path, mount_deg: Angles) -> RecordedTrack:
 class SubtitleBlock:
     """One subtitle; values it does not hold are NaN."""
 
-    start_ns: int
-    """Begin in the video."""
-    end_ns: int
-    """End in the video."""
+    start_ns: int  # begin in the video
+    end_ns: int  # end in the video
     lat_deg: float = math.nan
     lon_deg: float = math.nan
-    alt_m: float = math.nan
-    """Altitude in the drone's own reference."""
-    height_m: float = math.nan
-    """Height above take-off."""
-    yaw_deg: float = math.nan
-    """Yaw of the gimbal, as are pitch and roll."""
+    alt_m: float = math.nan  # altitude in the drone's own reference
+    height_m: float = math.nan  # height above take-off
+    yaw_deg: float = math.nan  # yaw of the gimbal, as are pitch and roll
     pitch_deg: float = math.nan
     roll_deg: float = math.nan
 
@@ -132,6 +130,8 @@ def read_srt(path: Path) -> RecordedTrack:
     Raises `FlightError` where it has no telemetry.
     """
     data = path.read_bytes()
+    text = _decoded(data)
+    doubtful = _GPS.search(text) is not None and _latitude_first(text) is None
     timed = [(block.start_ns, block) for block in blocks(data)]
     if not timed:
         raise FlightError(f"subtitles hold no telemetry: {path}")
@@ -146,7 +146,7 @@ def read_srt(path: Path) -> RecordedTrack:
         home=height.series(),
         position=position.positions(),
         tilt_std_deg=GIMBAL_TILT_STD_DEG,
-        warnings=_warnings(data),
+        warnings=(UNCLEAR_ORDER,) * doubtful,
     )
     if track.attitude is None and track.position is None:
         raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
@@ -202,16 +202,6 @@ def _latitude_first(text: str) -> bool | None:
     longitude = any(each[2].isdecimal() and not each[3] for each in found)
     longitude = longitude or _HOME.search(text) is not None
     return None if latitude == longitude else latitude
-
-
-def _warnings(data: bytes) -> tuple[str, ...]:
-    text = _decoded(data)
-    if _GPS.search(text) is None or _latitude_first(text) is not None:
-        return ()
-    return (
-        "subtitles do not show whether GPS(..) begins with the latitude or the longitude: "
-        "positions are left out",
-    )
 
 
 def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> SubtitleBlock:
@@ -283,7 +273,6 @@ def read_table(path: Path) -> RecordedTrack:
 
 
 def _position(row: Mapping[str, str | None], line: int, path: Path) -> tuple[float, float]:
-    """Latitude and longitude of a row; raises `FlightError` where they seem to be swapped."""
     lat_deg, lon_deg = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
     prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
     if hint := swapped_hint(lat_deg, lon_deg) or swapped_hint(*prior):

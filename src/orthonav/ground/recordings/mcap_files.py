@@ -40,12 +40,9 @@ class Walk:
 
     next_offset: int = len(MAGIC)
     """Offset of the first record that was not read yet; reading a growing file continues there."""
-    lost_bytes: int = 0
-    """Bytes after the last complete record."""
-    damaged: int = 0
-    """Damaged chunks."""
-    ended: bool = False
-    """Whether the file has a proper end."""
+    lost_bytes: int = 0  # bytes after the last complete record
+    damaged: int = 0  # damaged chunks
+    ended: bool = False  # whether the file has a proper end
 
 
 def profile_of(path: Path) -> str | None:

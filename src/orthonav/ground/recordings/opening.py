@@ -54,10 +54,9 @@ def open_source(path: Path | Sequence[Path], options: SourceOptions | None = Non
     if len(paths) > 1:
         return open_photos(paths, options)
     kind = options.kind or source_kind(path)
-    if kind == "flight" and not path.is_dir():
-        raise FlightError(f"expected a folder for kind {kind}, got a file: {path}")
-    if kind == "video" and not path.is_file():
-        raise FlightError(f"expected a file for kind video, got a folder: {path}")
+    wanted = {"flight": "folder", "video": "file"}.get(kind)
+    if wanted and path.is_dir() != (wanted == "folder"):
+        raise FlightError(f"expected a {wanted} for kind {kind}: {path}")
     if kind == "flight":
         return _flight(open_flight(path, images_needed=not options.skip_bad_images), options)
     if kind == "photos":
@@ -160,18 +159,12 @@ def _flight_views(
 class Imported:
     """Number of views that were written."""
 
-    views: int
-    """All of them."""
-    with_truth: int
-    """Those with a true position."""
-    complete: int
-    """Those with all telemetry that a fix needs."""
-    broken: int
-    """Views left out because their image cannot be decoded, or has another size."""
-    first_broken: str
-    """The error of the first one of them."""
-    radians: bool
-    """Whether the headings look like radians."""
+    views: int  # all of them
+    with_truth: int  # those with a true position
+    complete: int  # those with all telemetry that a fix needs
+    broken: int  # views left out because their image cannot be decoded, or has another size
+    first_broken: str  # the error of the first one of them
+    radians: bool  # whether the headings look like radians
 
 
 def import_flight(
@@ -213,7 +206,6 @@ def import_flight(
 def _encoded_image(
     view: SourceView, recording: Recording, jpeg_quality: int | None
 ) -> tuple[str, bytes]:
-    """Name and bytes of the image as it is written, once it is decoded."""
     grey, camera = view.grey(), recording.camera
     if grey.shape != (camera.height_px, camera.width_px):
         raise FlightError(

@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
@@ -51,11 +49,9 @@ from orthonav.ground.recordings.recording import (
 
 log = logging.getLogger(__name__)
 
-UNKNOWN_YAW_STD_DEG = 180.0
-"""Standard deviation of a heading that may be off by any angle."""
+UNKNOWN_YAW_STD_DEG = 180.0  # standard deviation of a heading that may be off by any angle
 _TURNED_DEG = 5.0
 """A gimbal follows the aircraft within a few degrees; at more it would not report 0."""
-_OPPOSED_DEG = 135.0
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
 _EDITOR = re.compile(
@@ -66,8 +62,7 @@ _EDITOR = re.compile(
 )
 """Programs that show, turn or develop photographs."""
 _FIRMWARE = re.compile(r"[vV]?\d+(?:\.\d+)+")
-_BY_NAME_NS = 10**9
-"""Spacing of photographs without a time, which are ordered by name."""
+_BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered by name
 
 
 def photo_paths(folder: Path) -> list[Path]:
@@ -163,7 +158,11 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
         )
     edited = _edited(photos)
     if edited:
-        warnings.append(_edited_warning(photos, poses, edited))
+        warnings.append(
+            f"{len(edited)} of {len(photos)} photographs were written by an editor "
+            f"({photos[edited[0]].software}); one that was turned there has kept its angles, so "
+            "the heading of these is taken as unknown"
+        )
     for number in edited:
         poses[number] = replace(poses[number], yaw_std_deg=UNKNOWN_YAW_STD_DEG)
     return [
@@ -184,7 +183,6 @@ def _pose(photo: Photo, gimbal_unrecorded: bool) -> PhotoPose:
 
 
 def _pose_with_row(pose: PhotoPose, row: ImageRow | None) -> PhotoPose:
-    """The attitude of a photograph, where a table states it by the table."""
     if row is not None and math.isfinite(row.pitch_deg):
         tilt = {"pitch_deg": row.pitch_deg, "roll_deg": row.roll_deg}
         pose = replace(pose, **tilt, tilt_std_deg=row.tilt_std_deg)
@@ -197,7 +195,7 @@ def _is_unrecorded(photos: Sequence[Photo]) -> bool:
     """Whether the gimbal reports 0, 0, 0 in all photographs while the aircraft is turned."""
     if any(photo.gimbal_deg is None or any(photo.gimbal_deg) for photo in photos):
         return False
-    return any(abs(_signed(photo.body_yaw_deg)) > _TURNED_DEG for photo in photos)
+    return any(abs(math.remainder(photo.body_yaw_deg, 360)) > _TURNED_DEG for photo in photos)
 
 
 def _edited(photos: Sequence[Photo]) -> list[int]:
@@ -210,27 +208,6 @@ def _edited(photos: Sequence[Photo]) -> list[int]:
         if _EDITOR.search(photo.software)
         or (named and photo.software and not _FIRMWARE.match(photo.software))
     ]
-
-
-def _edited_warning(
-    photos: Sequence[Photo], poses: Sequence[PhotoPose], edited: Sequence[int]
-) -> str:
-    text = (
-        f"{len(edited)} of {len(photos)} photographs were written by an editor "
-        f"({photos[edited[0]].software}); one that was turned there has kept its angles, "
-        "so the heading of these is taken as unknown"
-    )
-    rest = [pose.yaw_deg for number, pose in enumerate(poses) if number not in set(edited)]
-    known = np.radians([heading for heading in rest if math.isfinite(heading)])
-    mean = math.degrees(math.atan2(np.sin(known).sum(), np.cos(known).sum()))
-    opposed = [abs(_signed(poses[each].yaw_deg - mean)) > _OPPOSED_DEG for each in edited]
-    if all(opposed) and known.size:
-        text += "; they were flown against the direction of the rest"
-    return text
-
-
-def _signed(angle_deg: float) -> float:
-    return (angle_deg + 180) % 360 - 180
 
 
 def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
@@ -263,7 +240,18 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
                 f"pitch and roll of {level} of {len(photos)} photographs are not known: a camera "
                 "that looks straight down is assumed"
             )
-        warnings += _height_warnings(photos, options)
+        known = {
+            name: any(math.isfinite(getattr(photo, name)) for photo in photos)
+            for name in ("home_m", "amsl_m", "hae_m", "alt_m")
+        }
+        if any(math.isnan(photo.agl_m) for photo in photos):
+            warnings += height_warnings(
+                options,
+                above_ground=False,
+                above_home=known["home_m"],
+                above_sea=known["amsl_m"] or known["hae_m"],
+                altitudes=known["alt_m"],
+            )
         warnings += jump_warnings([(_time_ns(photo), photo.latlon_deg) for photo in photos])
     doubted = [photo for photo in photos if photo.doubts]
     if doubted:
@@ -292,7 +280,6 @@ def _time_ns(photo: Photo) -> int:
 
 
 def _taken(chosen: ChosenPhotos, options: SourceOptions) -> tuple[list[Photo], list[str]]:
-    """The photographs that can be used, by time of the log's clock, and warnings."""
     folder, paths = chosen.folder, chosen.paths
     if not paths:
         raise FlightError(f"folder has no photographs ({', '.join(SUFFIXES)}): {folder}")
@@ -334,7 +321,6 @@ def _left_out(all_of_them: Sequence[Path | Photo], bad: Sequence[Path], reason: 
 
 
 def _of_one_size(photos: Sequence[Photo]) -> tuple[list[Photo], list[Path]]:
-    """The photographs of the most frequent size, of two the larger one, and the other files."""
     sizes = Counter((photo.width_px, photo.height_px) for photo in photos)
     usual = max(sizes, key=lambda size: (sizes[size], size[0] * size[1]), default=None)
     alike = [photo for photo in photos if (photo.width_px, photo.height_px) == usual]
@@ -342,10 +328,6 @@ def _of_one_size(photos: Sequence[Photo]) -> tuple[list[Photo], list[Path]]:
 
 
 def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], list[str]]:
-    """Photographs with their rows of the table, and warnings about those without one.
-
-    Raises `FlightError` where no photograph has one.
-    """
     table = chosen.table
     if table is None:
         return photos, []
@@ -370,7 +352,6 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
 
 
 def _with_row(photo: Photo, row: ImageRow) -> Photo:
-    """The metadata of a photograph with the time, the position and the heights of a table."""
     photo = replace(photo, row=row, latlon_deg=row.latlon_deg or photo.latlon_deg)
     if row.time_ns is not None:
         photo = replace(photo, time_ns=row.time_ns, zone_known=True)
@@ -392,7 +373,12 @@ def _in_time(
     if untimed and options.telemetry is None and chosen.singly:
         ordered = sorted(photos, key=lambda photo: photo.row.order if photo.row else 0)
     elif untimed and options.telemetry is None:
-        ordered = sorted(filter(_has_pose, untimed), key=lambda photo: _natural(photo.path))
+        posed = [
+            each
+            for each in untimed
+            if not (each.gimbal_deg is None and each.rotation is None and each.latlon_deg is None)
+        ]
+        ordered = sorted(posed, key=lambda photo: _natural(photo.path))
         ordered = ordered if len(ordered) > len(timed) else []
     if not ordered:
         return timed, [photo.path for photo in untimed], 0
@@ -401,27 +387,9 @@ def _in_time(
     return spaced, left_out, len(spaced)
 
 
-def _has_pose(photo: Photo) -> bool:
-    return not (photo.gimbal_deg is None and photo.rotation is None and photo.latlon_deg is None)
-
-
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Key that puts IMG_9 before IMG_10."""
     parts = re.split(r"(\d+)", str(path))
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _height_warnings(photos: Sequence[Photo], options: SourceOptions) -> list[str]:
-    """Assumptions about the heights of photographs without a log."""
-    if all(math.isfinite(photo.agl_m) for photo in photos):
-        return []
-    above_home, above_sea, altitudes = (
-        any(math.isfinite(getattr(photo, name)) for photo in photos for name in names)
-        for names in (("home_m",), ("amsl_m", "hae_m"), ("alt_m",))
-    )
-    if options.over_terrain and (above_home or above_sea):
-        return []
-    return height_warnings(above_home, not above_home and altitudes, options)
 
 
 def _of_one_focal_length(
@@ -431,26 +399,23 @@ def _of_one_focal_length(
 
     Those that state none are used too, and all of them where no focal length can be used.
     """
-    found: list[FocalLength | CameraError | None] = []
+    focal_px: list[float | None] = []
+    known: Counter[FocalLength] = Counter()
     for photo in photos:
         try:
-            found.append(_focal_length(photo, options))
-        except CameraError as error:
-            found.append(error)
-    known = Counter(each for each in found if isinstance(each, FocalLength))
+            found = _focal_length(photo, options)
+        except CameraError:
+            focal_px.append(math.nan)
+        else:
+            focal_px.append(None if found is None else found.px)
+            known.update([found] if found else [])
     if not known:
         return photos, []
     usual = known.most_common(1)[0][0]
-    alike: list[Photo] = []
-    odd: list[Path] = []
-    for photo, each in zip(photos, found, strict=True):
-        if each is None or (
-            isinstance(each, FocalLength) and abs(each.px / usual.px - 1) <= usual.std
-        ):
-            alike.append(photo)
-        else:
-            odd.append(photo.path)
-    return alike, _left_out(photos, odd, "of another focal length than most")
+    fits = [px is None or abs(px / usual.px - 1) <= usual.std for px in focal_px]
+    odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
+    warnings = _left_out(photos, odd, "of another focal length than most")
+    return [photo for photo, fit in zip(photos, fits, strict=True) if fit], warnings
 
 
 def _focal_length(photo: Photo, options: SourceOptions) -> FocalLength | None:
@@ -495,7 +460,6 @@ def _views(
 
 
 def _own_telemetry(photo: Photo, options: SourceOptions) -> Telemetry:
-    """Telemetry from the metadata of the photograph itself."""
     height = photo.home_m if math.isnan(photo.agl_m) else photo.agl_m
     if math.isnan(height) and options.ground_alt_m is not None:
         height = photo.alt_m - options.ground_alt_m

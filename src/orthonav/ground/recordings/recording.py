@@ -45,36 +45,28 @@ that this program is for flies slower, and logs round positions to some metres."
 class SourceOptions:
     """How a recording is read. Raises `FlightError` for invalid values."""
 
-    kind: str | None = None
-    """One of `KINDS`; None: detected by content."""
-    camera: Path | None = None
-    """Camera file; None: the recording's own camera."""
-    rate_hz: float = 1.0
-    """Views per second of a video."""
-    telemetry: Path | None = None
-    """Log to join by time; None: the recording's own telemetry."""
-    time_offset_s: float = 0.0
-    """Added to the times of images to get times of the log, seconds."""
+    kind: str | None = None  # one of `KINDS`; None: detected by content
+    camera: Path | None = None  # camera file; None: the recording's own camera
+    rate_hz: float = 1.0  # views per second of a video
+    telemetry: Path | None = None  # log to join by time; None: the recording's own telemetry
+    time_offset_s: float = 0.0  # added to the times of images to get times of the log, seconds
     mount_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Yaw, pitch, roll of the camera in the body; 0, 0, 0 looks straight down, top forward."""
-    topics: Mapping[str, str] = field(default_factory=dict)
-    """ROS topics by role, one of `ROLES`."""
+    topics: Mapping[str, str] = field(default_factory=dict)  # ROS topics by role, one of `ROLES`
     prior_std_m: float | None = None
     """Use the recorded position as the prior, with this standard deviation per axis."""
     sensor_width_mm: float | None = None
     """Longer side of the sensor, for the focal length of photographs."""
     ground_alt_m: float | None = None
     """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
-    agl_m: float | None = None
-    """Height above ground of all views, in place of a recorded one."""
+    agl_m: float | None = None  # height above ground of all views, in place of a recorded one
     fov_deg: float | None = None
     """Field of view across the width of the image, where there is no camera file."""
     looks_down: bool = False
     """Whether the camera looked straight down where pitch and roll were not recorded."""
     over_terrain: bool = False
     """Whether a terrain turns the heights of the recording into heights above ground later on."""
-    skip_bad_images: bool = False
-    """Whether images that a flight folder names may be missing."""
+    skip_bad_images: bool = False  # whether images that a flight folder names may be missing
 
     def __post_init__(self) -> None:
         with_paths(self, "camera", "telemetry")
@@ -107,16 +99,11 @@ class SourceOptions:
 class SourceView:
     """One view of a recording: a `RecordedView` that can also be written to a flight folder."""
 
-    frame: str
-    """Name, with the suffix of the format that its image is written in."""
-    telemetry: Telemetry
-    """Telemetry of the exposure."""
-    truth_latlon_deg: tuple[float, float] | None
-    """True position, where it is known."""
-    where: str
-    """Location of the image, for messages."""
-    load: Callable[[], Grey]
-    """Decodes the image."""
+    frame: str  # name, with the suffix of the format that its image is written in
+    telemetry: Telemetry  # telemetry of the exposure
+    truth_latlon_deg: tuple[float, float] | None  # true position, where it is known
+    where: str  # location of the image, for messages
+    load: Callable[[], Grey]  # decodes the image
     data: Callable[[], bytes] | None = None
     """Returns the image as it was encoded; None where it was recorded unencoded."""
 
@@ -234,31 +221,39 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
 
 def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
     """Warnings about a track for people: its own, what its heights are, and jumps."""
-    warnings, series = list(track.warnings), track.position
-    known = bool(track.heights) or track.home is not None
-    altitudes = track.altitude is not None
-    if options.over_terrain and (known or track.amsl is not None or track.hae is not None):
-        pass  # the terrain gives heights above ground
-    elif track.heights and track.home is not None and options.agl_m is None:
-        warnings.append(LEVEL_GROUND_IN_GAPS)
-    else:
-        warnings += height_warnings(track.home is not None, not known and altitudes, options)
+    home, series = track.home is not None, track.position
+    warnings = [
+        *track.warnings,
+        *height_warnings(
+            options,
+            above_ground=bool(track.heights),
+            above_home=home,
+            above_sea=track.amsl is not None or track.hae is not None,
+            altitudes=track.altitude is not None,
+        ),
+    ]
     if series is None:
         return warnings
-    places = [
-        (int(time_ns), (float(lat), float(lon)))
-        for time_ns, (lat, lon) in zip(series.time_ns, series.values[:, :2], strict=True)
-    ]
-    return [*warnings, *jump_warnings(places)]
+    places = [(float(lat), float(lon)) for lat, lon in series.values[:, :2]]
+    return [*warnings, *jump_warnings(list(zip(series.time_ns.tolist(), places, strict=True)))]
 
 
-def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
-    """Assumptions about heights: of those above take-off, or where only altitudes are known."""
+def height_warnings(
+    options: SourceOptions,
+    *,
+    above_ground: bool,
+    above_home: bool,
+    above_sea: bool,
+    altitudes: bool,
+) -> list[str]:
+    """What is assumed about heights above ground, where these references were recorded."""
     if options.agl_m is not None:
         return []
+    if options.over_terrain and (above_ground or above_home or above_sea):
+        return []  # the terrain gives heights above ground
     if above_home:
-        return [LEVEL_GROUND]
-    if not only_altitudes:
+        return [LEVEL_GROUND_IN_GAPS if above_ground else LEVEL_GROUND]
+    if above_ground or not altitudes:
         return []
     if options.ground_alt_m is None:
         return [

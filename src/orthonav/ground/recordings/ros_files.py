@@ -66,7 +66,6 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def _order(path: Path) -> tuple[str, int]:
-    """Name and number of a file of a bag that was split."""
     match = _SPLIT.fullmatch(path.stem)
     return (match[1], int(match[2])) if match else (path.stem, 0)
 
@@ -89,7 +88,13 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
     if path.is_file():
         require_file(path, "ROS recording")
         return _reader([_whole(_named(path, stack), path, warnings)], path, stack)
-    files, doubt = _files_of(path), None
+    doubt = None
+    try:
+        files = storage_files(path)
+    except FlightError:
+        if not (path / METADATA).is_file():
+            raise
+        files = []  # only the metadata can tell which they are
     if (path / METADATA).is_file() and not any(_is_cut(file) for file in files):
         try:
             return _reader([path], path, stack)
@@ -102,16 +107,6 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
     if doubt:
         warnings.append(f"{METADATA} is not used ({doubt}); the files beside it are read")
     return _reader([_whole(file, file, warnings) for file in files], path, stack)
-
-
-def _files_of(path: Path) -> list[Path]:
-    """The storage files, or none where only the metadata can tell which they are."""
-    try:
-        return storage_files(path)
-    except FlightError:
-        if (path / METADATA).is_file():
-            return []
-        raise
 
 
 def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> Any:
@@ -193,7 +188,6 @@ def _named(path: Path, stack: contextlib.ExitStack) -> Path:
 
 
 def _is_cut(path: Path) -> bool:
-    """Whether a file of MCAP lacks its end."""
     if path.suffix != ".mcap":
         return False
     with path.open("rb") as stream:
@@ -203,7 +197,6 @@ def _is_cut(path: Path) -> bool:
 
 
 def _whole(named: Path, path: Path, warnings: list[str]) -> "Path | _CutMcap":
-    """The file, with an end where it has none."""
     journal = named.with_name(f"{named.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         warnings.append(
@@ -302,7 +295,6 @@ def check_held(readers: Iterable[Any]) -> None:
 
 
 def _most_held(chunks: Sequence[Any]) -> int:
-    """Largest total of chunks that overlap at one time."""
     edges = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
     edges += [
         (max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size)

@@ -25,10 +25,8 @@ V = TypeVar("V", bound=RecordedView)
 FEW = 0.5
 """Below this fraction of confident views the configuration may be wrong; a change that reaches it
 explains it."""
-SAMPLE = 8
-"""At most so many views are localized again."""
-_GIVE_UP = 4
-"""A change that makes none of so many views confident is left."""
+SAMPLE = 8  # at most so many views are localized again
+_GIVE_UP = 4  # a change that makes none of so many views confident is left
 _RETRIED = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidence")
 """Reasons of views without a position that another configuration may give one."""
 

@@ -32,8 +32,7 @@ from orthonav.ground.recordings.recording import (
 SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
 _SHORT_NS = 1_000_000_000
 _MISSING_FRAMES = 0.01
-SILENT = 0
-"""OpenCV's level of logging at which it writes nothing."""
+SILENT = 0  # OpenCV's level of logging at which it writes nothing
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -43,7 +42,8 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
     `FlightError` or `CameraError`.
     """
     with _opened(path) as capture:
-        width, height = _sides(capture)
+        sides = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = map(int, sides)
         fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if width < 1 or height < 1 or not capture.grab():
             raise FlightError(f"video has no frame: {path}")
@@ -69,7 +69,6 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
 def _track(
     path: Path, last_ns: int, options: SourceOptions
 ) -> tuple[RecordedTrack, Path, list[str]]:
-    """The telemetry of a video, its file, and a warning where it ends early."""
     beside = [path.with_suffix(suffix) for suffix in SIDECARS]
     telemetry_path = options.telemetry or next((one for one in beside if one.is_file()), None)
     if telemetry_path is None:
@@ -121,11 +120,6 @@ def _grey(frame: NDArray[Any] | None, where: str) -> NDArray[np.uint8]:
         raise FlightError(f"image of the flight cannot be decoded: {where}")
     grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
     return np.asarray(grey, dtype=np.uint8)
-
-
-def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
-    width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
-    return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
 
 
 @contextmanager

@@ -31,7 +31,6 @@ DPI = 220
 MOST_POINTS = 20_000
 """Lines of more points are rasterized in the SVG, which would be too large to open."""
 OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
-"""Arguments of an annotation whose position is an offset in points."""
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
 """Box (`bbox`) that keeps text readable on any background."""
 LEGEND_ABOVE: dict[str, Any] = {
@@ -39,7 +38,6 @@ LEGEND_ABOVE: dict[str, Any] = {
     "bbox_to_anchor": (0.5, 1.0),
     "frameon": False,
 }
-"""Arguments of a legend above the axes."""
 _STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": GREY,
@@ -66,12 +64,7 @@ _NO_METADATA = {"Date": None, "Creator": None}
 
 @dataclass(frozen=True)
 class Drawing:
-    """One drawing as PNG and SVG; the same drawing gives the same bytes.
-
-    `png`: image of `DPI` with a palette.
-    `svg`: document with text as text.
-    `size_in`: width and height in inches.
-    """
+    """One drawing as PNG and SVG; the same drawing gives the same bytes."""
 
     png: bytes
     svg: str
@@ -84,10 +77,7 @@ def draw_axes(size_in: tuple[float, float], draw: "Callable[[Axes], None]") -> D
 
 
 def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") -> Drawing:
-    """A drawing of `size_in` inches by a function of a matplotlib figure.
-
-    Raises `MissingExtraError` without matplotlib.
-    """
+    """A drawing of `size_in` inches; raises `MissingExtraError` without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -102,7 +92,9 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         canvas.draw()
         png = _png(np.asarray(canvas.buffer_rgba()))
         figure.set_layout_engine("none")  # PNG and SVG share one layout
-        _limit_points(figure)
+        for line in (line for axes in figure.axes for line in axes.lines):
+            if np.size(line.get_xdata()) > MOST_POINTS:
+                line.set_rasterized(True)
         # As `savefig`, which draws once more before, for a layout.
         page: Any = FigureCanvasSVG(figure)
         page.print_svg(svg, metadata=_NO_METADATA)
@@ -110,7 +102,6 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
 
 
 def _png(rgba: NDArray[np.uint8]) -> bytes:
-    """An opaque image (H, W, 4) as PNG with a palette."""
     from PIL import Image
 
     out = io.BytesIO()
@@ -119,16 +110,8 @@ def _png(rgba: NDArray[np.uint8]) -> bytes:
     return out.getvalue()
 
 
-def _limit_points(figure: "Figure") -> None:
-    """Rasterize lines of many points."""
-    for line in (line for axes in figure.axes for line in axes.lines):
-        if np.size(line.get_xdata()) > MOST_POINTS:
-            line.set_rasterized(True)
-
-
 @contextmanager
 def _own_style() -> Iterator[None]:
-    """matplotlib's defaults and our style, whatever the settings of the user."""
     import matplotlib
 
     with matplotlib.rc_context(), warnings.catch_warnings():
@@ -144,21 +127,14 @@ _BACKGROUND_LEVELS = 15  # few grey levels keep the PNG small
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A grey image behind a map, north up.
-
-    `grey`: (rows, columns), uint8, at most about a thousand pixels across.
-    `box`: its west, south, east and north edges in metres, in the plane of the map.
-    """
+    """A grey image (rows, columns) behind a map, north up; `box`: west, south, east, north."""
 
     grey: NDArray[np.uint8]
     box: tuple[float, float, float, float]
 
 
 def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None = None) -> None:
-    """Draw the base of a map: axes in metres, background image, scale bar and north arrow.
-
-    `box` is the visible part: west, east, south, north in metres.
-    """
+    """The base of a map; `box` is the visible part: west, east, south, north in metres."""
     if background is not None:  # pale, in few grey levels
         levels = np.round(background.grey / 255 * _BACKGROUND_LEVELS) / _BACKGROUND_LEVELS
         looks: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1, "interpolation": "none"}
@@ -181,7 +157,6 @@ def map_size_in(
 
 
 def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
-    """Draw a scale bar of a round length at the bottom left."""
     width_m, height_m = box[1] - box[0], box[3] - box[2]
     length_m = _round_length(0.25 * min(width_m, height_m))
     x, y = box[0] + 0.04 * width_m, box[2] + 0.04 * height_m
@@ -194,7 +169,6 @@ def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
 
 
 def draw_north(axes: "Axes") -> None:
-    """Draw a north arrow at the top right."""
     axes.annotate(
         "N",
         xy=(0.965, 0.975),
@@ -209,6 +183,5 @@ def draw_north(axes: "Axes") -> None:
 
 
 def _round_length(length_m: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above `length_m`."""
     power = 10.0 ** math.floor(math.log10(length_m))
     return max(factor * power for factor in (1, 2, 5) if factor * power <= length_m * (1 + 1e-9))

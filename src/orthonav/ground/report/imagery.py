@@ -30,7 +30,6 @@ from orthonav.core.records import Fix, Telemetry, View, ViewResult
 MIN_PX, MAX_PX = 256, 1024
 """Limits of the pixels across a window: what a screen shows."""
 MARGIN = 1.02
-"""Width of a window relative to the footprint."""
 MAX_READ_PX = 4096
 """Limit of a window of the map, about 16 MB."""
 Grey = NDArray[np.uint8]
@@ -53,14 +52,12 @@ class GroundWindow:
     offset_en_m: tuple[float, float]
 
     def box_at(self, position_en_m: NDArray[np.float64]) -> Box:
-        """Its edges where the camera is above a position (2,)."""
         east, north = (float(value) for value in position_en_m + self.offset_en_m)
         half_m = self.side_m / 2
         return east - half_m, north - half_m, east + half_m, north + half_m
 
 
 def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
-    """`telemetry` with the heading, height and tilt that the fix states."""
     fix = result.outcome
     if not isinstance(fix, Fix):
         return telemetry
@@ -126,7 +123,6 @@ def rectified(
 
 
 def png(grey: Grey, valid: Mask) -> bytes:
-    """Grey levels as PNG, transparent where not valid."""
     picture = grey
     if not valid.all():
         picture = np.dstack([grey, grey, grey, valid.astype(np.uint8) * 255])
@@ -134,12 +130,10 @@ def png(grey: Grey, valid: Mask) -> bytes:
 
 
 def jpeg(grey: Grey, quality: int = 95) -> bytes:
-    """Grey levels as JPEG."""
     return bytes(cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1].tobytes())
 
 
 def shrunk(grey: Grey, max_px: int, max_area_px: float = math.inf) -> Grey:
-    """An image no larger than `max_px` on its longer side and `max_area_px`."""
     rows, cols = grey.shape
     share = min(1.0, max_px / max(rows, cols), math.sqrt(max_area_px / (rows * cols)))
     if share == 1:
@@ -152,7 +146,6 @@ class SheetImagery:
     """The first sheet of a map: its grey layer, or its preview where it has none."""
 
     def __init__(self, opened: MapFile) -> None:
-        """Raises `MapFileError` where layer or preview are damaged."""
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
         self.terrain = TerrainLayer.of(opened)
@@ -166,7 +159,6 @@ class SheetImagery:
             self.preview = opened.array("sheet0/preview_jpeg", np.uint8, 1).tobytes()
 
     def plain(self) -> dict[str, Any]:
-        """Geometry of the sheet and its tiles, for the page."""
         grid, grey = self.grid, self.sheet.grey
         tiles = None
         if self._layer is not None and grey is not None:
@@ -233,14 +225,12 @@ class SheetImagery:
         return np.asarray(drawn, dtype=np.uint8), np.asarray(seen > 0, dtype=np.bool_)
 
     def _level(self, step_m: float) -> int:
-        """The coarsest level that is at least as fine as `step_m`."""
         if self._layer is None:
             return 0
         fine = math.floor(math.log2(max(step_m / self.grid.gsd_m, 1.0)) + 1e-6)
         return min(fine, self._layer.levels - 1)
 
     def _steps_m(self, level: int) -> tuple[float, float]:
-        """Size in metres of a pixel of a level, east and north."""
         grid = self.grid
         if self._layer is not None:
             return grid.gsd_m * 2**level, grid.gsd_m * 2**level

@@ -1,7 +1,7 @@
 """Numbers and records as text and as values for JSON; an undefined number is a dash, or None."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import Any
@@ -43,7 +43,6 @@ def _digits(name: str, digits: int | None) -> int | None:
 
 
 def percent_text(value: float) -> str:
-    """A share as `12.3 %`."""
     return f"{100 * value:.1f} %" if math.isfinite(value) else "-"
 
 
@@ -61,7 +60,6 @@ def metres_text(value: float) -> str:
 
 
 def plain_text(value: float) -> str:
-    """A number without unit, with three decimals."""
     return f"{value:.3f}" if math.isfinite(value) else "-"
 
 
@@ -70,3 +68,15 @@ def measure_text(value: float, unit: str = "") -> str:
     if not math.isfinite(value):
         return "-"
     return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}") + unit
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows as lines of a terminal: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            text.rjust(width) if i else text.ljust(width)
+            for i, (text, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

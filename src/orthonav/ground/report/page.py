@@ -34,11 +34,7 @@ _VML = re.compile(r"behavior:\s*url\(#default#VML\);")  # for Internet Explorer 
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing with its texts.
-
-    `name`: of its files (letters, digits, dots, underscores, dashes).
-    `alt`: description for screen readers; `caption`: text below it.
-    """
+    """A drawing with the name of its files, a description for screen readers and a caption."""
 
     name: str
     alt: str
@@ -47,13 +43,11 @@ class Figure:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height in a page."""
         width, height = (round(_PX_PER_IN * side) for side in self.drawing.size_in)
         return width, height
 
     @property
     def data_url(self) -> str:
-        """The PNG as an address that needs no file."""
         return data_url(self.drawing.png, "image/png")
 
 
@@ -93,10 +87,7 @@ def render(
 
 
 def write_page(folder: Path, page: str, figures: Iterable[Figure]) -> Path:
-    """Write `page` as `folder`/index.html, and figures as `write_figures` does; return its path.
-
-    Raises as `write_figures` does, and then leaves the page as it was.
-    """
+    """Write `page` as `folder`/index.html with its figures, or leave the page as it was."""
     path = Path(folder) / "index.html"
     with replacing(path) as temporary:
         temporary.write_bytes(page.encode("utf-8", "replace"))
@@ -156,7 +147,6 @@ def file_names(texts: Sequence[str]) -> list[str]:
 
 
 def static_text(name: str, package: str = "orthonav.ground.report") -> str:
-    """A style or script in the folder `static` of a package."""
     return files(package).joinpath("static", name).read_text(encoding="utf-8")
 
 
@@ -171,7 +161,6 @@ def joined_scripts(shared: Sequence[str], package: str, own: Sequence[str]) -> s
 
 
 def data_url(data: bytes, media_type: str) -> str:
-    """`data` as an address that needs no file."""
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
 
 
@@ -181,7 +170,6 @@ def _source(text: str) -> str:
 
 
 def load_leaflet() -> tuple[str, str]:
-    """Script and style of Leaflet with its images embedded. Raises as `leaflet_files`."""
     script, style = leaflet_files("leaflet.js", "leaflet.css")
     css = _IMAGE.sub(
         lambda found: f"url({data_url((style.parent / found[1]).read_bytes(), 'image/png')})",

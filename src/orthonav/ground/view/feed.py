@@ -1,14 +1,20 @@
-"""Results and health of a flight, read from a file that may still grow."""
+"""Results and health of a flight, read from a file that may still grow, and images of its views."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
+from orthonav.core.flight import open_flight
 from orthonav.core.flight.fixes import is_health, result_from_json
-from orthonav.core.records import ViewResult
+from orthonav.core.geo.camera import Camera
+from orthonav.core.records import Telemetry, ViewResult
 
 MAX_LINE_BYTES = 2**20
 MAX_VIEWS = 500_000
@@ -20,10 +26,8 @@ MAX_HEALTH = 200_000
 class Batch:
     """What is new since the last poll.
 
-    `results`: in order.
     `health`: lines of health, each with the number of results before it.
     `restarted`: the file was replaced, so everything read before is void.
-    `problems`: messages for people.
     """
 
     results: list[ViewResult] = field(default_factory=list)
@@ -33,8 +37,6 @@ class Batch:
 
 
 class Feed(Protocol):
-    """A source of results."""
-
     def poll(self) -> Batch:
         """What is new since the last call. Raises `OrthonavError` or `OSError`."""
         ...
@@ -56,7 +58,6 @@ class LineFeed:
         self._health, self._broken = 0, 0
 
     def poll(self) -> Batch:
-        """See `Feed.poll`."""
         batch = Batch()
         if self._live and not self._path.exists():
             return batch
@@ -73,7 +74,6 @@ class LineFeed:
         return batch
 
     def _was_replaced(self) -> bool:
-        """Whether the file was replaced or truncated since the last poll."""
         found = self._path.stat()
         file = found.st_dev, found.st_ino
         replaced = self._file != (0, 0) and (file != self._file or found.st_size < self._offset)
@@ -108,7 +108,6 @@ class LineFeed:
 
 
 def _health_of(text: str) -> dict[str, Any] | None:
-    """The health in a line; None for any other line."""
     if not is_health(text):
         return None
     try:
@@ -119,7 +118,6 @@ def _health_of(text: str) -> dict[str, Any] | None:
 
 
 def checked_health(plain: Any) -> dict[str, Any]:
-    """Level, reasons, time and counts of health, validated; raises `FlightError`."""
     level = plain.get("health") if isinstance(plain, dict) else None
     if not isinstance(level, str):
         raise FlightError("health has no level")
@@ -137,3 +135,35 @@ def checked_health(plain: Any) -> dict[str, Any]:
         if isinstance(value, dict):
             known[name] = {str(k)[:40]: v for k, v in value.items() if isinstance(v, int)}
     return known
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One recorded view; `load` returns the image (H, W), or raises `FlightError`."""
+
+    telemetry: Telemetry
+    camera: Camera
+    load: Callable[[], NDArray[np.uint8]]
+
+
+class ViewImages(Protocol):
+    def shot(self, frame: str) -> Shot:
+        """The view `frame`; raises `FlightError` with the reason where it has no image."""
+        ...
+
+
+class NoImages:
+    def shot(self, frame: str) -> Shot:
+        raise FlightError("there are no images; name the flight with --flight")
+
+
+class FolderImages:
+    def __init__(self, path: Path) -> None:
+        self.folder = open_flight(path, images_needed=False)
+        self._views = {view.frame: view for view in self.folder.views}
+
+    def shot(self, frame: str) -> Shot:
+        view = self._views.get(frame)
+        if view is None:
+            raise FlightError("this view is not in the flight")
+        return Shot(view.telemetry, self.folder.camera, view.grey)

@@ -30,8 +30,7 @@ from orthonav.ground.recordings.flightlog import (
     logged_result,
     run_of,
 )
-from orthonav.ground.view.feed import MAX_HEALTH, MAX_VIEWS, Batch, checked_health
-from orthonav.ground.view.images import Shot
+from orthonav.ground.view.feed import MAX_HEALTH, MAX_VIEWS, Batch, Shot, checked_health
 
 RESCAN_S = 1.0
 _WHY_NONE = {
@@ -66,11 +65,9 @@ class LogReader:
 
     @property
     def session(self) -> dict[str, Any]:
-        """Run, version, views, map and options as they were logged."""
         return self._content.session
 
     def poll(self) -> Batch:
-        """See `orthonav.ground.view.feed.Feed.poll`."""
         with self._lock:
             batch = Batch()
             self._rescan(batch)
@@ -80,7 +77,6 @@ class LogReader:
             return batch
 
     def shot(self, frame: str) -> Shot:
-        """See `orthonav.ground.view.images.ViewImages.shot`."""
         with self._lock:
             view, camera, content = self._views.get(frame), self.camera, self._content
             place = None if view is None else content.places.get(view.index)
@@ -92,7 +88,6 @@ class LogReader:
         return Shot(view.telemetry, camera, partial(content.grey, place, camera, where))
 
     def _rescan(self, batch: Batch) -> None:
-        """Add new files; start over where another flight began."""
         now = time.monotonic()
         if self._files and (not self._live or now - self._scanned_s < RESCAN_S):
             return
@@ -120,7 +115,6 @@ class LogReader:
             batch.problems.append(f"damaged chunks were skipped: {file.path}")
 
     def _take(self, batch: Batch, topic: str, data: bytes) -> None:
-        """Take a message of the log; see `LogContent.read`."""
         if topic == TELEMETRY.name:
             view = self._content.views[-1]
             self._views.setdefault(view.frame, view)
@@ -166,7 +160,6 @@ def run_files(path: Path, *, live: bool) -> list[Path]:
 
 
 def _candidates(path: Path) -> Iterator[Path]:
-    """Files that may belong to a log."""
     if path.is_dir():
         yield from path.glob("*.mcap")
     elif path.is_file():
@@ -176,7 +169,6 @@ def _candidates(path: Path) -> Iterator[Path]:
 
 
 def _was_cut(file: LogFile) -> bool:
-    """Whether a file is shorter than what was already read."""
     try:
         return file.path.stat().st_size < file.walk.next_offset and not file.walk.ended
     except OSError:

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.core.files import with_paths
-from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.fixes import STATES, Identity, flight_digest, read_identity
+from orthonav.core.flight import read_truth
+from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import fault_of, gnss_of
 from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
-from orthonav.core.mapfile.signature import map_digest
+from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.calibration import is_covariance
-from orthonav.ground.evaluate.metrics import FAR_M, check_truth
+from orthonav.ground.evaluate.metrics import FAR_M, check_truth, warn_of_another_run
 from orthonav.ground.recordings.flightlog import is_flight_log
 from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 from orthonav.ground.report.imagery import (
@@ -41,23 +41,26 @@ from orthonav.ground.report.imagery import (
     window_of,
 )
 from orthonav.ground.report.numbers import to_plain
-from orthonav.ground.view.feed import Batch, Feed, LineFeed
-from orthonav.ground.view.images import FolderImages, NoImages, Shot, ViewImages
+from orthonav.ground.view.feed import (
+    Batch,
+    Feed,
+    FolderImages,
+    LineFeed,
+    NoImages,
+    Shot,
+    ViewImages,
+)
 from orthonav.ground.view.logs import LogReader
 
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]
 FAR_AWAY_PX = 1e9
-"""Positions farther away are not drawn."""
 RAW_PX = 640
-"""The longer side of a view as recorded."""
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """What to show: see the arguments of `orthonav view`."""
-
     run: Path
     map_path: Path
     second: Path | None = None
@@ -73,9 +76,6 @@ class ViewRequest:
 
 @dataclass(frozen=True)
 class RunLabels:
-    """Names of run, map, images, truth and second run for the page; `live` while the run is in
-    progress."""
-
     name: str
     map_name: str
     images: str
@@ -135,15 +135,12 @@ class Run:
 
     @property
     def count(self) -> int:
-        """Number of views so far."""
         return len(self._results)
 
     def any_known(self, column: str) -> bool:
-        """Whether any view has a value in a column."""
         return any(value is not None for value in self._columns.get(column, ()))
 
     def any_on_map(self) -> bool:
-        """Whether any fix lies on the sheet."""
         grid = self.sheet.grid
         places = zip(self._columns.get("x", ()), self._columns.get("y", ()), strict=True)
         return any(
@@ -152,7 +149,6 @@ class Run:
         )
 
     def summary(self) -> dict[str, Any]:
-        """What does not change while the page is open."""
         return {
             **asdict(self.labels),
             "version": __version__,
@@ -177,7 +173,6 @@ class Run:
             }
 
     def detail(self, index: int) -> dict[str, Any]:
-        """Everything known about one view."""
         result = self._result(index)
         outcome = result.outcome
         found: dict[str, Any] = {
@@ -209,18 +204,15 @@ class Run:
         return plain
 
     def view_png(self, index: int) -> bytes:
-        """The view rectified to nadir, transparent outside."""
         result = self._result(index)
         placed = self._placed(result, self._images.shot(result.frame))
         made = rectified(placed.shot.load(), placed.telemetry, placed.shot.camera, placed.window)
         return png(*made)
 
     def raw_jpeg(self, index: int) -> bytes:
-        """The view as recorded, reduced."""
         return jpeg(shrunk(self._images.shot(self._result(index).frame).load(), RAW_PX))
 
     def map_png(self, index: int, at: str) -> bytes:
-        """The map at the fix or the true position, transparent where there is no imagery."""
         result = self._result(index)
         place = self._truth.get(result.frame) if at == "truth" else _place(result.outcome)
         if place is None:
@@ -230,8 +222,6 @@ class Run:
         return png(*self.sheet.crop(box, (window.size_px, window.size_px)))
 
     def ground(self, index: int, x: float, y: float) -> dict[str, Any]:
-        """The ground at a point of the rectified view, shares of its window from the left and the
-        top, with its 95 % ellipse."""
         result = self._result(index)
         fix = result.outcome
         if not isinstance(fix, Fix):
@@ -264,7 +254,6 @@ class Run:
         return _Placed(shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m))
 
     def _refresh(self) -> None:
-        """Read what is new; a file that cannot be read now is reported and tried again."""
         if not self.labels.live:
             return
         try:
@@ -374,7 +363,6 @@ def _reason(outcome: Fix | NoFix) -> str:
 
 
 def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
-    """Positions (N, 2) in the plane of the sheet, NaN where there is none."""
     en_m = np.full((len(latlon_deg), 2), math.nan)
     known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
     if known:
@@ -384,7 +372,6 @@ def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
 
 
 def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str, list[Any]]:
-    """Both columns of positions (N, 2), in pixels of the sheet."""
     px = sheet.px_from_en(en_m)
     px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
     return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
@@ -418,7 +405,8 @@ def open_run(request: ViewRequest) -> Run:
     """
     if not 0 < request.radius_m < 1e7:
         raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
-    sheet = SheetImagery(open_map(request.map_path))
+    opened = open_map(request.map_path)
+    sheet = SheetImagery(opened)
     feed = _feed(request)
     images = _images(request, feed)
     truth, truth_name = _truth(request)
@@ -438,7 +426,7 @@ def open_run(request: ViewRequest) -> Run:
     run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
     for problem in run.problems:
         log.warning("%s", problem)
-    _warn(request, run, feed, truth)
+    _warn(request, opened, run, feed, images)
     return run
 
 
@@ -459,7 +447,6 @@ def _feed(request: ViewRequest) -> Feed:
 
 
 def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
-    """Results of the second run by frame, None without one; its health is not read."""
     if request.second is None:
         return None
     batch = _feed(replace(request, run=request.second, live=False)).poll()
@@ -489,7 +476,6 @@ def _images(request: ViewRequest, feed: Feed) -> ViewImages:
 
 
 def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
-    """True positions and their source: the given file, or the flight folder."""
     if request.truth is not None:
         return read_truth(request.truth), request.truth.name
     if request.flight is not None and (request.flight / "truth.csv").is_file():
@@ -498,28 +484,17 @@ def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
     return {}, ""
 
 
-def _differences(request: ViewRequest, run: Path) -> str:
-    """Which other map or flight folder than the given ones a file of fixes states; else ""."""
-    if not run.is_file() or is_log(run):
-        return ""
-    flight = None
-    if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
-        flight = flight_digest(open_flight(request.flight, images_needed=False).views)
-    given = Identity(map_digest(request.map_path), flight)
-    return read_identity(run).differences(given, request.map_path, request.flight)
-
-
-def _warn(request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, LatLon]) -> None:
-    """Log probable mistakes."""
+def _warn(request: ViewRequest, opened: MapFile, run: Run, feed: Feed, images: ViewImages) -> None:
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
-    if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
+    if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
+    folder = images.folder if isinstance(images, FolderImages) else None
     for path in filter(None, (request.run, request.second)):
-        if other := _differences(request, path):
-            log.warning("the run is of %s: %s", other, path)
+        if path.is_file() and not is_log(path):
+            warn_of_another_run(path, opened, folder)
     if not run.count:
         return
-    if truth and not run.any_known("tx"):
+    if run.labels.truth and not run.any_known("tx"):
         log.warning("no view of the run has a true position in %s", run.labels.truth)
     if request.second is not None and not run.any_known("x2"):
         log.warning("no view has a position in the second run: %s", request.second)

@@ -39,14 +39,11 @@ LEAFLET = (
     "images/layers-2x.png",
     "images/marker-icon.png",
 )
-"""Files of Leaflet that the page may request."""
 SHARED = ("chart.js", "format.js", "plane.js")
-"""Scripts of `orthonav.ground.report` that the page uses."""
 
 
 log = logging.getLogger(__name__)
 TIMEOUT_S = 60.0
-"""An idle connection is closed after this time."""
 _CACHED = "private, max-age=86400"
 _NOT_CACHED = "no-store"
 _HEADERS = {
@@ -62,8 +59,6 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Response:
-    """A response to a request."""
-
     status: HTTPStatus
     data: bytes = b""
     media_type: str = "text/plain; charset=utf-8"
@@ -116,7 +111,6 @@ class Pages:
         }
 
     def answer(self, target: str) -> Response:
-        """The response to a request for `target`, a path with an optional query."""
         try:
             asked = urlsplit(target)
         except ValueError:
@@ -164,7 +158,6 @@ class Pages:
 def _fields(
     query: str, names: Sequence[str], pattern: str, default: str, expected: str
 ) -> list[str]:
-    """Values of a query; raises `ValueError` for one that does not match `pattern`."""
     fields = parse_qs(query, max_num_fields=10)
     asked = [fields.get(name, [default])[0] for name in names]
     if not all(re.fullmatch(pattern, each) for each in asked):
@@ -214,11 +207,9 @@ class Server(ThreadingHTTPServer):
 
     @property
     def port(self) -> int:
-        """The port of the server."""
         return int(self.server_address[1])
 
     def url(self) -> str:
-        """The URL for a browser on this computer, or for others if the server is public."""
         address = self._address
         host = _own_address(address.version) if address.is_unspecified else str(address)
         return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
@@ -238,7 +229,6 @@ class Server(ThreadingHTTPServer):
         return address.is_loopback or not self.only_loopback
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log errors for debugging; connections often end early."""
         log.debug("request of %s", client_address, exc_info=True)
 
 
@@ -259,14 +249,11 @@ def _own_address(version: int) -> str:
 
 
 def _host_name(host: str) -> str:
-    """The name or address in a Host header, without port and brackets."""
     match = re.fullmatch(r"\[([0-9a-fA-F:.]+)\](?::\d*)?|([^:\[\]/@\s]+)(?::\d*)?", host)
     return "" if match is None else (match[1] or match[2]).casefold().rstrip(".")
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One connection."""
-
     server: Server
     protocol_version = "HTTP/1.1"
     server_version = "orthonav"
@@ -278,13 +265,11 @@ class Handler(BaseHTTPRequestHandler):
         super().__init__(*arguments)
 
     def do_GET(self) -> None:
-        """Respond to a request."""
         self._send(self._refused() or self._pages.answer(self.path))
 
     do_HEAD = do_GET  # noqa: N815 - a name of http.server
 
     def _refused(self) -> Response | None:
-        """The response that refuses a request; None if it is allowed."""
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or not self.server.allows(hosts[0]):
             return _error(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served")
@@ -315,5 +300,4 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(reply.data)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Log requests for debugging."""
         log.debug(format, *arguments)

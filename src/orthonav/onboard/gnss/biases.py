@@ -1,20 +1,37 @@
-"""Constant biases of the difference GNSS minus map: displacement of the map, mount, latency.
+"""The difference GNSS minus map: its constant biases, the tests of a change, and learning.
 
-The difference is linear in them: a displacement is constant, an error of the mount turns with the
-heading and grows with the height, a latency acts along the velocity over ground. An error of the
-mount's yaw turns the view and does not displace it, so it is none of them.
+The difference is linear in the biases: a displacement of the map is constant, an error of the mount
+turns with the heading and grows with the height, a latency acts along the velocity over ground. An
+error of the mount's yaw turns the view and does not displace it, so it is none of them.
+
+Tests: the differences of a window are a Gaussian vector of the biases as far as they are known, and
+slowly varying errors of GNSS and map. A fault adds a step or a ramp. For each onset the change is
+estimated by generalized least squares and compared with its standard deviation: the generalized
+likelihood ratio test of Willsky and Jones (1976, doi:10.1109/TAC.1976.1101146), over a window
+instead of a recursion.
+
+Learning: a Kalman filter whose state is the biases and the slowly varying errors. With these in the
+state the differences are correlated, and the covariance of the biases is honest. A combination of
+biases that a flight does not show stays as uncertain as before. A spoofed receiver must not move
+the map: only values in agreement count, each waits in quarantine, an alarm discards those that
+wait, an offset discards all that was learnt since the reference, outliers are left out, and the
+biases are bounded.
 """
 
+import copy
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import cholesky, solve_triangular
 
 from orthonav.core.records import MAP_STD_M
-from orthonav.onboard.gnss.records import Array
+from orthonav.onboard.gnss.records import Array, Fault
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
 """Biases in the order of `Biases.mean`."""
@@ -61,7 +78,6 @@ class Biases:
 
     @property
     def stds(self) -> Array:
-        """Standard deviations (5,)."""
         return np.sqrt(np.diag(self.cov))
 
     @property
@@ -95,7 +111,6 @@ class Biases:
         return mean, cov + turning_m2 / 2 * np.eye(2)
 
     def without_displacement(self) -> "Biases":
-        """The same with no displacement, known exactly."""
         mean, cov = self.mean.copy(), self.cov.copy()
         mean[:2] = cov[:2] = cov[:, :2] = 0.0
         return replace(self, mean=mean, cov=cov)
@@ -177,3 +192,397 @@ def design(heading_rad: ArrayLike, agl_m: ArrayLike, vel_en_mps: Array) -> Array
     made[..., 0, 3], made[..., 1, 3] = height * cos, -height * sin  # the map's place is left
     made[..., 4] = vel_en_mps
     return made
+
+
+BIN_S = 1.0
+"""Differences within this time are one value, their median."""
+FINE_S, MERGED = 12.0, 3
+"""Older values than this are merged, so many into one: a tenth of the work, for the same delays."""
+
+
+@dataclass(frozen=True)
+class DifferenceModel:
+    """Parameters of errors and tests; chosen by `benchmarks/gnss_watch.py` unless noted.
+
+    `window_s`: length of the window.
+    `gnss_std_m`: least standard deviation of the slowly varying error of GNSS per axis; receivers
+    state less.
+    `gnss_tau_s`: its correlation time.
+    `map_tau_s`: correlation time of the map's local errors.
+    `mount_share`: share of the map's variance that turns with the aircraft, as from a tilted mount.
+    `mount_tau_s`: correlation time of that part.
+    `white_share`: share of the map's variance that is independent from view to view.
+    `multipath_m`: change of the difference that is no fault.
+    `sigmas`: standard deviations, in addition to `multipath_m`, from which a change is a fault.
+    `step_ages`: onsets of a step, in values before the newest, less than `FINE_S`.
+    `ramp_ages_s`: onsets of a ramp, in seconds before the newest value.
+    """
+
+    window_s: float = 60.0
+    gnss_std_m: float = 3.0
+    gnss_tau_s: float = 120.0
+    map_tau_s: float = 60.0
+    mount_share: float = 0.4
+    mount_tau_s: float = 600.0
+    white_share: float = 0.2
+    multipath_m: float = 8.0
+    sigmas: float = 5.0
+    step_ages: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
+    ramp_ages_s: tuple[float, ...] = (12.0, 18.0, 24.0, 32.0, 40.0, 50.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """One value of the window.
+
+    `time_s`: time. `en_m` (2,): GNSS minus map. `gnss_std_m`, `map_std_m`: stated deviations.
+    `heading_rad`: heading. `vel_en_mps` (2,): velocity. `agl_m`: height above ground; 0 where not
+    known, which gives it no error of the mount. `rolling_std_m`: standard deviation of an error of
+    this value alone, while the aircraft rolls. `as_stated`: whether the latency of the images is
+    the stated one; one that was measured in flight has no bias to be learnt.
+    """
+
+    time_s: float
+    en_m: Array
+    gnss_std_m: float
+    map_std_m: float
+    heading_rad: float
+    vel_en_mps: Array
+    agl_m: float = 0.0
+    rolling_std_m: float = 0.0
+    as_stated: bool = True
+
+    def rolling(self, std_m: float) -> "Difference":
+        """The same with at least this error by rolling."""
+        return replace(self, rolling_std_m=max(self.rolling_std_m, std_m))
+
+    @cached_property
+    def design(self) -> Array:
+        return design(self.heading_rad, self.agl_m, self.as_stated * self.vel_en_mps)
+
+    def residual(self, known: Biases) -> Array:
+        """Difference (2,) that the biases do not explain."""
+        return self.en_m - self.design @ known.mean
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A change of the difference that is a fault.
+
+    `onset_s`: time at which it began. `en_m`: size. `std_m`: standard deviation along its
+    direction. `excess`: by how many of them it exceeds what is no fault.
+    """
+
+    fault: Fault
+    onset_s: float
+    en_m: tuple[float, float]
+    std_m: float
+    excess: float
+
+
+class DifferenceWindow:
+    """Differences of the last minute and their tests. Mutable; deterministic."""
+
+    def __init__(self, model: DifferenceModel) -> None:
+        self.model = model
+        self._old: deque[Difference] = deque()
+        self._new: deque[Difference] = deque()
+
+    @property
+    def values(self) -> list[Difference]:
+        """Values of the window in the order of time, the older ones merged."""
+        return [*self._old, *self._new]
+
+    def add(self, value: Difference) -> None:
+        """Add a value; older ones than the window are dropped."""
+        self._new.append(value)
+        if len(self._new) > MERGED and self._new[MERGED].time_s < value.time_s - FINE_S:
+            merged = [self._new.popleft() for _ in range(MERGED)]
+            mean = np.mean([each.en_m for each in merged], axis=0)
+            rolling_m = max(each.rolling_std_m for each in merged)
+            self._old.append(replace(merged[MERGED // 2], en_m=mean, rolling_std_m=rolling_m))
+        while self._old and self._old[0].time_s < value.time_s - self.model.window_s:
+            self._old.popleft()
+
+    def widen(self, rolling_std_m: float) -> None:
+        """Give the newest value at least this error by rolling."""
+        if self._new:
+            self._new[-1] = self._new[-1].rolling(rolling_std_m)
+
+    def clear(self) -> None:
+        self._old.clear()
+        self._new.clear()
+
+    def recent(self, seconds: float) -> list[Difference]:
+        """Values of the last seconds, less than `FINE_S`, before the newest."""
+        begin = self._new[-1].time_s - seconds if self._new else 0.0
+        return [each for each in self._new if each.time_s > begin]
+
+    def finding(self, known: Biases) -> Finding | None:
+        """The likeliest change that is a fault; None without one.
+
+        `known`: what is known of the biases.
+        """
+        values = self.values
+        count = len(values)
+        if count < 3:
+            return None
+        times = np.array([each.time_s for each in values])
+        signatures, named = self._signatures(times)
+        biased = np.concatenate([each.design for each in values])
+        off = np.concatenate([each.en_m for each in values]) - biased @ known.mean
+        covariance = _covariance(values, self.model) + biased @ known.cov @ biased.T
+        lower = cholesky(covariance, lower=True, check_finite=False)
+        columns = np.kron(signatures, np.eye(2))
+        stacked = np.column_stack([columns, off])
+        white = solve_triangular(lower, stacked, lower=True, check_finite=False)
+        seen, data = white[:, :-1].reshape(2 * count, -1, 2), white[:, -1]
+        information = np.einsum("nka,nkb->kab", seen, seen)
+        spread = np.linalg.inv(information)
+        sizes = np.einsum("kab,nkb,n->ka", spread, seen, data)
+        length = np.hypot(*sizes.T)
+        along = np.einsum("ka,kab,kb->k", sizes, spread, sizes)
+        std = np.sqrt(along) / np.maximum(length, 1e-9)
+        excess = (length - self.model.multipath_m) / std
+        likelihood = np.einsum("ka,kab,kb->k", sizes, information, sizes)
+        likelihood[excess <= self.model.sigmas] = 0.0
+        best = int(np.argmax(likelihood))
+        if likelihood[best] == 0:
+            return None
+        fault, onset = named[best]
+        east, north = sizes[best].tolist()
+        return Finding(fault, onset, (east, north), float(std[best]), float(excess[best]))
+
+    def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
+        """Unit changes (N, K): constant, steps, and ramps that end at 1; their names and onsets."""
+        columns, named = [np.ones(len(times))], [(Fault.OFFSET, float(times[0]))]
+        for age in self.model.step_ages:
+            if age < len(times):
+                columns.append((np.arange(len(times)) >= len(times) - age).astype(np.float64))
+                named.append((Fault.STEP, float(times[-age])))
+        for age_s in self.model.ramp_ages_s:
+            onset = times[-1] - age_s
+            if onset >= times[0]:
+                columns.append(np.maximum(times - onset, 0.0) / age_s)
+                named.append((Fault.DRIFT, float(onset)))
+        return np.stack(columns, axis=1), named
+
+
+def _covariance(values: Sequence[Difference], model: DifferenceModel) -> Array:
+    """Covariance (2 N, 2 N) of the differences without a fault and without biases."""
+    gnss, map_std, heading, rolling, times = np.array(
+        [
+            (each.gnss_std_m, each.map_std_m, each.heading_rad, each.rolling_std_m, each.time_s)
+            for each in values
+        ]
+    ).T
+    gnss = np.maximum(gnss, model.gnss_std_m)
+    apart = np.abs(times[:, None] - times[None])
+    products = np.multiply.outer(map_std, map_std)
+    local_share = 1 - model.mount_share - model.white_share
+    same = np.multiply.outer(gnss, gnss) * np.exp(-apart / model.gnss_tau_s)
+    same += local_share * products * np.exp(-apart / model.map_tau_s)
+    same += np.diag(model.white_share * map_std**2 + rolling**2)
+    turned = heading[:, None] - heading[None]
+    mount = model.mount_share * products * np.exp(-apart / model.mount_tau_s)
+    cos, sin = mount * np.cos(turned), mount * np.sin(turned)
+    blocks = np.empty((len(times), 2, len(times), 2))
+    blocks[:, 0, :, 0] = blocks[:, 1, :, 1] = same + cos
+    blocks[:, 0, :, 1], blocks[:, 1, :, 0] = sin, -sin
+    return blocks.reshape(2 * len(times), -1)
+
+
+LARGEST_GAP_S = 2.0
+"""Values farther apart do not show how the aircraft turned between them."""
+LEAST_DEG_S2 = 3.0
+"""Change of the turn rate per second from which the aircraft rolls; less is noise of headings."""
+LATENCY_STD_S = 0.08
+"""Standard deviation of the latency of the images beyond the learnt one. With more, a step of GNSS
+in a turn is named after more than 5 s; with less, images that are 0.3 s late look like steps."""
+GRAVITY_MPS2 = 9.81
+
+
+class Rolling:
+    """Recognizes rolling by the change of the turn rate. Mutable; deterministic."""
+
+    def __init__(self) -> None:
+        self._before: deque[Difference] = deque(maxlen=2)
+
+    def std_m(self, value: Difference, known: Biases) -> float:
+        """Standard deviation of the error of a value, the next after those before; 0 without.
+
+        `known`: for the latency that it may be due to.
+        """
+        values = [*self._before, value]
+        self._before.append(value)
+        change = _change_of_rate(*values) if len(values) == 3 else 0.0
+        if change <= math.radians(LEAST_DEG_S2):
+            return 0.0
+        # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
+        bank_rate = float(np.hypot(*value.vel_en_mps)) * change / GRAVITY_MPS2
+        latency_s = math.hypot(known.mean[4], LATENCY_STD_S)
+        return latency_s * bank_rate * value.agl_m
+
+
+def _change_of_rate(first: Difference, middle: Difference, last: Difference) -> float:
+    """Magnitude of the change of the turn rate per second; 0 where it is not known."""
+    before_s, after_s = middle.time_s - first.time_s, last.time_s - middle.time_s
+    if not (0 < before_s <= LARGEST_GAP_S and 0 < after_s <= LARGEST_GAP_S):
+        return 0.0
+    before = math.remainder(middle.heading_rad - first.heading_rad, math.tau) / before_s
+    after = math.remainder(last.heading_rad - middle.heading_rad, math.tau) / after_s
+    return 2 * abs(after - before) / (before_s + after_s)
+
+
+QUARANTINE_S = 180.0
+"""Time that a value waits before it counts: longer than a drift of 0.25 m/s needs to be named."""
+SETTLED_S = 1800.0
+"""Time of agreement after which biases count as known."""
+OUTLIER = 13.8
+"""Squared Mahalanobis distance of an outlier: chi-square of two axes, 99.9 %."""
+LARGEST_STEP_S = 2.0
+"""Most time of agreement that one value counts."""
+_WALK = np.array([0.02, 0.02, math.radians(0.003), math.radians(0.003), 5e-4])
+"""Random walk of the biases, per root second, so that old values are forgotten over an hour: the
+displacement of a map is not the same everywhere, the track corrects part of the tilt."""
+_BIAS, _GNSS, _LOCAL, _BODY = slice(0, 5), slice(5, 7), slice(7, 9), slice(9, 11)
+_STATES = 11
+
+
+@dataclass(frozen=True, eq=False)
+class Resumed:
+    """What a flight had learnt before its process was restarted.
+
+    `learnt`, `reference`: see `BiasLearner`.
+    """
+
+    learnt: Biases
+    reference: Biases
+
+    def to_plain(self, before: Biases | None) -> dict[str, Any]:
+        """Values for strict JSON. `before`: what was known of the map before the flight, if it was
+        known at all."""
+        flight = {"reference": self.reference.to_plain()}
+        if before is not None:
+            flight["before"] = before.to_plain()
+        return {**self.learnt.to_plain(), "flight": flight}
+
+
+def before_flight(plain: Mapping[str, Any]) -> tuple[Biases | None, Resumed | None]:
+    """Inverse of `Resumed.to_plain`: what was known before the flight, and what it had learnt.
+
+    Values without a flight were known before it. Raises as `biases_from_plain`.
+    """
+    learnt, flight = biases_from_plain(plain), plain.get("flight")
+    if flight is None:
+        return learnt, None
+    before = biases_from_plain(flight["before"]) if "before" in flight else None
+    return before, Resumed(learnt, biases_from_plain(flight["reference"]))
+
+
+class BiasLearner:
+    """Learns the biases of one receiver over one map. Mutable; deterministic."""
+
+    def __init__(
+        self, start: Biases, model: DifferenceModel, resumed: Resumed | None = None
+    ) -> None:
+        """`start` is what is known before the flight; a `resumed` flight continues to learn with
+        the reference that it had."""
+        resumed = resumed or Resumed(start, start)
+        self._model, self._filter = model, _Filter(resumed.learnt, model)
+        self._reference = resumed.reference
+        self._waiting: deque[Difference] = deque()
+
+    @property
+    def learnt(self) -> Biases:
+        """Estimate from all values whose quarantine has ended."""
+        return self._filter.biases
+
+    @property
+    def reference(self) -> Biases:
+        """What a slow drag-off of this flight has not moved: the biases before the flight, or,
+        where they were not known, after the first `SETTLED_S` of agreement."""
+        return self._reference
+
+    def add(self, value: Difference) -> None:
+        self._waiting.append(value)
+        while self._waiting and self._waiting[0].time_s <= value.time_s - QUARANTINE_S:
+            self._filter.update(self._waiting.popleft())
+        if self._reference.agreed_s < SETTLED_S <= self.learnt.agreed_s:
+            self._reference = self.learnt
+
+    def widen(self, rolling_std_m: float) -> None:
+        """Give the newest value at least this error by rolling."""
+        if self._waiting:
+            self._waiting[-1] = self._waiting[-1].rolling(rolling_std_m)
+
+    def discard(self) -> None:
+        """Drop everything in quarantine, as at an alarm."""
+        self._waiting.clear()
+
+    def restore(self) -> None:
+        """Go back to the reference, if there is one: a drag-off may have been learnt since."""
+        self.discard()
+        if self._reference.agreed_s >= SETTLED_S:
+            self._filter = _Filter(self._reference, self._model)
+
+    def until(self, time_s: float) -> Biases:
+        """Estimate with the values before a time as well, though they are in quarantine."""
+        ahead = copy.copy(self._filter)
+        for value in self._waiting:
+            if value.time_s < time_s:
+                ahead.update(value)
+        return ahead.biases
+
+
+class _Filter:
+    """The filter; its arrays are replaced, never changed, so a shallow copy is independent."""
+
+    def __init__(self, start: Biases, model: DifferenceModel) -> None:
+        self.biases, self._model = start, model
+        self._taus = np.repeat([model.gnss_tau_s, model.map_tau_s, model.mount_tau_s], 2)
+        self._mean = np.concatenate([start.mean, np.zeros(_STATES - len(NAMES))])
+        self._cov = np.eye(_STATES)
+        self._cov[_BIAS, _BIAS] = start.cov
+        self._time_s: float | None = None
+
+    def update(self, value: Difference) -> None:
+        elapsed_s = 0.0 if self._time_s is None else value.time_s - self._time_s
+        mean, cov = self._predicted(elapsed_s)
+        shown = self._design(value)
+        noise_m2 = self._model.white_share * value.map_std_m**2 + value.rolling_std_m**2
+        spread = shown @ cov @ shown.T + noise_m2 * np.eye(2)
+        off = value.en_m - shown @ mean
+        gain = np.linalg.solve(spread, shown @ cov).T
+        self._mean, self._cov, self._time_s = mean, cov, value.time_s
+        if off @ np.linalg.solve(spread, off) <= OUTLIER:
+            self._mean, cov = mean + gain @ off, cov - gain @ spread @ gain.T
+            self._cov = (cov + cov.T) / 2
+            agreed_s = self.biases.agreed_s + min(max(elapsed_s, 0.0), LARGEST_STEP_S)
+            self.biases = replace(self.biases, agreed_s=agreed_s)
+        bounded = np.clip(self._mean[_BIAS], -LIMITS, LIMITS)
+        length = float(np.hypot(*bounded[:2]))
+        bounded[:2] *= min(1.0, LIMITS[0] / max(length, 1.0))
+        self._mean = np.concatenate([bounded, self._mean[len(NAMES) :]])
+        self.biases = replace(self.biases, mean=bounded, cov=self._cov[_BIAS, _BIAS])
+
+    def _predicted(self, elapsed_s: float) -> tuple[Array, Array]:
+        """State and covariance after a time; a clock that went back begins new slow errors."""
+        elapsed_s = elapsed_s if elapsed_s >= 0 else math.inf
+        kept = np.concatenate([np.ones(len(NAMES)), np.exp(-elapsed_s / self._taus)])
+        walked_s = elapsed_s if math.isfinite(elapsed_s) else 0.0
+        grown = np.concatenate([_WALK**2 * walked_s, 1 - kept[len(NAMES) :] ** 2])
+        return kept * self._mean, np.multiply.outer(kept, kept) * self._cov + np.diag(grown)
+
+    def _design(self, value: Difference) -> Array:
+        """Derivatives (2, 11) of a value by the state; slow errors have unit variance."""
+        model = self._model
+        made = np.zeros((2, _STATES))
+        made[:, _BIAS] = value.design
+        made[:, _GNSS] = max(value.gnss_std_m, model.gnss_std_m) * np.eye(2)
+        local_share = 1 - model.mount_share - model.white_share
+        made[:, _LOCAL] = math.sqrt(local_share) * value.map_std_m * np.eye(2)
+        sin, cos = math.sin(value.heading_rad), math.cos(value.heading_rad)
+        turned = np.array([[cos, sin], [-sin, cos]])
+        made[:, _BODY] = math.sqrt(model.mount_share) * value.map_std_m * turned
+        return made

@@ -18,8 +18,7 @@ from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
-from orthonav.onboard.gnss.biases import Biases, at_start, design
-from orthonav.onboard.gnss.learner import SETTLED_S, Resumed
+from orthonav.onboard.gnss.biases import SETTLED_S, Biases, Resumed, at_start, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
@@ -41,8 +40,6 @@ ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NO
 
 
 class GnssSource(Protocol):
-    """Delivers solutions."""
-
     def take(self, until_ns: int) -> list[GnssSample]:
         """Solutions that arrived until a time, each once, in order."""
 
@@ -54,18 +51,14 @@ class LiveSolutions:
         self._queue = queue
 
     def take(self, until_ns: int) -> list[GnssSample]:
-        """See `GnssSource.take`."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 
 
 class RecordedSolutions:
-    """Solutions of a recording."""
-
     def __init__(self, samples: list[GnssSample]) -> None:
         self._samples = deque(sorted(samples, key=lambda each: each.arrived_ns))
 
     def take(self, until_ns: int) -> list[GnssSample]:
-        """See `GnssSource.take`."""
         taken = []
         while self._samples and self._samples[0].arrived_ns <= until_ns:
             taken.append(self._samples.popleft())
@@ -198,7 +191,6 @@ class GnssWatch:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Reasons in the health."""
         found = [monitor.status.reason for monitor in self._monitors.values()]
         if not self._learnt.is_plausible:
             found.append(DISPLACED)
@@ -208,7 +200,6 @@ class GnssWatch:
 
     @property
     def _learnt(self) -> Biases:
-        """Biases of the first receiver."""
         return self._resumable.learnt
 
     @property
@@ -238,7 +229,6 @@ class GnssWatch:
         return made
 
     def plain(self) -> list[dict[str, Any]]:
-        """Status of each receiver for the line of health."""
         return [
             _plain(number, each.status, self._now_ns) | _plain_biases(each.learnt)
             for number, each in sorted(self._monitors.items())

@@ -1,8 +1,5 @@
-"""Input of all messages: one position at one exposure, with its accuracy and time.
-
-Unknown values are NaN or None here and are marked as unknown in the message; they never become a
-number that looks like a measurement.
-"""
+"""Input of all messages: one position at one exposure. Unknown values, NaN or None, never become a
+number that looks like a measurement."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -16,10 +13,8 @@ from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
 
 AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
-"""Time over which the filters of autopilots average positions, s, where their claim should come to
-the standard deviation `AT_STD_M`; it grows with this power of it. Derived from the default process
-noise of PX4 and ArduPilot, 5.5 s, and chosen on generated flights
-(docs/decisions/correlated-errors.md)."""
+"""Time over which the filters of autopilots average positions, for a claim of `AT_STD_M`; it grows
+with this power of the claim (docs/decisions/correlated-errors.md)."""
 
 
 class EstimateError(OrthonavError, ValueError):
@@ -39,21 +34,15 @@ class Clock(Enum):
 class NavigationEstimate:
     """Position of the aircraft at one exposure.
 
-    `lat_deg`, `lon_deg`: position, WGS84.
     `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
-    `confidence`: probability (0 to 1) that the fix is correct; NaN: not known.
+    `confidence`: 0 to 1; NaN: not known.
     `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
-    `processing_s`: time from exposure until the message is sent.
-    `agl_m`: height above ground; NaN where not known, as the next three.
-    `alt_amsl_m`, `alt_std_m`: altitude above mean sea level and its standard deviation.
-    `heading_deg`: heading of the top of the image, clockwise from true north.
+    `processing_s`: from exposure until the message is sent.
+    `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
     `state`: state of the track; None for views that are located one by one.
     `reset_counter`: 0 to 255; changes when the position jumped.
-    `dead_reckoned`: the view did not show the map, and the position is sent all the same because
-    that was asked for; messages that can mark it do, others are not made.
-
-    Raises `EstimateError` where a value is out of range or no time is given.
+    `dead_reckoned`: the view did not show the map; only a message that can mark it is made.
     """
 
     lat_deg: float
@@ -63,12 +52,10 @@ class NavigationEstimate:
     utc_ns: int | None = None
     boot_ns: int | None = None
     processing_s: float = 0.0
-    agl_m: float = math.nan
     alt_amsl_m: float = math.nan
     alt_std_m: float = math.nan
     vel_en_mps: tuple[float, float] | None = None
     vel_cov_en: NDArray[np.float64] | None = None
-    heading_deg: float = math.nan
     state: str | None = None
     reset_counter: int = 0
     dead_reckoned: bool = False
@@ -101,26 +88,18 @@ class NavigationEstimate:
         return time_ns
 
     def sent_ns(self, clock: Clock) -> int:
-        """Time of sending: exposure plus `processing_s`."""
         return self.exposed_ns(clock) + round(self.processing_s * 1e9)
 
-    def horizontal_std_m(self, min_std_m: float = 0.0) -> float:
-        """Horizontal standard deviation as one number: that along the worst direction.
+    def horizontal_std_m(self) -> float:
+        """Standard deviation along the worst direction; NaN where the covariance is invalid.
 
-        The square root of the larger eigenvalue of the covariance, at least `min_std_m`. Filters
-        that take one number use it for both axes (PX4 squares it into the variance of each), so a
-        smaller value would be too optimistic along the long axis. NaN where the covariance is
-        unknown or invalid.
+        Filters that take one number use it for both axes (PX4 squares it into both variances), so a
+        smaller one would be too optimistic along the long axis.
         """
-        major = error_ellipse(self.cov_en_m2)[0]
-        return major if math.isnan(major) else max(major, min_std_m)
+        return error_ellipse(self.cov_en_m2)[0]
 
     def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
-        """Whether this can be reported as a valid position.
-
-        It needs a confidence of at least `min_confidence`, a valid covariance, and the state
-        "tracking" if it comes from a track.
-        """
+        """Whether it is confident, with a valid covariance, and of no track or one that tracks."""
         return (
             self.confidence >= min_confidence  # False for NaN
             and self.state in (None, "tracking")
@@ -134,24 +113,24 @@ def estimate_from_result(
     clock: Clock = Clock.UTC,
     utc_minus_boot_ns: int | None = None,
     processing_s: float | None = None,
-    alt_amsl_m: float = math.nan,
-    alt_std_m: float = math.nan,
-    reset_counter: int = 0,
 ) -> NavigationEstimate | None:
     """Estimate of the fix of a view; None where there is no fix.
 
     `clock`: clock of `result.time_ns`; with `utc_minus_boot_ns` both clocks are filled in.
     `processing_s`: time from exposure to sending; by default the latency of the fix, without the
     latency of the camera.
-    `alt_amsl_m`, `alt_std_m`: altitude of the autopilot, to be sent back; a fix has none.
-    The velocity is that of the track.
     """
     fix = result.outcome
     if not isinstance(fix, Fix):
         return None
     if processing_s is None:
         processing_s = result.latency_ms / 1e3 if math.isfinite(result.latency_ms) else 0.0
-    utc_ns, boot_ns = _both_clocks(result.time_ns, clock, utc_minus_boot_ns)
+    utc_ns: int | None = result.time_ns
+    boot_ns: int | None = result.time_ns
+    if clock is Clock.UTC:
+        boot_ns = None if utc_minus_boot_ns is None else result.time_ns - utc_minus_boot_ns
+    else:
+        utc_ns = None if utc_minus_boot_ns is None else result.time_ns + utc_minus_boot_ns
     return NavigationEstimate(
         lat_deg=fix.lat_deg,
         lon_deg=fix.lon_deg,
@@ -160,32 +139,16 @@ def estimate_from_result(
         utc_ns=utc_ns,
         boot_ns=boot_ns,
         processing_s=processing_s,
-        agl_m=fix.agl_m,
-        alt_amsl_m=alt_amsl_m,
-        alt_std_m=alt_std_m,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
         vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
-        heading_deg=fix.heading_deg,
         state=result.state,
-        reset_counter=reset_counter,
     )
 
 
 def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
-    """Symmetric covariance with a standard deviation of at least `min_std` in every direction.
-
-    `cov`: covariance (N, N). `min_std`: in the square root of its unit.
-    """
+    """Symmetric covariance (N, N) with a standard deviation of at least `min_std` everywhere."""
     values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
-
-
-def _both_clocks(
-    time_ns: int, clock: Clock, utc_minus_boot_ns: int | None
-) -> tuple[int | None, int | None]:
-    if clock is Clock.UTC:
-        return time_ns, None if utc_minus_boot_ns is None else time_ns - utc_minus_boot_ns
-    return None if utc_minus_boot_ns is None else time_ns + utc_minus_boot_ns, time_ns
 
 
 def _velocity(fix: Fix) -> tuple[float, float] | None:
@@ -203,13 +166,11 @@ def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
 def messages_averaged(std_m: float, interval_s: float) -> float:
     """Number of messages, 1 or more, that a receiver averages.
 
-    The errors of consecutive fixes are nearly the same: the displacement of the map, the tilt of
-    the camera and the memory of the track last longer than a receiver averages. One that takes n
-    such fixes as independent claims n times too small a variance.
+    Errors of consecutive fixes (of the map, the tilt, the track) last longer than that: a receiver
+    that takes n of them as independent claims n times too small a variance.
 
-    `std_m`: standard deviation that its claim should come to, m. `interval_s`: time since the
-    message before, s; infinite for the first. A time that is not positive, after a clock was set
-    back, counts as infinite.
+    `std_m`: standard deviation that its claim should come to. `interval_s`: since the message
+    before; infinite for the first. After a clock was set back it counts as infinite.
     """
     if not interval_s > 0:
         return 1.0
@@ -221,10 +182,8 @@ def for_filter(
 ) -> NavigationEstimate:
     """The estimate with the covariance that makes the claim of a receiving filter right.
 
-    `interval_s`: time since the message before, see `messages_averaged`. `min_std_m`: lower bound
-    of the standard deviation of the fix, at least that of the map's displacement, which does not
-    average out. An invalid covariance stays
-    as it is.
+    `min_std_m`: lower bound of the standard deviation, at least that of the map's displacement,
+    which does not average out. An invalid covariance stays as it is.
     """
     if math.isnan(estimate.horizontal_std_m()):
         return estimate
@@ -235,16 +194,12 @@ def for_filter(
 
 @dataclass
 class FilterCovariance:
-    """Prepares the estimates of several messages, each by its own rate. Mutable.
-
-    `min_std_m`: see `for_filter`.
-    """
+    """Prepares the estimates of several messages, each by its own rate. Mutable."""
 
     min_std_m: float = 0.0
     _sent_ns: dict[str, int] = field(default_factory=dict)
 
     def interval_s(self, message: str, exposed_ns: int) -> float:
-        """Time from the exposure of the last `message` sent, s; infinite for the first."""
         before = self._sent_ns.get(message)
         return math.inf if before is None else (exposed_ns - before) / 1e9
 
@@ -255,5 +210,4 @@ class FilterCovariance:
         return for_filter(estimate, self.interval_s(message, exposed_ns), self.min_std_m)
 
     def sent(self, message: str, exposed_ns: int) -> None:
-        """Note that `message` was sent."""
         self._sent_ns[message] = exposed_ns

@@ -25,10 +25,14 @@ from orthonav.onboard.messages.estimate import (
 FUTURE_S = 0.1
 """Tolerance for exposures in the future, before the clocks are taken to disagree."""
 JITTER = 0.1
-"""Share of an interval by which a message may be early, so that views with a small jitter all pass
-at their nominal rate."""
+"""Share of an interval by which a message may be early: views with a small jitter all pass."""
 VELOCITY_STD_MPS = 1.0
 """Standard deviation of a velocity that has no covariance."""
+MAX_AGE_S = 1.0
+"""Longest time since exposure."""
+JUMP_SIGMAS, JUMP_VIEWS = 5.0, 3
+"""A position is a jump where it differs from the prediction by more standard deviations, beyond the
+possible manoeuvre; it is withheld until so many views in a row agree on the new place."""
 MAX_ACCEL_MPS2, MAX_SPEED_MPS = 10.0, 60.0
 """Possible manoeuvre where the velocity is known, and where it is not."""
 _MOST_NORTH_DEG = 89.8
@@ -39,31 +43,18 @@ Array = NDArray[np.float64]
 class GateRules:
     """Limits of the gate.
 
-    `min_confidence`: lowest confidence that is sent, 0 to 1.
-    `max_std_m`: largest standard deviation along the worst direction, metres.
-    `max_age_s`: longest time since exposure, seconds.
-    `min_interval_s`: shortest time between two messages, by name; others are not limited.
-    `jump_sigmas`: a position that differs from the prediction by more than this many standard
-    deviations plus the possible manoeuvre is a jump.
-    `jump_views`: a jump is withheld until so many views in a row agree on the new place.
-    `send_coasting`: admit dead reckoning of a track too; messages mark it.
-
-    Raises `EstimateError` for limits that are not positive, or a confidence outside 0 to 1.
+    `min_confidence`: 0 to 1. `max_std_m`: along the worst direction. `min_interval_s`: shortest
+    time between two messages, by name. `send_coasting`: admit dead reckoning; messages mark it.
     """
 
     min_confidence: float = CONFIDENT
     max_std_m: float = 50.0
-    max_age_s: float = 1.0
     min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    jump_sigmas: float = 5.0
-    jump_views: int = 3
     send_coasting: bool = False
 
     def __post_init__(self) -> None:
         limits = {
             "max_std_m": self.max_std_m,
-            "max_age_s": self.max_age_s,
-            "jump_sigmas": self.jump_sigmas,
             **{f"min_interval_s[{key}]": value for key, value in self.min_interval_s.items()},
         }
         for name, value in limits.items():
@@ -80,12 +71,10 @@ class Gate:
     `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for dead reckoning,
     `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a message that
     would exceed its rate, and the reasons of views that the flight loop does not locate.
-    `sent`: counts of messages by name.
     `resets`: number of admitted jumps of the position, and of tracks found again.
     """
 
     def __init__(self, rules: GateRules | None = None, clock: Clock = Clock.UTC) -> None:
-        """`clock`: clock of `now_ns`, with which times of exposure are compared."""
         self.rules = rules or GateRules()
         self.clock = clock
         self.withheld: Counter[str] = Counter()
@@ -97,11 +86,9 @@ class Gate:
         self._due_ns: dict[str, int] = {}
 
     def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
-        """Return the estimate with its reset counter set, or None where it must not be sent.
+        """The estimate with its reset counter set, or None where it must not be sent.
 
-        `estimate` is None for a view without a fix. Pass every view, also those that cannot be
-        sent: they show that a track was lost. Raises `EstimateError` where the exposure is not
-        known by the gate's clock.
+        Pass every view, also without a fix: it shows that a track was lost.
         """
         reason = self._reason(estimate, now_ns)
         self._watch(estimate)
@@ -123,18 +110,14 @@ class Gate:
         return made
 
     def _is_confirmed(self, estimate: NavigationEstimate) -> bool:
-        """Whether enough views in a row, this one included, agree on a place after a jump."""
         if self._jumped_to and self._jumped(self._jumped_to[-1], estimate):
             self._jumped_to = []
         self._jumped_to.append(estimate)
-        return len(self._jumped_to) >= self.rules.jump_views
+        return len(self._jumped_to) >= JUMP_VIEWS
 
     def due(self, message: str, now_ns: int) -> bool:
-        """Whether the rate of `message` allows sending now; counts it as sent or withheld.
-
-        The long-term rate never exceeds the limit. `now_ns` may be of any steady clock; after a
-        jump back the next message passes.
-        """
+        """Whether the rate of `message` allows sending now; counts it. The next one passes after a
+        clock was set back."""
         interval_s = self.rules.min_interval_s.get(message)
         if interval_s is not None:
             interval_ns = round(interval_s * 1e9)
@@ -150,7 +133,6 @@ class Gate:
         return True
 
     def _reason(self, estimate: NavigationEstimate | None, now_ns: int) -> str | None:
-        """Reason why the estimate must not be sent; None if it can be sent."""
         if estimate is None:
             return "no_fix"
         exposed_ns, std_m = estimate.exposed_ns(self.clock), estimate.horizontal_std_m()
@@ -166,9 +148,9 @@ class Gate:
             "no_covariance": math.isnan(std_m),
             "too_uncertain": std_m > self.rules.max_std_m,
             "from_the_future": age_s < -FUTURE_S,
-            "stale": age_s > self.rules.max_age_s,
+            "stale": age_s > MAX_AGE_S,
             # Farther behind, and not stale: the clock was set back.
-            "out_of_order": 0 <= behind_s <= self.rules.max_age_s + FUTURE_S,
+            "out_of_order": 0 <= behind_s <= MAX_AGE_S + FUTURE_S,
         }
         return next((reason for reason, applies in refusals.items() if applies), None)
 
@@ -179,7 +161,6 @@ class Gate:
             self._interrupted = True
 
     def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:
-        """Whether two positions differ by more than their errors and the motion allow."""
         seconds = (now.exposed_ns(self.clock) - before.exposed_ns(self.clock)) / 1e9
         if seconds <= 0:
             return True
@@ -194,12 +175,11 @@ class Gate:
             free_m = MAX_ACCEL_MPS2 * seconds**2 / 2
         else:
             free_m = MAX_SPEED_MPS * seconds
-        allowed_m = self.rules.jump_sigmas * error_ellipse(cov)[0] + free_m
+        allowed_m = JUMP_SIGMAS * error_ellipse(cov)[0] + free_m
         return not float(np.hypot(*moved)) <= allowed_m  # true for an invalid covariance, too
 
 
 def _moved_en_m(before: NavigationEstimate, now: NavigationEstimate) -> Array:
-    """Metres east and north from one position to another."""
     limited = min(max(before.lat_deg, -_MOST_NORTH_DEG), _MOST_NORTH_DEG)
     frame = LocalFrame(limited, before.lon_deg)
     start = frame.en_from_latlon(before.lat_deg, before.lon_deg)

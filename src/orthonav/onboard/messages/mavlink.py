@@ -1,11 +1,8 @@
 """MAVLink 2 messages of global positions that autopilots fuse, and their encoding.
 
-Fields and marks of unknown values are those of the definitions in `common.xml`; docs/autopilots.md
-lists each field and how PX4 and ArduPilot read it. Values out of range are clamped, never wrapped.
-Nothing is sent here: functions make messages, `Packer` encodes them, and
-`orthonav.onboard.messages.gate` decides which positions are sent.
-
-pymavlink (extra `autopilot`) is loaded with the first message.
+Fields and marks of unknown values are those of `common.xml`; docs/autopilots.md lists each field
+and how PX4 and ArduPilot read it. Values out of range are clamped, never wrapped. pymavlink (extra
+`autopilot`) is loaded with the first message.
 """
 
 import math
@@ -69,14 +66,8 @@ AUTOPILOT = Target()
 
 @dataclass(frozen=True)
 class Signing:
-    """Key and state of MAVLink 2 message signing.
-
-    `secret_key`: 32 bytes.
-    `timestamp_10us`: tens of microseconds since 2015-01-01; must never decrease for a link and a
-    key (see `signing_timestamp`), and grows by one with every message.
-    `link_id`: 0 to 255.
-    Raises `EstimateError` for a key of another length or values out of range.
-    """
+    """Key and state of MAVLink 2 message signing. `timestamp_10us`, since 2015-01-01, must never
+    decrease for a link and a key; it grows by one with every message."""
 
     secret_key: bytes = field(repr=False)
     timestamp_10us: int
@@ -98,11 +89,7 @@ def signing_timestamp(utc_ns: int) -> int:
 
 
 class Packer:
-    """Encodes messages with consecutive sequence numbers. Mutable; one per link.
-
-    Equal messages in equal order give equal bytes. `sequence` (0 to 255) is the number of the first
-    message. Raises `MissingExtraError` where pymavlink is not installed.
-    """
+    """Encodes messages, numbered from `sequence` on. Mutable; one per link."""
 
     def __init__(
         self,
@@ -124,7 +111,6 @@ class Packer:
             self._mav.signing.sign_outgoing = True
 
     def pack(self, message: Message) -> bytes:
-        """MAVLink 2 frame of one message, signed if the packer has a key."""
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
@@ -136,7 +122,6 @@ def global_position_sensor(
     clock: Clock = Clock.UTC,
     sensor_id: int = 1,
     target: Target = AUTOPILOT,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
@@ -149,7 +134,7 @@ def global_position_sensor(
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
     if not estimate.dead_reckoned:
         require_confident(estimate, min_confidence, "GLOBAL_POSITION_SENSOR")
-    eph_m = estimate.horizontal_std_m(min_std_m)
+    eph_m = estimate.horizontal_std_m()
     if math.isnan(eph_m):
         raise EstimateError("GLOBAL_POSITION_SENSOR needs the accuracy of the position")
     return dialect().MAVLink_global_position_sensor_message(
@@ -176,22 +161,19 @@ def gps_input(
     gps_id: int = 0,
     satellites: int = 0,
     hdop_m: float | None = None,
-    send_yaw: bool = False,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """GPS_INPUT (message 232): the position as that of a GPS receiver, stamped at exposure.
 
     Unknown values are marked in `ignore_flags` and sent as 0: the vertical velocity always,
     altitude and speed accuracy unless the estimate has them. `fix_type` is 3 for a confident
-    estimate, else 1 with all fields ignored. `satellites`: number to send; 0 is true, but some
-    checks refuse it. `hdop_m`: metres per unit of HDOP, which is then derived from the horizontal
-    standard deviation, else ignored. `send_yaw`: send the heading as that of the vehicle, which is
-    correct only where the top of the image points forward.
+    estimate, else 1 with all fields ignored. `satellites`: 0 is true, but some checks refuse it.
+    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored.
     """
     confident = estimate.is_confident(min_confidence)
-    eph_m = estimate.horizontal_std_m(min_std_m)
-    speed_std_mps = _speed_std_mps(estimate)
+    eph_m = estimate.horizontal_std_m()
+    vel_cov = estimate.vel_cov_en
+    speed_std_mps = math.nan if vel_cov is None else error_ellipse(vel_cov)[0]
     flags = _ignored(estimate, speed_std_mps, hdop_m) if confident else _IGNORE_ALL
     week, week_ms = (0, 0) if estimate.utc_ns is None else gps_time(estimate.utc_ns)
     vel_east, vel_north = estimate.vel_en_mps or (0.0, 0.0)
@@ -218,7 +200,7 @@ def gps_input(
         horiz_accuracy=unless(_IGNORE_HORIZ_ACC, eph_m),
         vert_accuracy=unless(_IGNORE_VERT_ACC, estimate.alt_std_m),
         satellites_visible=clamped(satellites, 0, 255),
-        yaw=_yaw_cdeg(estimate.heading_deg) if send_yaw and confident else 0,
+        yaw=0,  # the camera need not point forward
     )
 
 
@@ -227,14 +209,10 @@ def external_position_estimate(
     *,
     clock: Clock = Clock.UTC,
     target: Target = AUTOPILOT,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
-
-    `transmission_time` is the time of sending modulo `WRAP_S`. Raises `EstimateError` for an
-    estimate of low confidence, which the command cannot mark.
-    """
+    Raises `EstimateError` for an estimate of low confidence, which it cannot mark."""
     require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
     wrapped_ns = estimate.sent_ns(clock) % round(WRAP_S * 1e9)
     return dialect().MAVLink_command_int_message(
@@ -246,7 +224,7 @@ def external_position_estimate(
         autocontinue=0,
         param1=float32(wrapped_ns / 1e9),
         param2=float32(max(estimate.processing_s, 0.0)),
-        param3=float32(estimate.horizontal_std_m(min_std_m)),
+        param3=float32(estimate.horizontal_std_m()),
         param4=0.0,
         x=deg_e7(estimate.lat_deg),
         y=deg_e7(estimate.lon_deg),
@@ -302,7 +280,6 @@ def dialect() -> Any:
 
 
 def deg_e7(degrees: float) -> int:
-    """Angle in 1e-7 degrees, rounded to the nearest."""
     return round(degrees * 1e7)
 
 
@@ -312,7 +289,6 @@ def microseconds(time_ns: int) -> int:
 
 
 def clamped(value: float, low: int, high: int) -> int:
-    """`value` clamped to `low` and `high`, rounded to the nearest integer."""
     return round(min(max(value, low), high))
 
 
@@ -333,10 +309,6 @@ def _ignored(estimate: NavigationEstimate, speed_std_mps: float, hdop_m: float |
     return flags | (0 if math.isfinite(speed_std_mps) else _IGNORE_SPEED_ACC)
 
 
-def _speed_std_mps(estimate: NavigationEstimate) -> float:
-    return math.nan if estimate.vel_cov_en is None else error_ellipse(estimate.vel_cov_en)[0]
-
-
 def _hdop(eph_m: float, hdop_m: float | None) -> float:
     """HDOP of a standard deviation, at most 99.99: ArduPilot stores hundredths in 16 bits."""
     if hdop_m is None:
@@ -344,13 +316,6 @@ def _hdop(eph_m: float, hdop_m: float | None) -> float:
     if not hdop_m > 0:
         raise EstimateError(f"hdop_m must be metres per unit, above 0, got {hdop_m}")
     return min(eph_m / hdop_m, 99.99)
-
-
-def _yaw_cdeg(heading_deg: float) -> int:
-    """Hundredths of degrees, 36000 for north, because 0 means "not available"."""
-    if not math.isfinite(heading_deg):
-        return 0
-    return round(heading_deg * 100) % 36000 or 36000
 
 
 def _unix_s(day: str) -> int:
@@ -363,10 +328,7 @@ _WEEK_MS = 7 * 86_400_000
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
-    """GPS week (without rollover at 1024) and time of week in ms, of a UTC time in ns since 1970.
-
-    (0, 0), which receivers read as "not known", before 1980-01-06.
-    """
+    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 1980-01-06."""
     utc_ms = utc_ns // 1_000_000
     leaps = bisect_right(_LEAPS_UNIX_S, utc_ms // 1000)
     since_epoch_ms = utc_ms - _EPOCH_UNIX_S * 1000 + leaps * 1000

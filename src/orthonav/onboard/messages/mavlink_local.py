@@ -1,8 +1,7 @@
 """MAVLink messages in the autopilot's local frame: ODOMETRY, VISION_POSITION_ESTIMATE, its origin.
 
-They need more than a map provides: height, attitude and, in part, a 3D velocity. These are the
-autopilot's own values at the exposure (`LocalPose`), sent back to complete the message; its filter
-must fuse the horizontal position only (docs/autopilots.md).
+Height, attitude and vertical velocity are the autopilot's own (`LocalPose`), sent back to complete
+the message; its filter must fuse the horizontal position only (docs/autopilots.md).
 """
 
 import math
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate, floored
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.onboard.messages.mavlink import (
     Message,
     clamped,
@@ -47,11 +46,7 @@ class Autopilot(Enum):
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of an autopilot's local frame.
-
-    `lat_deg`, `lon_deg`: WGS84. `alt_amsl_m`: metres above mean sea level; needed, because the
-    message that sets the origin cannot omit it. Raises `EstimateError` for invalid values.
-    """
+    """Origin of an autopilot's local frame (WGS84, m above mean sea level)."""
 
     lat_deg: float
     lon_deg: float
@@ -70,10 +65,8 @@ class Origin:
 class LocalPose:
     """State that the autopilot reported for the exposure, in its local frame. NaN: not known.
 
-    `origin`: origin of the local frame.
-    `down_m`, `down_std_m`: distance below the origin; needed where the estimate has no altitude.
+    `down_m`, `down_std_m`: below the origin; needed where the estimate has no altitude.
     `attitude_rad`, `attitude_std_rad`: roll, pitch, yaw of the body from NED (rotations ZYX).
-    `vel_down_mps`, `vel_down_std_mps`: velocity downwards.
     """
 
     origin: Origin
@@ -91,7 +84,6 @@ def odometry(
     autopilot: Autopilot,
     *,
     clock: Clock = Clock.UTC,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
@@ -99,11 +91,10 @@ def odometry(
     PX4: pose and velocity in MAV_FRAME_LOCAL_NED; attitude and velocity are NaN where not known.
     ArduPilot: MAV_FRAME_LOCAL_FRD with its x axis north and the velocity in MAV_FRAME_BODY_FRD, the
     only pair that it accepts; it always reads attitude and velocity, so they must be known.
-    `quality` is the confidence in per cent. Raises `EstimateError` where a needed value is not
-    known, or the estimate is of low confidence.
+    `quality` is the confidence in per cent. Raises `EstimateError`.
     """
     require_confident(estimate, min_confidence, "ODOMETRY")
-    position, variance = _position(estimate, pose, autopilot, min_std_m, "ODOMETRY")
+    position, variance = _position(estimate, pose, autopilot, "ODOMETRY")
     velocity_ned = _velocity_ned(estimate, pose)
     frames = (_LOCAL_NED, _LOCAL_NED)
     velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
@@ -146,16 +137,14 @@ def vision_position_estimate(
     autopilot: Autopilot,
     *,
     clock: Clock = Clock.UTC,
-    min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
 
-    Raises `EstimateError` where height or attitude is not known (the message cannot mark that), or
-    the estimate is of low confidence.
+    Raises `EstimateError` where height or attitude is not known, or for a low confidence.
     """
     require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
-    (x, y, z), variance = _position(estimate, pose, autopilot, min_std_m, "this message")
+    (x, y, z), variance = _position(estimate, pose, autopilot, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
     roll, pitch, yaw = pose.attitude_rad
@@ -172,20 +161,14 @@ def vision_position_estimate(
     )
 
 
-def set_gps_global_origin(
-    origin: Origin, *, target_system: int = 1, time_ns: int | None = None
-) -> Message:
-    """SET_GPS_GLOBAL_ORIGIN (message 48): origin of the local frame.
-
-    Autopilots accept it once. `target_system` must be theirs: PX4 refuses 0. `time_ns`: time of
-    sending by the clock of the link.
-    """
+def set_gps_global_origin(origin: Origin, *, target_system: int = 1) -> Message:
+    """SET_GPS_GLOBAL_ORIGIN (message 48), which autopilots accept once. PX4 refuses system 0."""
     return dialect().MAVLink_set_gps_global_origin_message(
         target_system=target_system,
         latitude=deg_e7(origin.lat_deg),
         longitude=deg_e7(origin.lon_deg),
         altitude=clamped(origin.alt_amsl_m * 1000, _INT32_MIN, _INT32_MAX),
-        time_usec=0 if time_ns is None else microseconds(time_ns),
+        time_usec=0,
     )
 
 
@@ -193,14 +176,10 @@ def _position(
     estimate: NavigationEstimate,
     pose: LocalPose,
     autopilot: Autopilot,
-    min_std_m: float,
     message: str,
 ) -> tuple[Triple, Array]:
-    """North, east, down in metres and their (3, 3) covariance, all of them known.
-
-    ArduPilot makes one standard deviation of the covariance; it gets the one that comes out as the
-    horizontal standard deviation.
-    """
+    """North, east, down in metres and their covariance (3, 3), all known. ArduPilot makes one
+    standard deviation of it: it gets the one that comes out as the horizontal one."""
     north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
     down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
     if not math.isfinite(down):
@@ -211,10 +190,10 @@ def _position(
             "receivers drop the position or its accuracy"
         )
     if autopilot is Autopilot.ARDUPILOT:
-        std_m = estimate.horizontal_std_m(min_std_m)
+        std_m = estimate.horizontal_std_m()
         return (north, east, down), np.eye(3) * ardupilot_variance(std_m)
     variance = np.zeros((3, 3))
-    variance[:2, :2] = floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
+    variance[:2, :2] = estimate.cov_en_m2[::-1, ::-1]
     variance[2, 2] = down_std**2
     return (north, east, down), variance
 
@@ -249,10 +228,9 @@ def north_east_m(
 ) -> tuple[float, float]:
     """Metres north and east of `origin` that `autopilot` converts to this position.
 
-    PX4 converts metres on an azimuthal-equidistant plane of a sphere of 6371 km, ArduPilot by a
-    constant per degree; neither uses the ellipsoid. True metres, 10 km from the origin, would
-    become positions up to 67 m away. Sources: PX4-Autopilot `src/lib/geo/geo.cpp`
-    (`MapProjection::project`); ArduPilot `libraries/AP_Common/Location.cpp`.
+    PX4 converts metres on an azimuthal-equidistant plane of a sphere of 6371 km
+    (`src/lib/geo/geo.cpp`), ArduPilot by a constant per degree (`AP_Common/Location.cpp`): 10 km
+    from the origin, true metres would become positions up to 67 m away.
     """
     if autopilot is Autopilot.PX4:
         return _px4(origin, lat_deg, lon_deg)
@@ -266,8 +244,7 @@ def ardupilot_variance(std_m: float) -> float:
     """Variance of each of three axes that ArduPilot reads as the standard deviation `std_m`.
 
     It takes the root of the sum of the variances of all three axes; older versions the cube root of
-    the sum of their squares, which gives `std_m` at 3 m and more than it above
-    (`libraries/GCS_MAVLink/GCS_Common.cpp`).
+    the sum of their squares, which is not smaller (`GCS_MAVLink/GCS_Common.cpp`).
     """
     return std_m**2 / 3
 

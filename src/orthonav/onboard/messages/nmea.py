@@ -1,11 +1,8 @@
 """NMEA 0183 sentences of a position: GGA, RMC and GST, for displays, loggers and old receivers.
 
-Fields are as in NMEA 0183 version 2.3 to 4.0; unknown values are empty fields. A sentence without a
-confident position is marked as its type provides: quality 0 (GGA), status V and mode N (RMC), empty
-fields (GST). Values are limited to the width of their field; altitudes that do not fit are omitted.
-
-The writer of pynmeagps is not used: it writes hundredths of seconds, 60.00000 minutes instead of
-the next degree, zeros for unknown numbers, and the current time for an unknown one.
+Fields are as in version 2.3 to 4.0; unknown values, and altitudes that do not fit, are empty.
+Without a confident position: quality 0 (GGA), status V and mode N (RMC), empty fields (GST). The
+writer of pynmeagps writes 60.00000 minutes, zeros for unknown numbers and the time of now.
 """
 
 import math
@@ -14,7 +11,7 @@ from enum import Enum
 
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT
-from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
+from orthonav.onboard.messages.estimate import NavigationEstimate
 
 MPS_PER_KNOT = 1852 / 3600
 _MINUTE = 10**5
@@ -25,14 +22,10 @@ _UNIX = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Quality(Enum):
-    """GGA quality, RMC status and RMC mode of a confident position."""
-
     ESTIMATED = ("6", "V", "E")
-    """Estimated, which is true. The RMC status is then V, as NMEA requires for all modes but A and
-    D, so that receivers that need satellites (such as ArduPilot) do not take it for GPS."""
+    """Receivers that need satellites, such as ArduPilot, do not take it for GPS."""
     AUTONOMOUS = ("1", "A", "A")
-    """As a GPS fix, for receivers that accept nothing else. It hides that no satellites were
-    used."""
+    """As a GPS fix, for receivers that accept nothing else."""
 
 
 def gga(
@@ -40,25 +33,18 @@ def gga(
     *,
     quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
-    hdop_m: float | None = None,
     min_confidence: float = CONFIDENT,
 ) -> bytes:
-    """GGA: time, position, quality, altitude above mean sea level where known.
+    """GGA: time, position, quality, altitude above mean sea level where known; 00 satellites.
 
-    `utc_ns`: time of a sentence without an estimate. `hdop_m`: metres per unit of HDOP; HDOP is
-    then derived from the horizontal standard deviation. The number of satellites is 00.
+    `utc_ns`: time of a sentence without an estimate.
     """
     time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
     if estimate is None or not confident:
         return _sentence(["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
-    altitude, hdop = _altitude(estimate.alt_amsl_m), ""
-    if hdop_m is not None:
-        if not hdop_m > 0:
-            raise EstimateError(f"hdop_m must be metres per unit, above 0, got {hdop_m}")
-        hdop = _number(estimate.horizontal_std_m() / hdop_m, 99.99)
-    place = _place(estimate)
-    tail = [altitude, "M" if altitude else "", "", "", "", ""]
-    return _sentence(["GGA", _time(time_ns), *place, quality.value[0], "00", hdop, *tail])
+    altitude, place = _altitude(estimate.alt_amsl_m), _place(estimate)
+    tail = ["00", "", altitude, "M" if altitude else "", "", "", "", ""]
+    return _sentence(["GGA", _time(time_ns), *place, quality.value[0], *tail])
 
 
 def rmc(
@@ -136,7 +122,6 @@ def _minutes(degrees: float, width: int) -> str:
 
 
 def _moment(utc_ns: int | None) -> datetime | None:
-    """Date and time; None where it is unknown or out of range."""
     if utc_ns is None:
         return None
     try:

@@ -90,7 +90,6 @@ class RosArguments:
 
     @property
     def full_name(self) -> str:
-        """Name of the node with its namespace."""
         return f"{self.namespace.rstrip('/')}/{self.node}"
 
     def expanded(self, name: str) -> str:

@@ -1,23 +1,156 @@
-"""A node of a ROS 2 graph, whichever library carries its messages."""
+"""A node of a ROS 2 graph, whichever library carries its messages, and the messages themselves.
 
+DDS types and CDR come from the definitions that `rosbags` has: a message is decoded by the code
+that decodes it from a recorded bag. DDS names:
+https://design.ros2.org/articles/topic_and_service_names.html (`rt/NAME`) and
+https://design.ros2.org/articles/mapping_dds_types.html (`PACKAGE::msg::dds_::NAME_`).
+"""
+
+import contextlib
+import importlib
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Protocol
 
-from orthonav.core.errors import described
+from orthonav.core.errors import MissingExtraError, described
 from orthonav.onboard.ros2.arguments import RosArguments
-from orthonav.onboard.ros2.messages import Definitions
+
+TIME_NS = 10**9
+_LOG = "rcl_interfaces/msg/Log"
+_GEOGRAPHIC = {
+    "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
+    "geographic_msgs/msg/GeoPointStamped": (
+        "std_msgs/Header header\ngeographic_msgs/GeoPoint position\n"
+    ),
+}
+_SAME_NAME = (
+    *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+    *("float32", "float64", "byte"),
+)
+
+
+def ros2_module(name: str) -> Any:
+    """A module of the extra `ros2`. Raises `MissingExtraError` where it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise MissingExtraError(
+            f"--ros2 needs {package}: pip install 'orthonav[ros2]'; where cyclonedds has no wheel "
+            f"(docs/ros2.md), source a ROS 2 environment ({error})"
+        ) from error
+
+
+class Definitions:
+    """The message definitions of one distribution of ROS 2, and their DDS types."""
+
+    def __init__(self, distro: str = "") -> None:
+        """`distro` as in ROS_DISTRO ("humble"); one that is not known stands for the newest.
+
+        Raises `MissingExtraError`.
+        """
+        typesys = ros2_module("rosbags.typesys")
+        stores = {store.value: store for store in typesys.Stores}
+        self._store = typesys.get_typestore(stores.get(f"ros2_{distro}", typesys.Stores.LATEST))
+        for name, text in _GEOGRAPHIC.items():
+            self._store.register(typesys.get_types_from_msg(text, name))
+        self._nested: dict[str, Any] = {}
+
+    def new(self, name: str, /, **values: Any) -> Any:
+        """A message of the type `name` ("sensor_msgs/msg/NavSatFix")."""
+        return self._store.types[name](**values)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        return self.new("std_msgs/msg/Header", stamp=self.time(stamp_ns), frame_id=frame)
+
+    def time(self, stamp_ns: int) -> Any:
+        sec, nanosec = divmod(stamp_ns, TIME_NS)
+        return self.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+    def vector(self, kind: str, names: str, values: Sequence[float]) -> Any:
+        """A message of `geometry_msgs` of plain numbers, such as Point and Quaternion."""
+        numbers = map(float, values)
+        return self.new(f"geometry_msgs/msg/{kind}", **dict(zip(names, numbers, strict=True)))
+
+    def decoded(self, name: str, cdr: bytes) -> Any:
+        """The message in a sample. Raises whatever `rosbags` raises for a damaged one."""
+        return self._store.deserialize_cdr(cdr, name)
+
+    def encoded(self, message: Any) -> bytes:
+        """The sample (XCDR1, little endian) of a message."""
+        return bytes(self._store.serialize_cdr(message, message.__msgtype__))
+
+    def type_hash(self, name: str) -> bytes:
+        """The type hash (REP 2016) as ROS 2 announces it in the user data of a DDS endpoint."""
+        return f"typehash={self._store.hash_rihs01(name)};".encode("ascii")
+
+    def dds_type(self, name: str) -> Any:
+        """A DDS type whose samples hold their CDR bytes in `cdr`, encoded already.
+
+        Cyclone DDS checks what comes in against the type before anybody reads it.
+        """
+        idl = ros2_module("cyclonedds.idl")
+        made = idl.make_idl_struct(
+            name.rpartition("/")[2], _dotted(name), self._members(name), dataclassify=False
+        )
+        made.serialize = lambda self, **_: self.cdr
+        made.deserialize = classmethod(_sample)
+        made.deserialize_key = classmethod(lambda kind, data, **_: kind())  # of a writer that left
+        return made
+
+    def _members(self, name: str) -> dict[str, Any]:
+        return {member: self._idl(kind) for member, kind in self._store.fielddefs[name][1]}
+
+    def _idl(self, kind: Any) -> Any:
+        """The type of a member as `cyclonedds.idl` writes it."""
+        types = ros2_module("cyclonedds.idl.types")
+        node, detail = kind
+        if node.name == "NAME":
+            return self._nested_struct(detail)
+        if node.name == "ARRAY":
+            return types.array[self._idl(detail[0]), detail[1]]
+        if node.name == "SEQUENCE":
+            return types.sequence[self._idl(detail[0])]
+        plain = {"bool": bool, "string": str, "char": types.uint8}
+        plain |= {each: getattr(types, each) for each in _SAME_NAME}
+        return plain[detail[0]]
+
+    def _nested_struct(self, name: str) -> Any:
+        if name not in self._nested:
+            idl = ros2_module("cyclonedds.idl")
+            self._nested[name] = idl.make_idl_struct(
+                name.rpartition("/")[2], _dotted(name), self._members(name)
+            )
+        return self._nested[name]
+
+
+def ros_type_name(dds_name: str) -> str:
+    """The message type of a name in DDS ("sensor_msgs::msg::dds_::Image_"); others stay."""
+    parts = dds_name.split("::")
+    if len(parts) != 4 or parts[2] != "dds_":
+        return dds_name
+    return "/".join((parts[0], parts[1], parts[3].removesuffix("_")))
+
+
+def _dotted(name: str) -> str:
+    package, kind, short = name.split("/")
+    return f"{package}.{kind}.dds_.{short}_"
+
+
+def _sample(kind: Any, /, data: bytes, **_: Any) -> Any:
+    sample = kind()
+    sample.cdr = data
+    return sample
+
 
 log = logging.getLogger(__name__)
 Handler = Callable[[Any, bytes], None]
 
 
 class Writer(Protocol):
-    """Sends messages of one topic."""
-
     def write(self, message: Any) -> None:
         """Send one message. Raises `OSError` where the middleware does not take it."""
 
@@ -89,3 +222,30 @@ class Graph(ABC):
             if not self.undecodable[topic]:
                 log.warning("message on %s cannot be used (%s)", topic, described(error))
             self.undecodable[topic] += 1
+
+
+class Rosout(logging.Handler):
+    """Publishes records as `rcl_interfaces/Log`, whose levels are those of Python."""
+
+    def __init__(self, node: Graph) -> None:
+        super().__init__()
+        self._node = node
+        self._writer = node.advertise(
+            node.arguments.resolved("/rosout"), _LOG, depth=100, latched=True
+        )
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Publish a record; one that cannot be published is dropped."""
+        definitions = self._node.definitions
+        with contextlib.suppress(Exception):  # the code that logs must not fail
+            message = definitions.new(
+                _LOG,
+                stamp=definitions.time(round(record.created * 1e9)),
+                level=min(record.levelno, logging.CRITICAL),
+                name=self._node.arguments.full_name.strip("/").replace("/", "."),
+                msg=record.getMessage(),
+                file=record.pathname,
+                function=record.funcName or "",
+                line=record.lineno,
+            )
+            self._writer.write(message)

@@ -1,6 +1,9 @@
 """A node over DDS, without ROS: readers and writers under the names, types and QoS of ROS 2.
 
-QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Quality-of-Service-Settings.html
+QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Quality-of-Service-Settings.html.
+For `ros2 node list` and `ros2 node info` a participant says by a topic of its own which readers and
+writers belong to which node, as `rmw_dds_common` does:
+https://design.ros2.org/articles/Node_to_Participant_mapping.html.
 """
 
 import logging
@@ -10,15 +13,47 @@ from dataclasses import dataclass
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
+
 from orthonav.core.errors import OutputError
-from orthonav.onboard.ros2 import names
 from orthonav.onboard.ros2.arguments import RosArguments
-from orthonav.onboard.ros2.graph import Graph, Handler
-from orthonav.onboard.ros2.messages import (
+from orthonav.onboard.ros2.graph import (
     Definitions,
+    Graph,
+    Handler,
     ros2_module,
     ros_type_name,
 )
+
+TOPIC, KIND = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
+USER_DATA = b"enclave=/;"
+"""Of a participant with nodes of ROS 2."""
+_HUMBLE_BYTES = 24
+
+
+def _node_entities(
+    definitions: Definitions,
+    arguments: RosArguments,
+    participant: Any,
+    readers: Sequence[Any],
+    writers: Sequence[Any],
+) -> Any:
+    """The message with the one node of a DDS participant, its readers and its writers."""
+    count = _HUMBLE_BYTES if arguments.distro == "humble" else 16
+
+    def gid(entity: Any) -> Any:
+        data = np.frombuffer(entity.guid.bytes.ljust(count, b"\0"), np.uint8)
+        return definitions.new("rmw_dds_common/msg/Gid", data=data)
+
+    node = definitions.new(
+        "rmw_dds_common/msg/NodeEntitiesInfo",
+        node_namespace=arguments.namespace,
+        node_name=arguments.node,
+        reader_gid_seq=[gid(each) for each in readers],
+        writer_gid_seq=[gid(each) for each in writers],
+    )
+    return definitions.new(KIND, gid=gid(participant), node_entities_info_seq=[node])
+
 
 log = logging.getLogger(__name__)
 CONFIGURATION = """<CycloneDDS><Domain>
@@ -52,14 +87,11 @@ class Subscription:
 
 
 class DdsWriter:
-    """Sends messages of one topic."""
-
     def __init__(self, topic: str, kind: str, definitions: Definitions, writer: Any) -> None:
         self.topic, self.kind, self.writer = topic, kind, writer
         self._definitions, self._sample = definitions, writer.topic.data_type
 
     def write(self, message: Any) -> None:
-        """See `Writer.write`."""
         sample = self._sample()
         sample.cdr = self._definitions.encoded(message)
         try:
@@ -78,12 +110,12 @@ class Node(Graph):
         builtin = ros2_module("cyclonedds.builtin")
         domain = ros2_module("cyclonedds.domain")
         self._domain = self._opened(domain, arguments)
-        made = self._qos.Qos(self._qos.Policy.Userdata(names.USER_DATA))
+        made = self._qos.Qos(self._qos.Policy.Userdata(USER_DATA))
         self._participant = domain.DomainParticipant(arguments.domain_id, made)
         self._subscriptions: list[Subscription] = []
         self._writers: list[DdsWriter] = []
         self._conditions: list[Any] = []
-        self._names = self._writer(names.TOPIC, names.KIND, depth=1, latched=True)
+        self._names = self._writer(TOPIC, KIND, depth=1, latched=True)
         self._waitset = self._core.WaitSet(self._participant)
         self._publishers, self._subscribers = (
             Endpoints(builtin.BuiltinDataReader(self._participant, topic))
@@ -96,7 +128,6 @@ class Node(Graph):
     def subscribe(
         self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
     ) -> None:
-        """See `Graph.subscribe`."""
         qos = self._made_qos(kind, reliable=reliable, depth=depth)
         sub = ros2_module("cyclonedds.sub")
         reader = sub.DataReader(self._participant, self._topic(f"rt{topic}", kind), qos)
@@ -110,18 +141,15 @@ class Node(Graph):
     def advertise(
         self, topic: str, kind: str, *, depth: int = 10, latched: bool = False
     ) -> DdsWriter:
-        """See `Graph.advertise`."""
         self._writers.append(self._writer(f"rt{topic}", kind, depth=depth, latched=latched))
         self._announce()
         return self._writers[-1]
 
     def spin(self, timeout_s: float) -> int:
-        """See `Graph.spin`."""
         self._waitset.wait(round(timeout_s * 1e9))
         return sum(self._taken(each) for each in self._subscriptions)
 
     def close(self) -> None:
-        """See `Graph.close`."""
         del self._publishers, self._subscribers, self._names
         for held in (self._conditions, self._subscriptions, self._writers):
             held.clear()
@@ -169,11 +197,10 @@ class Node(Graph):
         readers = [each.reader for each in self._subscriptions]
         writers = [each.writer for each in self._writers]
         own = self._participant
-        message = names.node_entities(self.definitions, self.arguments, own, readers, writers)
+        message = _node_entities(self.definitions, self.arguments, own, readers, writers)
         self._names.write(message)
 
     def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> DdsWriter:
-        """A writer of a topic of DDS."""
         qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
         pub = ros2_module("cyclonedds.pub")
         made = pub.DataWriter(self._participant, self._topic(name, kind), qos)
@@ -219,7 +246,6 @@ class Endpoints:
                 yield ros_type_name(kind)
 
     def update(self) -> None:
-        """Take note of what came and left."""
         try:
             changes = self._reader.take(_MOST_ENDPOINTS)
         except Exception as error:  # a policy of another vendor that the library cannot name

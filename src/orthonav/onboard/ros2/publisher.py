@@ -66,7 +66,7 @@ class Ros2Publisher:
     def position(
         self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[str, ...]:
-        """See `PositionOutput.position`; raises `EstimateError` for a low confidence too."""
+        """The names of the topics. Raises `EstimateError`, also for a low confidence."""
         require_confident(estimate, self._least, "NavSatFix")
         if self._silent:
             return ()
@@ -82,7 +82,7 @@ class Ros2Publisher:
         return tuple(sent)
 
     def health(self, plain: dict[str, Any]) -> None:
-        """See `PositionOutput.health`; it also lists problems of the topics."""
+        """Publish the health, and the problems of the topics."""
         new = self._node.definitions.new
         problems = {f"topic {name}": text for name, text in self._node.problems.items()}
         damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
@@ -105,7 +105,7 @@ class Ros2Publisher:
         )
 
     def close(self) -> None:
-        """See `PositionOutput.close`; the node is closed by its owner."""
+        """Nothing to do: the node is closed by its owner."""
 
     def _send_origin(self) -> None:
         definitions = self._node.definitions

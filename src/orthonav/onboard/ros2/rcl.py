@@ -11,8 +11,7 @@ from typing import Any
 
 from orthonav.core.errors import OutputError
 from orthonav.onboard.ros2.arguments import RosArguments
-from orthonav.onboard.ros2.graph import Graph, Handler, Writer
-from orthonav.onboard.ros2.messages import Definitions
+from orthonav.onboard.ros2.graph import Definitions, Graph, Handler, Writer
 from orthonav.onboard.ros2.node import Node
 
 log = logging.getLogger(__name__)
@@ -41,14 +40,11 @@ def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Gra
 
 
 class RclWriter:
-    """Sends messages of one topic."""
-
     def __init__(self, topic: str, definitions: Definitions, publisher: Any) -> None:
         """`publisher` is None where ROS has no such message: nothing is sent."""
         self._topic, self._definitions, self._publisher = topic, definitions, publisher
 
     def write(self, message: Any) -> None:
-        """See `Writer.write`."""
         if self._publisher is None:
             return
         try:
@@ -58,10 +54,7 @@ class RclWriter:
 
 
 class RclNode(Graph):
-    """Reads and writes topics through `rclpy`."""
-
     def __init__(self, arguments: RosArguments) -> None:
-        """Raises `OutputError` where ROS does not start."""
         super().__init__(arguments)
         self._rclpy, self._qos = _module("rclpy"), _module("rclpy.qos")
         self._subscriptions: list[tuple[Any, str]] = []
@@ -96,8 +89,6 @@ class RclNode(Graph):
     def subscribe(
         self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
     ) -> None:
-        """See `Graph.subscribe`."""
-
         def take(cdr: bytes) -> None:
             self._handled += 1
             self._handle(topic, kind, handler, cdr)
@@ -119,7 +110,6 @@ class RclNode(Graph):
         return RclWriter(topic, self.definitions, made)
 
     def spin(self, timeout_s: float) -> int:
-        """See `Graph.spin`."""
         self._handled = 0
         self._executor.spin_once(timeout_s)
         for made, _ in self._subscriptions:  # spin_once handles one message
@@ -132,7 +122,6 @@ class RclNode(Graph):
         return self._handled
 
     def close(self) -> None:
-        """See `Graph.close`."""
         self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()

@@ -6,9 +6,12 @@ header stamps; for a message without a stamp the time of arrival is used.
 
 import logging
 import math
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, StoppedError
@@ -30,10 +33,44 @@ from orthonav.core.geo.attitude import (
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.graph import Graph
-from orthonav.onboard.ros2.lost import LostImages
-from orthonav.onboard.ros2.messages import TIME_NS
+from orthonav.onboard.ros2.graph import TIME_NS, Graph
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
+
+WINDOW_NS = 10 * 10**9
+LOST_SHARE, LEAST_IMAGES = 0.2, 5
+IRREGULAR = 2
+"""Steps from image to image, in messages of the camera, differ by less where a node between passes
+every n-th image on."""
+
+
+class LostImages:
+    """Stamps of the images and of the `camera_info` that arrived; a camera gives both the same.
+
+    An image is sent in many parts and lost with one of them, its `camera_info` is a single part.
+    """
+
+    def __init__(self) -> None:
+        self.images: deque[int] = deque(maxlen=1000)
+        self.infos: deque[int] = deque(maxlen=1000)
+
+    def reason(self) -> str | None:
+        """What is wrong where more than `LOST_SHARE` of the last seconds' images are missing."""
+        infos = sorted(self.infos)
+        images = sorted(self.images)
+        if not images:
+            return None
+        images = images[bisect_left(images, images[-1] - WINDOW_NS) :]
+        if len(images) < LEAST_IMAGES:
+            return None
+        steps = [bisect_right(infos, b) - bisect_right(infos, a) for a, b in pairwise(images)]
+        lost = sum(max(step - 1, 0) for step in steps)
+        if lost <= LOST_SHARE * (lost + len(images)) or max(steps) - min(steps) < IRREGULAR:
+            return None
+        return (
+            "loses images: use compressed ones, image_reliability:=reliable, or a larger "
+            "net.core.rmem_max"
+        )
+
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS
@@ -110,7 +147,6 @@ class Ros2Reader:
         )
 
     def read(self) -> CameraImage | None:
-        """See `ImageSource.read`."""
         while not self._stopped():
             self._spin()
             if self._images and self._is_ready(self._images[0]):
@@ -144,8 +180,8 @@ class Ros2Reader:
         for topic, kind, handler in (
             (self._info_topic, "sensor_msgs/msg/CameraInfo", self._take_camera_info),
             (resolved("imu"), "sensor_msgs/msg/Imu", self._take_attitude),
-            (resolved("range"), "sensor_msgs/msg/Range", self._take_range),
-            (resolved("rel_alt"), "std_msgs/msg/Float64", self._take_altitude),
+            (resolved("range"), "sensor_msgs/msg/Range", partial(self._take_height, "distance")),
+            (resolved("rel_alt"), "std_msgs/msg/Float64", partial(self._take_height, "home")),
             (resolved("gnss"), "sensor_msgs/msg/NavSatFix", self._take_gnss),
         ):
             node.subscribe(topic, kind, handler, depth=_TELEMETRY_DEPTH)
@@ -217,13 +253,7 @@ class Ros2Reader:
         if turned is not None:
             self._buffer.add_attitude(time_ns, turned.tolist())
 
-    def _take_range(self, message: Any, cdr: bytes) -> None:
-        self._take_height("distance", message)
-
-    def _take_altitude(self, message: Any, cdr: bytes) -> None:
-        self._take_height("home", message)
-
-    def _take_height(self, source: str, message: Any) -> None:
+    def _take_height(self, source: str, message: Any, cdr: bytes) -> None:
         time_ns, height = self._stamp(message), height_of_message(message)
         if time_ns is None or height is None:
             return

@@ -30,9 +30,8 @@ _EXTRAS = {"rasterio": "geo", "shapely": "geo", "matplotlib": "report", "jinja2"
 def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
     """Write page, JSON, GeoTIFF, GeoJSON and figures into the folder `out`; return the page's path.
 
-    `opened` is the checked map, whose imagery the page shows. Raises `OutputError` where the folder
-    holds other files or cannot be written, `MissingExtraError` without the extras geo, report and
-    web.
+    Raises `OutputError` where the folder holds other files or cannot be written,
+    `MissingExtraError` without the extras geo, report and web.
     """
     out = Path(out)
     require_free(out)

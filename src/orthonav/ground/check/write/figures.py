@@ -52,7 +52,6 @@ _NUMBERED = 0.01
 
 
 def check_figures(result: CheckResult, image: Background) -> list[Figure]:
-    """The figures of a check, in the order in which the page shows them."""
     found = [_map(result, image)]
     if result.along is not None and len(result.along.distance_m) > 1:
         found.append(_profile(result, result.along))
@@ -114,7 +113,6 @@ def _draw_cells(axes: "Axes", result: CheckResult) -> None:
 
 
 def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
-    """The route in classes of risk; gaps in black, with numbers."""
     points = along.points_en_m
     drawn = segments(along.probability)
     for number, risk in enumerate(RISKS):
@@ -229,7 +227,6 @@ def _envelope(envelope: Envelope) -> Figure:
 
 
 def page_jpeg(image: Background) -> bytes:
-    """An image as JPEG of the best quality within `MAX_BYTES`."""
     for quality in _QUALITIES:
         data = jpeg(image.grey, quality)
         if len(data) <= MAX_BYTES:
@@ -260,10 +257,6 @@ def visible_box(result: CheckResult) -> Box:
 
 
 def map_image(opened: MapFile, box: Box) -> Background:
-    """The imagery of the first sheet in `box`, from the registration layer or the preview.
-
-    Raises `MapFileError` where these are damaged.
-    """
     sheet = SheetImagery(opened)
     limits = np.array(sheet.grid.extent_en_m)
     low, high = np.tile(limits[:2], 2), np.tile(limits[2:], 2)

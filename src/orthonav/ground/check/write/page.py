@@ -47,7 +47,6 @@ LAYERS = {
     "persistence": "expected persistence of the ground",
     "changed": "changed since the map was made",
 }
-"""Layers of cells that the map can show."""
 INPUTS = (
     "height above ground",
     "footprint of a view",
@@ -56,13 +55,11 @@ INPUTS = (
     "error of the reported tilt",
     "drift without fixes",
 )
-"""Conditions shown beside the results."""
 DOWNLOADS = {
     "check.geojson": "GeoJSON: route, gaps, cells, ambiguous places",
     "check.tif": "GeoTIFF: a band per layer of the map",
     "check.json": "JSON: all results and conditions",
 }
-"""Files beside the page."""
 ZERO_IF_UNKNOWN = frozenset({"trials", "changed"})
 """Values that are 0, not None, in cells of which nothing is known."""
 
@@ -74,10 +71,6 @@ def page_of(
     leaflet: tuple[str, str],
     json_sha256: str,
 ) -> str:
-    """The page as HTML; `json_sha256` is the digest of the `check.json` beside it.
-
-    Raises `MissingExtraError` without Jinja2.
-    """
     about = result.about
     script, style = leaflet
     scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
@@ -162,7 +155,6 @@ def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
 
 
 def _alternatives(result: CheckResult) -> list[Plain]:
-    """For each planning parameter its name, a sentence and a table."""
     found = result.alternatives
     return [
         {
@@ -183,7 +175,6 @@ def _alternatives(result: CheckResult) -> list[Plain]:
 
 
 def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
-    """What was checked, and with what: the rows above the signature."""
     about = result.about
     return [
         ("map", about.map_name),
@@ -201,8 +192,7 @@ def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
 def _page_data(result: CheckResult, image: Background) -> str:
     """JSON for the scripts: `check.json`, and under `drawn` positions in metres and colours.
 
-    Cells of which nothing is known are left out: around a band they are most of the box. The text
-    contains no `<`, so that no name can end the script element.
+    The text contains no `<`, so that no name can end the script element.
     """
     along, cells = result.along, result.cells
     known_m = cells.error_m[np.isfinite(cells.error_m)]
@@ -274,7 +264,6 @@ def _colours() -> list[str]:
 
 
 def _band(result: CheckResult) -> list[Any]:
-    """Rings of the outline of the band, in metres; empty without a band."""
     if result.route_en_m is None or not result.band_m or len(result.route_en_m) < 2:
         return []
     from shapely import LineString

@@ -31,13 +31,11 @@ Plain = dict[str, Any]
 
 @dataclass(frozen=True)
 class Risk:
-    """A class of places along the route; classes differ in colour, width and dash.
+    """A class of places along the route; classes differ in colour, width (pixels) and dash.
 
     `least`: lowest probability of the class; NaN where the probability is unknown.
     `colour`: that of the middle of its range on the scale of the cells (cividis: light is likely);
     `edge`: behind it, so that it stands out on the cells.
-    `width`: of the line in pixels; `dash`: lengths drawn and skipped, empty for a solid line.
-    `range_text`: its range of probabilities.
     """
 
     name: str
@@ -60,7 +58,6 @@ RISKS = (
 
 
 def risk_of(probability: float) -> int:
-    """The index in `RISKS` of a probability."""
     found = (i for i, risk in enumerate(RISKS) if probability >= risk.least)
     return next(found, len(RISKS) - 1)
 
@@ -93,7 +90,6 @@ def stretch_en_m(along: Along, start_m: float, end_m: float) -> Array:
 
 
 def to_json(result: CheckResult) -> str:
-    """A check as strict JSON, one line per top-level field."""
     lines = ",\n".join(
         f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False, allow_nan=False)}"
         for name, value in check_to_plain(result).items()
@@ -102,7 +98,6 @@ def to_json(result: CheckResult) -> str:
 
 
 def check_to_plain(result: CheckResult) -> Plain:
-    """A check as dictionaries, lists, text and finite numbers."""
     verdict, frame = result.verdict, result.frame
     return {
         "format": FORMAT,
@@ -126,12 +121,10 @@ def check_to_plain(result: CheckResult) -> Plain:
 
 
 def _stretches(result: CheckResult) -> list[Plain]:
-    """The gaps, numbered from 1."""
     return [
         {
             "number": number,
-            **to_plain(each, BY_UNIT),
-            **to_plain({"length_m": each.length_m}, BY_UNIT),
+            **to_plain({**vars(each), "length_m": each.length_m}, BY_UNIT),
             "recoverable": each.recoverable,
         }
         for number, each in enumerate(result.stretches, start=1)
@@ -139,7 +132,6 @@ def _stretches(result: CheckResult) -> list[Plain]:
 
 
 def _lookalikes(result: CheckResult) -> list[Plain]:
-    """The pairs of ambiguous places, numbered from 1."""
     return [
         {"number": number, **to_plain(each, BY_UNIT)}
         for number, each in enumerate(result.lookalikes, start=1)
@@ -180,7 +172,6 @@ def _route_to_plain(result: CheckResult) -> Plain | None:
 
 
 def _latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
-    """Latitude and longitude of points (N, 2), rounded to a centimetre."""
     found: list[list[float]] = to_plain(
         np.stack(frame.latlon_from_en(points_en_m), axis=1), _LATLON_DIGITS
     )
@@ -196,7 +187,6 @@ def to_geojson(result: CheckResult) -> str:
 
 
 def features(result: CheckResult) -> Iterator[Plain]:
-    """Features of all layers: cells, lookalikes, and with a route route, blind, legs, waypoints."""
     frame, along = result.frame, result.along
     yield from _cell_features(result)
     if along is not None:
@@ -213,7 +203,6 @@ def features(result: CheckResult) -> Iterator[Plain]:
 
 
 def _cell_features(result: CheckResult) -> Iterator[Plain]:
-    """A square for every cell of which something is known."""
     cells = result.cells
     known = np.isfinite(cells.probability) | (cells.trials > 0) | np.isfinite(cells.persistence)
     for row, col in np.argwhere(known).tolist():
@@ -244,7 +233,6 @@ def _route_features(result: CheckResult, along: Along) -> Iterator[Plain]:
 
 
 def _plan_features(frame: LocalFrame, waypoints: Array) -> Iterator[Plain]:
-    """Legs and waypoints of the route as planned."""
     steps = np.diff(waypoints, axis=0)
     lengths_m = np.hypot(*steps.T)
     for i, (start, step, length_m) in enumerate(zip(waypoints, steps, lengths_m, strict=False)):
@@ -311,7 +299,6 @@ def tif_bytes(result: CheckResult) -> bytes:
 
 
 def _tags(result: CheckResult) -> dict[str, str]:
-    """What was checked under which conditions; unknown values are left out."""
     values = {
         "map": result.about.map_name,
         "imagery": result.about.imagery,

@@ -14,7 +14,7 @@ from orthonav.ground.check.outcome import (
     Word,
     summarize,
 )
-from orthonav.ground.report.numbers import metres_text
+from orthonav.ground.report.numbers import aligned, metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -28,17 +28,14 @@ AREA_VERDICTS = {
     Word.NO_GO: "Do not rely on this map; see the reasons.",
 }
 WHAT = {"agl_m": "height above ground", "band_m": "band width"}
-"""Parameters that an alternative changes, in words."""
 CLEARLY = 0.05
 """Smaller differences may be chance, because an alternative rests on few trials."""
 MAX_STRETCHES = 7
-_MAX_REASONS = 5
 _WIDTH = 100
 SIMULATED = "Predicted from this map alone, with simulated ageing."
 
 
 def verdict_sentence(result: CheckResult) -> str:
-    """The verdict about the route or, without one, the map, and the height it holds for."""
     sentences = AREA_VERDICTS if result.along is None else VERDICTS
     origin = f", {result.about.height}" if result.about.height else ""
     height = f"Checked at {result.conditions.agl_m:.0f} m above ground{origin}."
@@ -64,8 +61,6 @@ def seconds_text(value: float) -> str:
 
 
 def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    """A gap as a row of a table: number, ends, length, duration, probability, drift,
-    allowed drift and outcome."""
     outcome = "recovers" if stretch.recoverable else "lost"
     return (
         str(number),
@@ -81,7 +76,6 @@ def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
 
 
 def stretch_sentence(number: int, stretch: BlindStretch) -> str:
-    """A gap in one sentence."""
     _, _, _, length, duration, probability, drift, allowed, outcome = stretch_row(number, stretch)
     return (
         f"Gap {number}: {length}, {duration}, probability {probability}, error {drift} at its end "
@@ -90,7 +84,6 @@ def stretch_sentence(number: int, stretch: BlindStretch) -> str:
 
 
 def lookalike_sentence(number: int, pair: Lookalike) -> str:
-    """A pair of ambiguous places in one sentence."""
     where = "within" if pair.within_prior else "outside"
     return (
         f"Ambiguous places {number}: {metres_text(pair.apart_m)} apart, similarity "
@@ -99,7 +92,6 @@ def lookalike_sentence(number: int, pair: Lookalike) -> str:
 
 
 def tolerance_sentence(envelope: Envelope) -> str:
-    """The tolerated errors of reported heading and height."""
     low, high = abs(envelope.tolerated_agl_low), abs(envelope.tolerated_agl_high)
     return (
         f"Tolerated: a heading error of up to {envelope.tolerated_yaw_deg:g}°, or a reported "
@@ -108,14 +100,10 @@ def tolerance_sentence(envelope: Envelope) -> str:
     )
 
 
-def _tilt_error_m(conditions: Conditions) -> float:
-    """Error of fixes from that of the reported tilt, root mean square of both axes."""
-    return math.sqrt(2) * conditions.agl_m * math.tan(math.radians(conditions.tilt_std_deg))
-
-
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
-    """The conditions of the check by name."""
     yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
+    # root mean square of both axes
+    off_m = math.sqrt(2) * conditions.agl_m * math.tan(math.radians(conditions.tilt_std_deg))
     rows = {
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
         "height above ground": f"{conditions.agl_m:.0f} m",
@@ -131,7 +119,7 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
         "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)"
-        f", displaces fixes by {metres_text(_tilt_error_m(conditions))}",
+        f", displaces fixes by {metres_text(off_m)}",
         "sensor": (
             "of another kind than the map's (assumed)"
             if conditions.other_sensor
@@ -148,7 +136,6 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
 
 
 def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
-    """Whether another value of `what` would be better; empty if unknown."""
     tried = [each for each in alternatives if each.what == what]
     known = [each for each in tried if math.isfinite(each.probability)]
     chosen = next((each for each in known if each.chosen), None)
@@ -166,7 +153,6 @@ def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
 
 
 def remedies(result: CheckResult) -> list[str]:
-    """What may help, of what the check tried or computed, a sentence each; empty for a go."""
     if result.verdict.word is Word.GO:
         return []
     found = [better_sentence(result.alternatives, what) for what in WHAT]
@@ -184,18 +170,13 @@ def remedies(result: CheckResult) -> list[str]:
         found.append(
             f"End the route before km {start_km:.1f}, or extend it to where fixes are likely."
         )
-    tried = any(each.what == "agl_m" for each in result.alternatives)
-    heights = "None of the other heights tried is better" if tried else "No other height was tried"
-    return found or [f"{heights}; check another route or map."]
+    return found or ["Check another route or map."]
 
 
 def text(result: CheckResult) -> str:
-    """Verdict, reasons, key figures and gaps, in about 25 lines at most.
-
-    Control characters in names are replaced.
-    """
+    """Verdict, reasons, key figures and gaps; control characters in names are replaced."""
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
-    lines += _reasons(result)
+    lines += [line for each in result.verdict.reasons for line in _item(each.text)]
     rows = _figures(result)
     width = max(len(name) for name, _ in rows)
     lines += ["", *(f"{name:<{width}}  {value}" for name, value in rows)]
@@ -204,15 +185,6 @@ def text(result: CheckResult) -> str:
     if helpful:
         lines += ["", "what may help:", *(line for each in helpful for line in _item(each))]
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
-
-
-def _reasons(result: CheckResult) -> list[str]:
-    reasons = result.verdict.reasons
-    lines = []
-    for each in reasons[:_MAX_REASONS]:
-        lines += _item(each.text)
-    more = len(reasons) - _MAX_REASONS
-    return [*lines, f"  - and {more} more"] if more > 0 else lines
 
 
 def _item(sentence: str) -> list[str]:
@@ -259,20 +231,4 @@ def _stretches(result: CheckResult) -> list[str]:
     for number, each in enumerate(result.stretches, start=1):
         if each in worst:
             rows.append(stretch_row(number, each))
-    more = len(result.stretches) - len(worst)
-    head = f"gaps without fixes ({len(result.stretches)})" + (
-        f", the {len(worst)} worst" * (more > 0)
-    )
-    return ["", head, *_columns(rows)]
-
-
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    """Aligned columns: right, the last one left."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if i == len(row) - 1 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    return ["", f"gaps without fixes: {len(result.stretches)}, the worst:", *aligned(rows)]

@@ -1,4 +1,4 @@
-"""SuperPoint keypoints and descriptors (DeTone, Malisiewicz and Rabinovich, CVPRW 2018).
+"""Pretrained networks from Hugging Face folders, and SuperPoint (DeTone et al., CVPRW 2018).
 
 The network is that of the `transformers` library (Apache-2.0). Its weights are not part of
 orthonav and it never downloads them: their licence forbids commercial use. They are published as
@@ -153,7 +153,6 @@ def pretrained(folder: str, model_type: str, class_name: str) -> Any:
 
 
 def transformers() -> Any:
-    """The library `transformers`; raises `MissingExtraError` without it."""
     return needed("transformers", "train", "a neural network")
 
 

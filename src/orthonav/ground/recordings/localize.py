@@ -1,0 +1,66 @@
+"""Localization of recorded flights, by the same steps as in flight."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from orthonav.core.errors import CameraError, FlightError, MissingFileError
+from orthonav.core.flight.heights import FlownHeights
+from orthonav.core.flight.recording import Flight, RecordedView
+from orthonav.core.localize.confidence import Acceptance
+from orthonav.core.records import Fix, NoFix, View, ViewResult
+from orthonav.core.track.tracker import Tracker
+from orthonav.onboard.run import Locator, finite, locate_view, passed_view
+
+
+def localize_flight(
+    locator: Locator,
+    flight: Flight,
+    *,
+    skip_bad_images: bool = False,
+    accept: Acceptance | None = None,
+    views: Iterable[RecordedView] | None = None,
+    heights: FlownHeights | None = None,
+) -> Iterator[ViewResult]:
+    """Results of the views of a recorded flight, in order, as they are computed.
+
+    `heights`: turns reported heights into heights above ground; None: they are used as reported.
+    With `accept` each result says whether its fix meets it. Raises `FlightError` or
+    `MissingFileError` at an image that cannot be decoded or is missing, unless `skip_bad_images`
+    makes it a `NoFix`; raises `CameraError` where an image has not the camera's aspect ratio.
+    """
+    for view in flight.views if views is None else views:
+        outcome: Fix | NoFix
+        telemetry = view.telemetry if heights is None else heights.corrected(view.telemetry)
+        try:
+            grey = view.grey()
+        except (FlightError, MissingFileError) as error:
+            if not skip_bad_images:
+                raise
+            reason = NoFix("bad_image", str(error))
+            outcome = finite(passed_view(locator, telemetry, reason))
+            latency_ms = math.nan
+        else:
+            try:
+                seen = View(grey, flight.camera, telemetry)
+                outcome, latency_ms = locate_view(locator, seen)
+            except CameraError as error:
+                raise CameraError(f"{error}: {view.where}") from error
+        if heights is not None:
+            heights.observe(telemetry.time_ns, outcome, locator.state_name)
+        accepted = None if accept is None else accept.accepts(outcome)
+        yield ViewResult(
+            view.frame, telemetry.time_ns, outcome, latency_ms, locator.state_name, accepted
+        )
+
+
+def smoothed_track(
+    tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
+) -> list[ViewResult]:
+    placed = [finite(outcome) for outcome in tracker.smoothed_track()]
+    return [
+        replace(
+            result, outcome=outcome, accepted=None if accept is None else accept.accepts(outcome)
+        )
+        for result, outcome in zip(results, placed, strict=True)
+    ]
