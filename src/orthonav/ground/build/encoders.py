@@ -117,10 +117,10 @@ def learn_encoder(
     request: "BuildRequest",
     progress: Progress,
 ) -> tuple[Encoder, NDArray[np.float16]]:
-    """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
+    """The embedder, and embeddings (N, D) of the reference tiles. CAEVL learns from one date.
 
-    A triplet network's positives are the same tiles of `other_dates`; without any, the tiles
-    themselves with simulated ageing. CAEVL learns from one date.
+    Positives of a triplet network are the same tiles of `other_dates`, or tiles with simulated
+    ageing.
     """
     tiles = pictures.tiles(tiles_px, progress)
     if isinstance(recipe, WordsRecipe):
