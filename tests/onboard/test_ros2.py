@@ -29,9 +29,8 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import attitude_of
-from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import ViewResult
+from orthonav.core.records import ViewResult, error_ellipse
 from orthonav.ground.recordings.opening import open_source
 from orthonav.onboard.messages.estimate import (
     Clock,

@@ -23,8 +23,7 @@ from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.localize.policy import SearchPlan, SearchPolicy
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
-from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.writer import write_map
+from orthonav.core.mapfile.reader import MapFile, write_map
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.network import TripletRecipe
