@@ -16,11 +16,7 @@ from numpy.typing import NDArray
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.onboard.messages.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-)
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
 
 FUTURE_S = 0.1
 """Tolerance for exposures in the future, before the clocks are taken to disagree."""

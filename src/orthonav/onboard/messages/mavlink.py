@@ -15,11 +15,7 @@ from orthonav.core.errors import MissingExtraError
 from orthonav.core.extras import needed
 from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.records import CONFIDENT
-from orthonav.onboard.messages.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-)
+from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
 
 Message = Any
 """A `MAVLink_message` of pymavlink, which has no types."""
