@@ -1,6 +1,8 @@
 """What many tests import. Not in `conftest.py`: any folder may have one of its own."""
 
+import contextlib
 import functools
+import tracemalloc
 from typing import NamedTuple
 
 import cv2
@@ -20,6 +22,17 @@ def _textured(shape, seed):
         blots = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), sigma)
         total += (blots / blots.std()).reshape(shape)
     return np.clip(128 + 32 * total, 1, 255).astype(np.uint8)
+
+
+@contextlib.contextmanager
+def memory_below(limit_bytes):
+    """Fails where Python's own memory grows by more."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit_bytes
+    finally:
+        tracemalloc.stop()
 
 
 class Done(NamedTuple):

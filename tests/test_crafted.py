@@ -114,11 +114,6 @@ def test_headings_that_are_too_many(tmp_path, step):
         open_map(changed(tmp_path / "a.onav", view=view))
 
 
-def test_headings_that_are_many_but_not_too_many(tmp_path):
-    view = {**open_map(GOLDEN).manifest.view, "heading_step_deg": 0.5}
-    Localizer(open_map(changed(tmp_path / "a.onav", view=view)), registration=False)
-
-
 def test_a_map_of_what_does_not_fly(tmp_path, flight_path, monkeypatch):
     """Refused before anything of it is loaded, weights least of all."""
     monkeypatch.setitem(sys.modules, "orthonav.research.sam", None)

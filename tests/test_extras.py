@@ -1,6 +1,5 @@
 """A core-only install: each command works, or names in one line what to install."""
 
-import ast
 import json
 import platform
 import re
@@ -12,12 +11,10 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 
 from orthonav.cli import COMMANDS, version
 from orthonav.cli.needs import NEEDS
 from orthonav.core import extras
-from orthonav.core.errors import MissingExtraError
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -181,58 +178,6 @@ def test_modules_are_those_of_the_packages():
     assert names and not wrong
 
 
-def asked(extra):
-    """Names that pyproject.toml asks for, those of the extras that an extra includes too."""
-    for text in PROJECT["optional-dependencies"][extra]:
-        one = Requirement(text)
-        if one.name == "orthonav":
-            yield from (name for included in one.extras for name in asked(included))
-        else:
-            yield one.name
-
-
-def calls_of(function, tree):
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            name = getattr(node.func, "id", getattr(node.func, "attr", None))
-            if name == function:
-                yield [arg.value if isinstance(arg, ast.Constant) else None for arg in node.args]
-
-
-def test_the_extra_that_an_error_names_brings_the_module():
-    found = []
-    for path in (ROOT / "src").rglob("*.py"):
-        text = path.read_text("utf-8")
-        if "needed(" not in text and "missing_extra(" not in text:
-            continue
-        tree = ast.parse(text)
-        for module, *more in calls_of("needed", tree):  # of `sources.guard`, of `extras`
-            found.append((module, "flights" if len(more) == 1 else more[0]))
-        found += [(module, extra) for _, extra, module, _ in calls_of("missing_extra", tree)]
-    found = [(module, extra) for module, extra in found if module and extra]  # not by a variable
-    assert len(found) > 20
-    for module, extra in found:
-        tops = {extras.module_of(name).partition(".")[0] for name in asked(extra)}
-        assert module.partition(".")[0] in tops, (module, extra)
-
-
-def test_extras_that_include_others(monkeypatch):
-    lines = ['a>=1', 'b[x]>=2,<3; extra == "one"', 'orthonav[one]; extra == "two"',
-             'c; python_version >= "3" and extra == "two"']  # fmt: skip
-    monkeypatch.setattr(metadata, "requires", lambda name: lines)
-    monkeypatch.setattr(extras, "_version", lambda name: "")
-    extras._requirements.cache_clear()
-    try:
-        assert [package.name for package in extras.packages("two")] == ["b", "c"]
-        assert all(package.available for package in extras.packages("two"))
-        assert extras.missing("") == ("a",)
-        with pytest.raises(MissingExtraError) as caught:
-            extras.require("this", "one", "two")
-        assert str(caught.value) == "this needs b, c: pip install 'orthonav[one,two]'"
-    finally:
-        extras._requirements.cache_clear()
-
-
 @pytest.mark.parametrize(
     ("machine", "python", "available"),
     [("x86_64", "3.13.2", True), ("aarch64", "3.13.2", False), ("x86_64", "3.14.0", False)],
@@ -253,24 +198,3 @@ def test_what_is_not_made_for_a_machine_is_not_called_missing(
     assert ("pip install" in answer) is available
     shown = version._text(plain)
     assert ("cyclonedds MISSING" in shown) is available and "rosbags MISSING" in shown
-
-
-def test_markers_of_the_project_are_understood():
-    """`extras` reads comparisons with == and <, joined by `and`."""
-    for lines in PROJECT["optional-dependencies"].values():
-        for marker in (str(Requirement(line).marker or "") for line in lines):
-            left = extras._CONDITION.sub("", marker)
-            assert left.split() in ([], ["and"]), marker
-
-
-def test_sources_without_metadata_ask_nothing(monkeypatch):
-    def gone(name):
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "requires", gone)
-    extras._requirements.cache_clear()
-    try:
-        assert extras.packages() == () and extras.missing("geo") == ()
-        extras.require("anything", "geo")
-    finally:
-        extras._requirements.cache_clear()

@@ -242,14 +242,3 @@ def shape_of(west, south, east, north, shape):
     """The box, a little wider."""
     corners = [(west, south), (east, south), (east, north), (west, north), (west, south)]
     return shape({"type": "Polygon", "coordinates": [corners]}).buffer(1e-4)
-
-
-def test_without_a_command_the_help_is_shown(run):
-    done = run()
-    assert (done.code, done.err) == (0, "") and "orthonav localize area.onav" in done.out
-
-
-def test_abbreviations_are_refused_with_the_usage_of_the_command(run):
-    done = run("localize", "a.onav", "flight", "--out", "c", "--head", "unknown")
-    assert done.code == 2 and done.err.startswith("usage: orthonav localize")
-    assert "unrecognized arguments: --head" in done.err

@@ -1,10 +1,10 @@
 """Tables of untrusted origin: bounded lines, rows and memory; errors name lines."""
 
 import io
-import tracemalloc
 
 import pytest
 
+from helpers import memory_below
 from orthonav.core.errors import FlightError, RouteError
 from orthonav.core.flight import folder as folders
 from orthonav.core.flight.fixes import MAX_LINE_BYTES, read_results
@@ -38,15 +38,12 @@ def test_a_line_of_many_fields_is_refused(tmp_path, at, name, head, row, read, e
     lines[at - 1] = lines[at - 1].rstrip() + "," * 3_000_000 + "\n"
     path = tmp_path / name
     path.write_text("".join(lines))
-    tracemalloc.start()
-    try:
-        with pytest.raises(error, match=f"line {at} is longer than") as caught:
-            read(path)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    with (
+        memory_below(10 * path.stat().st_size),
+        pytest.raises(error, match=f"line {at} is longer than") as caught,
+    ):
+        read(path)
     assert str(path) in str(caught.value)
-    assert peak < 10 * path.stat().st_size
 
 
 def test_tables_of_a_flight_have_at_most_so_many_rows(tmp_path, monkeypatch):
@@ -70,14 +67,11 @@ def test_routes_of_too_many_waypoints_take_little_memory(tmp_path, monkeypatch, 
     monkeypatch.setattr("orthonav.ground.planning.routes.record.MAX_WAYPOINTS", 5_000)
     path = tmp_path / name
     path.write_text(text)
-    tracemalloc.start()
-    try:
-        with pytest.raises(RouteError, match="at most 5,000 are read"):
-            read_route(path)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 5_000_000  # mostly the 5,000 waypoints
+    with (
+        memory_below(5_000_000),
+        pytest.raises(RouteError, match="at most 5,000 are read"),
+    ):  # mostly the 5,000 waypoints
+        read_route(path)
 
 
 def test_a_line_of_fixes_is_bounded(tmp_path):

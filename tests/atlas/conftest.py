@@ -4,12 +4,7 @@ import dataclasses
 
 import pytest
 
-RECIPE = {
-    "gsd_m": 2.5,
-    "sheet_km": 2.0,
-    "tile_px": 128,
-    "calibration_views": 4,
-}
+RECIPE = {"gsd_m": 2.5, "sheet_km": 2.0, "tile_px": 128, "calibration_views": 4}
 COARSE = (5.0, 64, 0.875)
 
 

@@ -174,8 +174,7 @@ def test_other_recipes_are_refused_with_the_differences(built, ortho):
 
 
 @pytest.mark.parametrize(
-    "recipe",
-    [{"tile_px": 50}, {"tile_px": 2048}, {"overlap": 1.0}, {"coarse": {"tile_px": 33}}],
+    "recipe", [{"tile_px": 50}, {"tile_px": 2048}, {"overlap": 1.0}, {"coarse": {"tile_px": 33}}]
 )
 def test_impossible_recipes_leave_no_atlas(ortho, tmp_path, recipe):
     with pytest.raises((AreaError, AtlasError)):

@@ -142,10 +142,7 @@ def test_a_replaced_revision_is_removed(atlas):
 
 def test_a_revision_stays_while_its_replacement_is_incomplete(atlas):
     old, new = second_revision(atlas, missing=True)
-    wrong = [
-        ("second revision", f"items/{old.item_name}"),
-        ("missing file", new.files["map"].name),
-    ]
+    wrong = [("second revision", f"items/{old.item_name}"), ("missing file", new.files["map"].name)]
     assert found(atlas, clean=True, min_age_s=-5) == wrong == found(atlas)
 
 

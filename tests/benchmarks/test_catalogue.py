@@ -1,9 +1,8 @@
-"""The catalogue of scenes, rows that resume, memory of a process, instructions of a view."""
+"""The catalogue of scenes, rows that resume, memory of a process."""
 
 import json
 
 import pytest
-from arm64 import instructions
 from benchmarks.placing import memory_mb
 from benchmarks.record import resumed
 from benchmarks.scenes import SCENES, leave_one_out_pairs, place_of
@@ -37,28 +36,3 @@ def test_the_memory_now_is_at_most_the_peak():
     assert 0 < memory_mb("VmRSS") <= memory_mb()
     with pytest.raises(RuntimeError, match="Vm0"):
         memory_mb("Vm0")
-
-
-def test_instructions_of_a_view_leave_out_the_start():
-    seen = []
-
-    def counted(processor, run, views):
-        seen.append((run, views))
-        return 1e9 + 7e6 * views
-
-    assert instructions._per_view(counted, None, "track", 9) == pytest.approx(7e6)
-    assert seen == [("track", 9), ("track", 18)]
-
-
-def test_the_estimate_is_instructions_by_those_of_a_second():
-    name, run, millions, ratio, *estimates = instructions.row("A76", "views", 4.8e9, 2.4e9)
-    assert (name, run, millions, ratio) == ("A76", "views", "4,800", "2.00")
-    assert estimates == ["2000", "1000"]
-
-
-@pytest.mark.parametrize(
-    ("printed", "count"),
-    [("x\ninstructions: 12345\n", "12345"), ("==27706== I   refs:      2,851,113\n", "2,851,113")],
-)
-def test_both_counters_are_read(printed, count):
-    assert instructions.COUNTED.findall(printed) == [count]

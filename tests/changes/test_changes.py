@@ -98,10 +98,7 @@ def test_changed_ground_is_found_from_another_plane(some):
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "[]",
-        "{}",
-        '{"format": "orthonav-changes"}',
+        *("", "[]", "{}", '{"format": "orthonav-changes"}'),
         '{"format": "orthonav-changes", "version": 9}',
         '{"type": "FeatureCollection", "features": []}',
     ],

@@ -1,14 +1,13 @@
 """Synthetic check results for tests of the output files."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 
+from orthonav.ground.check.findings import blind_stretches, expected_drift
 from orthonav.ground.check.outcome import (
     Along,
     Alternative,
-    BlindStretch,
     Cells,
     CheckedInputs,
     CheckResult,
@@ -29,7 +28,7 @@ CONDITIONS = Conditions(
     agl_m=200.0,
     yaw_std_deg=5.0,
     agl_std=0.05,
-    prior_std_m=150.0,
+    prior_std_m=25.0,
     accept=0.9,
     radius_m=35.0,
     speed_mps=22.0,
@@ -79,26 +78,6 @@ def lost_in(cells, mask):
     return Cells(cells.west_m, cells.north_m, cells.side_m, **values)
 
 
-def stretches_of(distance_m, probability, speed_mps, drift):
-    """Runs of low probability; what they drift is allowed up to 25 m."""
-    low = np.concatenate([[False], probability < 0.5, [False]])
-    edges = np.flatnonzero(np.diff(low.astype(int))).reshape(-1, 2)
-    last = len(distance_m) - 1
-    return tuple(
-        BlindStretch(
-            start_m=float(distance_m[first]),
-            end_m=float(distance_m[min(end, last)]),
-            start_s=float(distance_m[first] / speed_mps),
-            end_s=float(distance_m[min(end, last)] / speed_mps),
-            probability=float(probability[first:end].mean()),
-            drift_m=float(5 + drift * (distance_m[min(end, last)] - distance_m[first])),
-            allowed_m=25.0,
-            ends_lost=bool(end > last),
-        )
-        for first, end in edges
-    )
-
-
 def along_of(cells, waypoints, step_m=25.0):
     legs = np.hypot(*np.diff(waypoints, axis=0).T)
     ends = np.concatenate([[0.0], np.cumsum(legs)])
@@ -109,11 +88,6 @@ def along_of(cells, waypoints, step_m=25.0):
     rows = np.clip(rows, 0, cells.probability.shape[0] - 1)
     cols = np.clip(cols, 0, cells.probability.shape[1] - 1)
     probability = cells.probability[rows, cols]
-    drift = np.zeros(len(distance))
-    for i in range(1, len(drift)):
-        flown = drift[i - 1] + 0.02 * (distance[i] - distance[i - 1])
-        share = probability[i] if np.isfinite(probability[i]) else 0
-        drift[i] = share * 6 + (1 - share) * flown
     return Along(
         distance_m=distance,
         points_en_m=points,
@@ -122,7 +96,7 @@ def along_of(cells, waypoints, step_m=25.0):
         high=cells.high[rows, cols],
         across_low=np.maximum(probability - 0.15, 0),
         error_m=cells.error_m[rows, cols],
-        drift_m=drift,
+        drift_m=expected_drift(distance, probability, cells.error_m[rows, cols], 0.02, 100.0),
     )
 
 
@@ -136,7 +110,7 @@ def envelope():
 def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", route="", **changed):
     """A check of cells, along a route where there is one."""
     along = None if waypoints is None else along_of(cells, waypoints)
-    stretches = () if along is None else stretches_of(along.distance_m, along.probability, 22, 0.02)
+    stretches = () if along is None else blind_stretches(along, CONDITIONS, 25.0)
     known = np.isfinite(cells.probability)
     here = frame.latlon_from_en(np.array([[0.0, 0.0], [400.0, 250.0], [-300.0, 100.0]]))
     places = list(zip(*here, strict=True))
@@ -191,28 +165,6 @@ def small_route(frame, **changed):
     cells.high[:, 17:] = 0.35
     waypoints = np.array([(-420.0, -400.0), (-100.0, 300.0), (150.0, -350.0), (440.0, 350.0)])
     return made_check(frame, cells, waypoints, 300.0, route="north loop", **changed)
-
-
-def long_route(frame):
-    """60 km2: 50 km in a band of 1 km."""
-    cells = made_cells(140, 200, 100.0, seed=5)
-    waypoints = np.array(
-        [
-            (-9000.0, -5500.0),
-            (8500.0, -4800.0),
-            (8800.0, 500.0),
-            (-8200.0, 900.0),
-            (-8000.0, 5600.0),
-        ]
-    )
-    east = cells.west_m + (np.arange(200) + 0.5) * 100
-    north = cells.north_m - (np.arange(140) + 0.5) * 100
-    far = np.full((140, 200), np.inf)
-    for a, b in pairwise(waypoints):
-        grid = np.stack(np.meshgrid(east, north), axis=-1)
-        t = np.clip(((grid - a) @ (b - a)) / ((b - a) @ (b - a)), 0, 1)
-        far = np.minimum(far, np.linalg.norm(grid - a - t[..., None] * (b - a), axis=-1))
-    return made_check(frame, lost_in(cells, far > 600), waypoints, 1000.0, route="valley run")
 
 
 def nearly_empty(frame):

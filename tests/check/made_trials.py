@@ -1,23 +1,14 @@
 """Synthetic trials for tests."""
 
 import math
+from dataclasses import replace
 
-from orthonav.ground.check.outcome import Conditions
+import made_check
+
 from orthonav.ground.check.trials import Trial
 
 NOWHERE = (math.nan, math.nan)
-CONDITIONS = Conditions(
-    width_m=120.0,
-    height_m=90.0,
-    agl_m=100.0,
-    yaw_std_deg=5.0,
-    agl_std=0.05,
-    prior_std_m=50.0,
-    accept=0.9,
-    radius_m=35.0,
-    speed_mps=20.0,
-    drift=0.03,
-)
+CONDITIONS = replace(made_check.CONDITIONS, prior_std_m=50.0, speed_mps=20.0, drift=0.03)
 
 
 def judged(error_m, confidence):

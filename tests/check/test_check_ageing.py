@@ -3,17 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 
 from helpers import textured
 from orthonav.ground.check import ageing
-from orthonav.ground.check.ageing import (
-    MAX_PERSISTENCE,
-    MIN_PERSISTENCE,
-    another_year,
-    displaced,
-)
-from orthonav.ground.check.estimate import LEARNT, Recalibration
+from orthonav.ground.check.ageing import MAX_PERSISTENCE, MIN_PERSISTENCE, another_year
 from orthonav.ground.check.trials import reported_persistence
 
 SIZE = 256
@@ -115,32 +108,4 @@ def test_what_comes_instead_stays_mirrored():
     assert max(kept(each, made) for each in mirrored) > 0.4
 
 
-def test_what_stands_tilts_away_from_the_middle():
-    grey = textured((SIDE, SIDE), 5)
-    upright = displaced(np.random.default_rng(1), grey, 0.0, 15.0)
-    assert_array_equal(upright, grey)
-    leant = displaced(np.random.default_rng(1), grey, 4.0, 15.0)
-    off = np.abs(leant.astype(int) - grey)
-    middle, rim = np.s_[SIDE // 2 - 8 : SIDE // 2 + 8], np.s_[:24]
-    assert off[middle, middle].mean() < 0.3 * off[rim, rim].mean()
-
-
 SHARES = np.linspace(0.02, 0.98, 25)
-
-
-@pytest.mark.parametrize("view_px", [60.0, 256.0, 500.0])
-@pytest.mark.parametrize("has_prior", [True, False])
-def test_more_trials_that_succeed_predict_more(view_px, has_prior):
-    predicted = LEARNT(SHARES, view_px, has_prior)
-    assert (np.diff(predicted) > 0).all()
-    assert predicted.min() > 0 and predicted.max() < 1
-
-
-def test_corrections_apply_where_they_should():
-    by = Recalibration(0.0, 1.0, narrow=-0.5, no_prior=-0.3, std=0.5)
-    wide, half = by(SHARES, 256.0, True), by(SHARES, 128.0, True)
-    np.testing.assert_allclose(wide, SHARES)
-    np.testing.assert_allclose(by(SHARES, 512.0, True), SHARES)
-    odds = (half / (1 - half)) / (SHARES / (1 - SHARES))
-    np.testing.assert_allclose(odds[1:-1], np.exp(-0.5), rtol=1e-6)
-    assert (by(SHARES, 256.0, False) <= SHARES).all()

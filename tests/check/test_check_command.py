@@ -208,18 +208,6 @@ def test_routes_outside_the_map(checked, frame):
         checked(route=route_of(frame, [[-40_000, 0], [40_000, 0]]))
 
 
-def test_another_date_that_shows_nothing_here(half_blank, checked, monkeypatch):
-    def none_of_other(work, workers, progress):
-        found = made_up(work, workers, progress)
-        return [
-            [] if plan.second_date else each for (plan, _), each in zip(work, found, strict=True)
-        ]
-
-    monkeypatch.setattr(check_run, "run_many", none_of_other)
-    with pytest.raises(AreaError, match="does not cover the checked area"):
-        checked(other_date=half_blank.present)
-
-
 # As a command.
 
 

@@ -58,18 +58,6 @@ def even(points):
     return predicted(np.full(len(points), 0.8), np.full(len(points), 3.0))
 
 
-def test_along_a_route():
-    along = predicted_along(
-        area_of([[0, 0], [1000, 0], [1000, 500]]), [200.0] * 2, SIDE_M, CONDITIONS, even
-    )
-    assert along.distance_m[0] == 0 and np.diff(along.distance_m) == pytest.approx(SIDE_M / 4)
-    assert along.distance_m[-1] == pytest.approx(1500, abs=SIDE_M / 4)
-    np.testing.assert_allclose(along.points_en_m[0], [0, 0], atol=0.01)
-    at_corner = np.hypot(*(along.points_en_m - [1000, 0]).T).argmin()
-    assert along.distance_m[at_corner] == pytest.approx(1000, abs=SIDE_M / 4)
-    assert (along.across_low == 0.8).all() and (along.drift_m < 4.2).all()
-
-
 def test_the_worst_over_the_width_of_every_leg():
     """The map is bad more than 80 m north of an eastbound leg, and east of a northbound one."""
 

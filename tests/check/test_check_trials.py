@@ -18,7 +18,7 @@ from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid
 from orthonav.ground.check import trials
 from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.check.trials import OrthoPyramid, TrialPlan, run_many
+from orthonav.ground.check.trials import TrialPlan, run_many
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 WEST = np.array([[-250.0, 60.0], [-180.0, -90.0], [-300.0, 120.0], [-220.0, 0.0], [-330.0, -60.0]])
@@ -29,11 +29,7 @@ EAST = np.array([[200.0, 60.0], [250.0, -90.0], [300.0, 120.0]])
 def plan(half_blank):
     """Views of 154 x 115 m, searched in a part of the map."""
     request = CheckRequest(
-        half_blank.map,
-        camera=CAMERA,
-        prior_std_m=40.0,
-        relief_m=0.0,
-        other_date=half_blank.present,
+        half_blank.map, camera=CAMERA, prior_std_m=40.0, relief_m=0.0, other_date=half_blank.present
     )
     return TrialPlan(request, 120.0)
 
@@ -144,23 +140,3 @@ def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
     build_map(BuildRequest([half_blank.past], path, tile_px=128, overlap=0.5, registration=False))
     with pytest.raises(MapFileError, match="registration layer"):
         run_trials(TrialPlan(CheckRequest(path, camera=CAMERA), 120.0), WEST[:1])
-
-
-def test_another_date_lies_on_the_map(half_blank, registration):
-    """The map's own orthophoto, read as another date, is the picture of the map."""
-    layer = registration.pyramid
-    pyramid = OrthoPyramid(half_blank.past, registration.sheet, layer.levels)
-    try:
-        for level in (0, 1, 2):
-            assert pyramid.shape(level) == layer.shape(level)
-            part = (level, 200 >> level, 160 >> level, 200 >> level, 160 >> level)
-            (one, valid), (other, _) = pyramid.read(*part), layer.read(*part)
-            assert valid.all()
-            same = np.corrcoef(one.ravel(), other.ravel())[0, 1]
-            for shift in (1, -1):
-                moved = np.roll(one, shift, axis=1)
-                assert same > 0.97 > np.corrcoef(moved.ravel(), other.ravel())[0, 1]
-        grey, valid = pyramid.read(0, -500, -500, 100, 100)
-        assert not valid.any() and not grey.any()
-    finally:
-        pyramid.close()

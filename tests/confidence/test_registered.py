@@ -9,14 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.confidence import (
-    CHANCES,
-    FEATURES,
-    STAND_IN,
-    Chances,
-    RegisteredConfidence,
-    features_of,
-)
+from orthonav.core.localize.confidence import CHANCES, FEATURES, Chances, RegisteredConfidence
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.build.fit import fit_registered
 
@@ -49,44 +42,6 @@ def evidence(strength=60.0, rival=30.0, look=35.0, look_rival=18.0, **more):
         "detail_ratio": 1.5,
         **more,
     }
-
-
-def test_features_by_hand():
-    features = features_of(evidence(50.0, 40.0, 30.0, 20.0), CHANCE)
-    ratios = [50 / 25, 50 / 40, 30 / 20]
-    np.testing.assert_allclose(np.exp(features), [*ratios, 1.5, 10.0, 10.0, 8.0])
-    assert len(features) == len(FEATURES)
-
-
-def test_a_place_that_fits_as_well_a_little_aside_is_not_believed():
-    """A lattice: strong, without a rival far away."""
-    usual = RegisteredConfidence.usual(CHANCE)
-    strong = {"strength": 400.0, "rival": 30.0, "look": 200.0, "look_rival": 18.0}
-    assert usual(evidence(**strong)) > 0.99
-    assert usual(evidence(**strong, local_phase=3.0, local_gradients=2.5)) < 0.5
-
-
-def test_chance_stands_in_for_a_rival_that_is_missing():
-    """So that a search of one place only does not look like certainty."""
-    for rival in (0.0, 0.5 * STAND_IN * CHANCE.total):
-        features = features_of(evidence(50.0, rival, 30.0, 0.0), CHANCE)
-        np.testing.assert_allclose(
-            np.exp(features[:3]),
-            [2, 50 / (STAND_IN * CHANCE.total), 30 / (STAND_IN * CHANCE.look)],
-        )
-    assert MODEL(evidence(strength=14.0, rival=0.0, look=8.0, look_rival=0.0)) < 0.1
-
-
-def test_the_finer_level_counts_where_it_was_looked_at():
-    deep = evidence(50.0, 45.0, 30.0, 20.0, fine=120.0, fine_rival=60.0)
-    # The mean of both: 50 over 45 and 120 over 60.
-    assert np.exp(features_of(deep, CHANCE))[1] == pytest.approx(math.sqrt(50 / 45 * 2))
-    alone = evidence(50.0, 45.0, 30.0, 20.0, fine=120.0, fine_rival=0.0)
-    stood_in = 50 / 45 * 120 / (STAND_IN * CHANCE.fine)
-    assert np.exp(features_of(alone, CHANCE))[1] == pytest.approx(math.sqrt(stood_in))
-    for half in ({"fine": 120.0}, {"fine_rival": 60.0}, {}):
-        plain = evidence(50.0, 45.0, 30.0, 20.0, **half)
-        assert np.exp(features_of(plain, CHANCE))[1] == pytest.approx(50 / 45)
 
 
 @pytest.mark.parametrize("value", [0.0, -30.0, 1e-300, 1e300])
@@ -196,16 +151,6 @@ def test_what_is_learnt_fits_fresh_views_better_than_the_usual(harder):
     usual = RegisteredConfidence.usual(CHANCE)
     assert fitted.chances == CHANCE and fitted.weights == usual.weights
     assert loss(fitted, *fresh) <= loss(usual, *fresh) + 0.005
-
-
-@pytest.mark.parametrize("all_right", [True, False])
-def test_one_sided_views_give_a_finite_answer(all_right):
-    views, _ = synthetic(40, seed=3)
-    fitted = fit_registered(views, np.full(40, all_right), CHANCE)
-    assert all(math.isfinite(number) for number in (*fitted.biases, *fitted.weights))
-    usual = RegisteredConfidence.usual(CHANCE)
-    moved = [fitted(each) - usual(each) for each in views]
-    assert min(moved) > 0 if all_right else max(moved) < 0
 
 
 @pytest.mark.parametrize("path", NUMBERS, ids=".".join)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.bank import CHUNK_POSES, embed_poses
+from orthonav.core.tiles.bank import embed_poses
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import make_variant
@@ -122,22 +122,6 @@ def test_one_channel_is_only_turned(name, least):
     assert (place.tiles @ seen).argmax() == place.middle_tile
 
 
-@pytest.mark.parametrize("shape", [WHOLE, (128, 171), (80, 107), (107, 80), (81, 201)])
-def test_views_are_no_less_like_their_tile_than_by_the_slow_path(place, shape):
-    """More so where they cover part of a tile: turned as a picture, a view loses its border."""
-    truth, bank, slow = place.tiles[place.middle_tile], [], []
-    for pose in random_poses(30, scale=0.13, seed=3):
-        grey, valid = place.view(*pose, shape)
-        bank.append(place.bank(grey, valid, [pose])[0])
-        slow.append(place.slow(grey, valid, *pose))
-    assert np.median(bank @ truth) > np.median(slow @ truth)
-    found, found_slow = (
-        np.mean((some @ place.tiles.T).argmax(axis=1) == place.middle_tile)
-        for some in (np.array(bank), np.array(slow))
-    )
-    assert found >= found_slow
-
-
 def test_what_is_not_valid_does_not_count(place):
     grey, valid = place.view(1.0, 0.1)
     valid[:, :150] = False
@@ -150,53 +134,9 @@ def test_what_is_not_valid_does_not_count(place):
     )
 
 
-def test_poses_do_not_depend_on_each_other(place):
-    grey, valid = place.view(0.4, 0.0, (120, 150))
-    poses = random_poses(2 * CHUNK_POSES + 3)
-    together = place.bank(grey, valid, poses)
-    alone = np.concatenate([place.bank(grey, valid, [pose]) for pose in poses])
-    # The reach of the farthest pose decides what is cut off, so micro-cells may begin elsewhere.
-    assert np.einsum("qd,qd->q", together, alone).min() > 0.99
-    np.testing.assert_array_equal(together, place.bank(grey, valid, poses))
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (256, 341)])
 def test_views_without_content_are_finite(place, shape):
     poses = [*random_poses(3), (0.0, 4.0), (0.0, -4.0)]
     grey = np.full(shape, 77, np.uint8)
     assert not place.bank(grey, np.zeros(shape, bool), poses).any()
     assert np.isfinite(place.bank(grey, np.ones(shape, bool), poses)).all()
-
-
-class TwoChannels:
-    channels, margin_px = 2, 0
-
-    def __call__(self, grey, valid):
-        raise AssertionError("not to be called")
-
-
-def test_what_cannot_be_turned_is_refused(place):
-    grey, valid = place.view(0.0, 0.0)
-    with pytest.raises(ValueError, match="multiple of 32"):
-        embed_poses(place.embedder, place.representation, grey, valid, [(0.0, 0.0)], 100)
-    with pytest.raises(ValueError, match="odd"):
-        embed_poses(place.embedder, TwoChannels(), grey, valid, [(0.0, 0.0)], TILE_PX)
-
-
-@pytest.mark.parametrize("share", [1.0, 0.7, 0.3, 0.05])
-def test_many_cells_at_once_give_what_one_view_gives(place, share):
-    """The solution for missing cells comes in few steps, and close enough."""
-    valid = np.ones((TILE_PX, TILE_PX), bool)
-    valid[:, round(share * TILE_PX) :] = False
-    views, cells, shares = [], [], []
-    pooling = place.embedder.recipe.pooling
-    for row, col in place.tiles_px[::97]:
-        grey = place.grey[row : row + TILE_PX, col : col + TILE_PX]
-        maps = place.representation(grey, valid)
-        views.append(place.embedder.view(maps, valid))
-        sheet = CellSheet(CellLayout(4, 4), TILE_PX, TILE_PX, len(maps))
-        sheet.fill(0, 0, maps, valid)
-        cells.append(np.einsum("ai,ijc,bj->abc", pooling, sheet.means, pooling))
-        shares.append(pooling @ sheet.valid @ pooling.T)
-    many = place.embedder.cells(np.array(cells), np.array(shares))
-    np.testing.assert_allclose(np.einsum("qd,qd->q", many, views), 1, atol=1e-3)

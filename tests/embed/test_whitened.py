@@ -12,7 +12,6 @@ from orthonav.core.variants import make_variant
 
 TILE_PX = 128
 SHEET_PX = 384
-STRIDES = [64, 32, 16, 12, 10, 4, 2, 1]
 
 
 def ground(seed=0, size=SHEET_PX):
@@ -80,26 +79,6 @@ def test_a_view_that_equals_a_tile_gives_its_embedding(any_place):
         assert int((stored.astype(np.float32) @ seen).argmax()) == row
 
 
-@pytest.mark.parametrize("name, least", [("gradient", 0.9), ("gray", 0.999)])
-def test_a_view_is_represented_on_its_own(name, least):
-    """Its representation knows no pixels beyond its border; that costs little."""
-    place = Place(name, cells=8 if name == "gradient" else 16)
-    stored = place.embedder.tiles(place.sheet, place.tiles_px)
-    row, col = place.tiles_px[77]
-    grey = np.ascontiguousarray(ground()[row : row + TILE_PX, col : col + TILE_PX])
-    seen = place.embedder.view(maps_of(grey, name=name), np.ones(grey.shape, bool))
-    scores = stored.astype(np.float32) @ seen
-    assert scores.argmax() == 77 and scores[77] > least
-
-
-@pytest.mark.parametrize("stride_px", STRIDES)
-def test_the_stride_does_not_matter(place, stride_px):
-    sheet, tiles_px = sheet_of(place.maps, place.valid, stride_px), grid_px(stride_px)
-    together = place.embedder.tiles(sheet, tiles_px)
-    alone = [place.embedder.view(*place.cut(*tile)) for tile in tiles_px]
-    np.testing.assert_allclose(together, alone, atol=2e-3)
-
-
 @pytest.mark.parametrize("stride_px", [12, 1])
 def test_the_stride_does_not_matter_where_imagery_is_missing(place, stride_px):
     valid = place.valid.copy()
@@ -163,23 +142,6 @@ def test_nothing_to_see_is_zero(place):
     empty = sheet_of(maps, nothing, TILE_PX)
     stored = place.embedder.tiles(empty, np.zeros((1, 2), np.intp))
     assert np.isfinite(stored).all() and not stored.any()
-
-
-@pytest.mark.parametrize("count", [1, 2, 9])
-def test_fewer_tiles_than_dims(place, count):
-    few = place.tiles_px[:: len(place.tiles_px) // count][:count]
-    embedder = learn(WhitenedRecipe(dims=128), place.sheet, few)
-    assert 1 <= embedder.dims <= count
-    stored = embedder.tiles(place.sheet, place.tiles_px)
-    assert np.isfinite(stored).all() and stored.shape == (len(place.tiles_px), embedder.dims)
-
-
-def test_places_are_distinguished(any_place):
-    """Whitened, tiles that share nothing are as likely alike as unlike."""
-    stored = any_place.embedder.tiles(any_place.sheet, any_place.tiles_px).astype(float)
-    apart = np.abs(any_place.tiles_px[:, None] - any_place.tiles_px[None]).max(axis=2) >= TILE_PX
-    scores = (stored @ stored.T)[apart]
-    assert abs(scores.mean()) < 0.15 and np.percentile(scores, 99) < 0.8
 
 
 @pytest.mark.parametrize("shape", [(7, 128, 96), (7, 100, 100), (7, 33, 33)])

@@ -8,13 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.core.errors import MissingExtraError, VariantError
+from orthonav.core.errors import VariantError
 from orthonav.core.tiles.represent import Gray
-from orthonav.core.tiles.words import (
-    WordsEmbedder,
-    WordsRecipe,
-    describe,
-)
+from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
 from orthonav.core.variants import Variant, make_variant
 from orthonav.research.words import learn_words
 
@@ -144,72 +140,13 @@ def test_places_are_found_again(learnt):
     assert right >= 8
 
 
-def test_learning_gives_words_of_its_pictures(learnt):
-    assert learnt.dims == 256 and learnt.recipe == WordsRecipe(words=256)
-    parts = learnt.parts()
-    assert parts["vocabulary"].shape == (256, 128) and parts["vocabulary"].dtype == np.uint8
-    assert parts["idf"].shape == (0,)
-    assert len(np.unique(learnt.vocabulary, axis=0)) == 256
-    descriptors = describe(learnt.recipe, area(), np.ones((700, 700), bool))
-    near = learnt.vocabulary[learnt.assigned(descriptors)].astype(np.float32)
-    within = np.square(descriptors - near).sum(axis=1).mean()
-    whole = np.square(descriptors - descriptors.mean(axis=0)).sum(axis=1).mean()
-    assert within < 0.75 * whole
-
-
-def test_rare_words_weigh_more():
-    """Half of the pictures are one and the same: their words are common."""
-    common, *rest = tiles(area())
-    shown = [common] * 7 + rest[:7]
-    made = learn_words(WordsRecipe(words=256, tfidf=1), pictures_of(shown), seed=1)
-    plain = WordsEmbedder(WordsRecipe(words=256), made.vocabulary, NOTHING)
-    counts = np.stack([plain.counts(tile, everywhere(tile)) for tile in shown])
-    expected = np.log(15 / np.maximum(1, (counts > 0).sum(axis=0)))
-    np.testing.assert_allclose(made.idf, expected, rtol=1e-5)
-    assert made.idf[counts[0] > 0].max() < made.idf.max()
-
-
 @pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [area(size=100)]])
 def test_too_few_features_are_refused(greys):
     with pytest.raises(VariantError, match=r"1024 words cannot be learned from \d+ features"):
         learn_words(WordsRecipe(), pictures_of(greys))
 
 
-def test_without_faiss_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "faiss", None)
-    with pytest.raises(MissingExtraError, match=r"orthonav\[train\]"):
-        learn_words(WordsRecipe(), pictures_of([area()]))
-
-
 # SuperPoint.
-
-
-@pytest.mark.slow
-def test_superpoint_words(tmp_path):
-    import torch
-    import transformers
-
-    torch.manual_seed(3)
-    model = transformers.SuperPointForKeypointDetection(
-        transformers.SuperPointConfig(keypoint_threshold=0.016)
-    )
-    with torch.no_grad():
-        for name, weight in model.named_parameters():
-            if name.endswith("weight"):
-                weight.normal_(0, (2 / weight[0].numel()) ** 0.5)
-    model.save_pretrained(tmp_path)
-    recipe = WordsRecipe(words=256, features="superpoint", weights=str(tmp_path))
-    shown = tiles(area())[:12]
-    made = learn_words(recipe, pictures_of(shown))
-    assert made.vocabulary.shape == (256, 256) and made.vocabulary.dtype == np.float16
-    out = made.views(np.stack([maps_of(tile) for tile in shown[:2]]))
-    np.testing.assert_allclose(out.sum(axis=1), 1, atol=1e-5)
-    assert (out[0] != out[1]).any()
-    valid = everywhere(shown[0])
-    valid[:, 40:] = False
-    some = describe(recipe, shown[0], valid)
-    assert 0 < len(some) < len(describe(recipe, shown[0], everywhere(shown[0])))
-    assert not made.view(maps_of(np.zeros((64, 64), np.uint8)), np.zeros((64, 64), bool)).any()
 
 
 # Values.

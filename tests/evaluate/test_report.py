@@ -17,7 +17,6 @@ from orthonav.ground.evaluate.metrics import compare, measure
 from orthonav.ground.evaluate.report import MadeFrom, write_report
 from orthonav.ground.evaluate.tables import (
     FlightReport,
-    covariance_card,
     metrics_to_json,
     table,
     total,
@@ -69,40 +68,16 @@ def test_the_page_needs_nothing_from_outside(tmp_path: Path, no_plots) -> None:
 
 def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None:
     flight = made_flight(50)
-    made_from = MadeFrom(
-        map_name="brest.onav",
-        recipe="gradient:sigma_px=1.5",
-        flight="logs/7",
-        command="orthonav evaluate fixes.jsonl --truth truth.csv",
-        version="0.1.0",
-    )
+    made_from = MadeFrom("brest.onav", "gradient", "ortho.tif", "logs/7", "orthonav evaluate", "1")
     html = write_report(tmp_path, [flight], made_from).read_text("utf-8")
-    assert "<h1>Evaluation of flight</h1>" in html
-    metrics = flight.metrics
+    metrics, worst = flight.metrics, int(np.nanargmax(flight.comparison.errors_m))
     assert f"<b>{100 * metrics.availability:.1f} %</b>" in html
     assert f'<b class="bad">{metrics.n_confident_wrong} of {metrics.n_confident}</b>' in html
-    assert f"below {100 * metrics.wrong_upper_95:.1f} %" in html
-    for figures in (metrics.of_confident, metrics.standard):
-        assert f"<td>{measure_text(figures.cep50_m)}</td>" in html
-    assert covariance_card(metrics.consistency)[1] in html
+    shown = [measure_text(each.cep50_m) for each in (metrics.of_confident, metrics.standard)]
+    for cell in (*shown, flight.comparison.frames[worst], "too_dark"):
+        assert f"<td>{cell}</td>" in html
     for said in vars(made_from).values():
         assert said in html
-    worst = flight.comparison.frames[int(np.nanargmax(flight.comparison.errors_m))]
-    assert f"<td>{worst}</td>" in html
-    assert "<td>too_dark</td>" in html
-    assert "Lowe&#39;s ratio" in html
-
-
-@pytest.mark.long
-def test_text_is_escaped(tmp_path: Path, coarse) -> None:
-    nasty = '<img src=x onerror="1">&$\\frac'
-    flight = made_flight(12, name=nasty)
-    frames = (f"{nasty}\udcff", *flight.comparison.frames[1:])
-    flight = replace(flight, comparison=replace(flight.comparison, frames=frames))
-    made_from = MadeFrom(map_name=nasty, command=nasty)
-    html = write_report(tmp_path, [flight], made_from).read_text("utf-8")
-    assert "<img src=x" not in html
-    assert html.count("<img ") == PICTURES_PER_FLIGHT
 
 
 def test_several_flights_have_a_total(tmp_path: Path, no_plots) -> None:

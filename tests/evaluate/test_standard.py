@@ -5,44 +5,27 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.ground.evaluate.standard import standard_figures
+from orthonav.ground.evaluate.figures import standard_figures
 
 TRUTH = np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0], [180.0, 0.0], [240.0, 0.0]])
 ERRORS = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan], [0.0, 10.0], [0.0, -5.0]])
 """Errors of 5, 0, none, 10 and 5 m."""
 
 
-def test_absolute_pose_error() -> None:
+def test_pose_errors_of_the_example() -> None:
+    """From fix to fix errors differ by (-3, -4), (0, 10), (0, -15). The fixes lie at 0, 60, 180 and
+    240 m: 100 m are reached at 180 m, and no second time; 60 m at 180 and 240 m."""
     found = standard_figures(TRUTH, TRUTH + ERRORS)
-    ape = found.ape
-    assert ape.n == 4
-    assert ape.mean_m == pytest.approx(5.0)  # (5 + 0 + 10 + 5) / 4
-    assert ape.median_m == pytest.approx(5.0)
-    assert ape.rmse_m == pytest.approx(math.sqrt(37.5))  # (25 + 0 + 100 + 25) / 4
-    assert ape.std_m == pytest.approx(math.sqrt(12.5))  # 37.5 - 25
-    assert ape.max_m == pytest.approx(10.0)
-    assert found.cep50_m == pytest.approx(5.0)
-    assert found.cep95_m == pytest.approx(9.25)  # 5 + 0.85 * (10 - 5)
-
-
-def test_relative_pose_error_per_frame() -> None:
-    """From each fix to the next: differences of errors (-3, -4), (0, 10) and (0, -15)."""
-    found = standard_figures(TRUTH, TRUTH + ERRORS).rpe_frames
-    assert found.n == 3
-    assert found.mean_m == pytest.approx(10.0)  # (5 + 10 + 15) / 3
-    assert found.median_m == pytest.approx(10.0)
-    assert found.rmse_m == pytest.approx(math.sqrt(350 / 3))
-    assert found.std_m == pytest.approx(math.sqrt(50 / 3))
-    assert found.max_m == pytest.approx(15.0)
-
-
-def test_relative_pose_error_over_a_distance() -> None:
-    """The fixes lie at 0, 60, 180 and 240 m: 100 m are reached at 180 m, and no second time."""
-    assert standard_figures(TRUTH, TRUTH + ERRORS).rpe_distance.n == 0
-    found = standard_figures(TRUTH, TRUTH + ERRORS, distance_m=60.0).rpe_distance
-    assert found.n == 2  # from 60 to 180 m, from 180 to 240 m
-    assert found.mean_m == pytest.approx(12.5)
-    assert found.max_m == pytest.approx(15.0)
+    far = standard_figures(TRUTH, TRUTH + ERRORS, distance_m=60.0).rpe_distance
+    expected = {  # n, RMSE, mean, median, std, max
+        found.ape: (4, math.sqrt(37.5), 5.0, 5.0, math.sqrt(12.5), 10.0),
+        found.rpe_frames: (3, math.sqrt(350 / 3), 10.0, 10.0, math.sqrt(50 / 3), 15.0),
+        far: (2, math.sqrt(325 / 2), 12.5, 12.5, 2.5, 15.0),
+    }
+    for statistics, values in expected.items():
+        assert tuple(vars(statistics).values()) == pytest.approx(values)
+    assert found.rpe_distance.n == 0
+    assert (found.cep50_m, found.cep95_m) == pytest.approx((5.0, 5 + 0.85 * (10 - 5)))
 
 
 def test_a_constant_offset_has_no_relative_error() -> None:

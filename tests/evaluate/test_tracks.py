@@ -19,7 +19,6 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.contact_sheet import worst_rows
-from orthonav.ground.evaluate.figures import seconds_since_first
 from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.report import write_report
 from orthonav.ground.evaluate.tables import (
@@ -95,15 +94,6 @@ def drawn(n=200, seed=0, alike=0.0):
 
 
 # Consistency.
-
-
-def test_errors_of_their_own_covariance_are_consistent_and_of_a_quarter_over_confident() -> None:
-    errors = drawn()
-    verdicts = {
-        scale: tracked(errors, "tracking", cov_en_m2=scale * COV).consistency.verdict
-        for scale in (0.25, 1.0, 4.0)
-    }
-    assert verdicts == {0.25: "over-confident", 1.0: "consistent", 4.0: "under-confident"}
 
 
 @pytest.mark.parametrize("alike", [0.0, 0.9])
@@ -251,11 +241,6 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
     json.dumps(flights_to_json([flight], flight.metrics), allow_nan=False)
     for text in (summary([flight], flight.metrics), "".join(said for _, said in track_rows(track))):
         assert "nan" not in text.lower() and "inf" not in text.lower()
-
-
-@pytest.mark.parametrize("times", [[math.nan, 1.0], [1.0, math.nan], [2, 1], [3, 3], []])
-def test_times_that_do_not_rise_are_undefined(times: list) -> None:
-    assert np.isnan(seconds_since_first(times)).all()
 
 
 def test_states_count_without_a_truth_and_errors_only_with_one() -> None:

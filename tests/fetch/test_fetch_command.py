@@ -10,7 +10,7 @@ import servers
 import terrain
 
 from orthonav.cli import main
-from orthonav.ground.imagery.source import open_source
+from orthonav.ground.imagery.source import open_sources
 
 SECRET = "t0ken-of-mine"
 
@@ -45,7 +45,7 @@ def test_an_orthophoto_with_its_terms(command, area, tmp_path):
     assert tags["ORTHONAV_LICENCE"] == "CC BY 4.0" and tags["ACQUISITION_DATE"] == "2021-06"
     assert tags["ORTHONAV_SOURCE"].startswith(server.url) and "ORTHONAV_FETCHED" in tags
     assert "TIFFTAG_DATETIME" not in tags  # the day is not known
-    found = open_source(out)
+    found = open_sources([out])[0][0]
     assert found.date == "2021-06" and found.bands == (1, 2, 3) and found.gsd_m < 0.5
     with rasterio.open(out) as data:
         assert data.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"

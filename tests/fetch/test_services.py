@@ -14,7 +14,7 @@ from orthonav.core.errors import AreaError, FetchError
 from orthonav.ground.fetch.options import ImageryOptions
 from orthonav.ground.fetch.presets import find_preset, parse_source
 from orthonav.ground.fetch.run import FetchRequest, fetch
-from orthonav.ground.imagery.source import open_source
+from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -76,7 +76,7 @@ def test_wms_in_every_axis_order(mapproxy, take, version, crs):
     )
     worst, valid = placed(path, crs)
     assert worst <= 1.5 and valid == 1.0
-    assert open_source(path).gsd_m == pytest.approx(1.0, rel=0.01)
+    assert open_sources([path])[0][0].gsd_m == pytest.approx(1.0, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -86,12 +86,7 @@ def test_a_band_is_needed_where_a_leg_has_none():
     assert (same.frame, same.extent_en_m) == (plain.frame, plain.extent_en_m)
 
 
-@given(
-    routes(),
-    st.floats(50, 800),
-    st.sampled_from([0.0, 0.5, 0.875]),
-    st.integers(0, 2**32 - 1),
-)
+@given(routes(), st.floats(50, 800), st.sampled_from([0.0, 0.5, 0.875]), st.integers(0, 2**32 - 1))
 def test_every_point_of_the_band_is_near_a_tile(route, band_m, overlap, seed):
     area = Area.from_route(route, band_m)
     grid = TileGrid.covering(area.extent_en_m, gsd_m=5.0, tile_px=128, overlap=overlap)

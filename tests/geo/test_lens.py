@@ -106,9 +106,3 @@ def test_angles_of_a_rotation_come_back(yaw, pitch, roll):
     )
     assert again[1:] == pytest.approx((pitch, roll), abs=1e-6)
     assert (again[0] - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
-
-
-@pytest.mark.parametrize("pitch", [90.0, -90.0])
-def test_angles_at_the_horizon_give_the_same_rotation(pitch):
-    turned = enu_from_camera(30, pitch, 20)
-    np.testing.assert_allclose(enu_from_camera(*attitude_of(turned)), turned, atol=1e-7)

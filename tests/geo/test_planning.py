@@ -46,12 +46,7 @@ def test_the_view_is_the_footprint():
         ViewPlan.of(CAMERA, math.nan)
 
 
-@given(
-    st.floats(1, 50_000),
-    st.integers(64, 6000),
-    st.integers(64, 6000),
-    st.floats(0.3, 5),
-)
+@given(st.floats(1, 50_000), st.integers(64, 6000), st.integers(64, 6000), st.floats(0.3, 5))
 def test_the_map_that_is_advised_is_good_for_the_view(agl_m, width_px, height_px, focal):
     camera = Camera(width_px, height_px, focal * width_px, focal * width_px, 10.0, 10.0)
     view = ViewPlan.of(camera, agl_m)

@@ -121,8 +121,7 @@ def test_names_that_no_sheet_has(name):
 
 
 @pytest.mark.parametrize(
-    "box",
-    [(1.0, 47.0, 2.0, 46.0), (math.nan, 46.0, 2.0, 47.0), (1.0, 46.0, 2.0, math.inf)],
+    "box", [(1.0, 47.0, 2.0, 46.0), (math.nan, 46.0, 2.0, 47.0), (1.0, 46.0, 2.0, math.inf)]
 )
 def test_boxes_that_are_none(box):
     with pytest.raises(AreaError, match="bounds must be"):

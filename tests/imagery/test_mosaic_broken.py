@@ -32,19 +32,13 @@ def refused(path, message, error=ImageryError):
     assert str(caught.value).endswith(str(path))
 
 
-def test_a_file_that_is_missing(tmp_path):
-    with pytest.raises(MissingFileError, match="does not exist"):
-        Mosaic.open([tmp_path / "none.tif"])
-
-
-@pytest.mark.parametrize("content", [b"", b"not an image", b"II*\0" + b"\xff" * 40, bytes(4096)])
-def test_a_file_that_is_no_image(ortho, content):
-    ortho.write_bytes(content)
-    refused(ortho, "cannot be read")
-
-
-def test_no_coordinate_reference_system(ortho):
-    refused(write(ortho, SCENE, crs=None), "no coordinate reference system.*gdal_edit.py")
+def test_files_that_are_no_image(ortho):
+    refused(ortho, "does not exist", MissingFileError)
+    ortho.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    refused(ortho, "Git LFS pointer.*git lfs pull", MissingFileError)
+    for content in (b"", b"not an image", b"II*\0" + b"\xff" * 40, bytes(4096)):
+        ortho.write_bytes(content)
+        refused(ortho, "cannot be read")
 
 
 @pytest.mark.parametrize("assigned", [False, True])
@@ -58,33 +52,29 @@ def test_ground_control_points_only(ortho, assigned):
     refused(ortho, "4 ground control points only.*gdalwarp -tps")
 
 
-def test_a_pointer_of_git_lfs(ortho):
-    ortho.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
-    refused(ortho, "Git LFS pointer.*git lfs pull", MissingFileError)
-
-
-def test_no_geotransform(ortho):
-    refused(write(ortho, SCENE, transform=Affine.identity()), "no georeference")
-
-
-def test_a_local_coordinate_system_is_nowhere_on_earth(ortho):
-    crs = 'LOCAL_CS["mine",UNIT["metre",1]]'
-    refused(write(ortho, SCENE, crs=crs), "coordinate system cannot be converted to latitude")
+@pytest.mark.parametrize(
+    "profile, message",
+    [
+        ({"crs": None}, "no coordinate reference system.*gdal_edit.py"),
+        ({"transform": Affine.identity()}, "no georeference"),
+        ({"crs": 'LOCAL_CS["mine",UNIT["metre",1]]'}, "system cannot be converted to latitude"),
+        ({"crs": "EPSG:4326"}, "border cannot be converted to latitude"),
+        *(
+            (
+                {"crs": "EPSG:4326", "transform": Affine(1e-4, 0, west_deg, 0, -1e-4, -17)},
+                "beyond longitude 180",
+            )
+            for west_deg in (179.999, -180.001, 200.0)
+        ),
+    ],
+)
+def test_places_that_cannot_be_used(ortho, profile, message):
+    refused(write(ortho, SCENE, **profile), message)
 
 
 @pytest.mark.parametrize("shape", [(15, 60), (60, 15), (1, 1)])
 def test_too_small(ortho, shape):
     refused(write(ortho, np.ones((3, *shape), np.uint8)), f"only {shape[1]} x {shape[0]} px")
-
-
-def test_metres_called_degrees(ortho):
-    refused(write(ortho, SCENE, crs="EPSG:4326"), "border cannot be converted to latitude")
-
-
-@pytest.mark.parametrize("west_deg", [179.999, -180.001, 200.0])
-def test_degrees_across_the_antimeridian(ortho, west_deg):
-    transform = Affine(1e-4, 0, west_deg, 0, -1e-4, -17)
-    refused(write(ortho, SCENE, crs="EPSG:4326", transform=transform), "beyond longitude 180")
 
 
 @pytest.mark.parametrize("dtype, nodata", [("uint16", 0), ("float32", -1), ("float32", np.nan)])
@@ -204,33 +194,20 @@ READ_HUGE = """
 """
 
 
-@pytest.fixture(scope="module", params=["colours", "palette"])
-def huge(request, tmp_path_factory):
+@pytest.fixture
+def huge(ortho):
     """A 12,000 x 12,000 px orthophoto at 0.2 m, 430 MB when unpacked."""
-    path = tmp_path_factory.mktemp("huge") / "huge.tif"
-    bands = 3 if request.param == "colours" else 1
-    block = smooth_scene(2000)[:bands]
     half = HUGE_PX / 2
     profile = {
-        "driver": "GTiff",
-        "dtype": "uint8",
-        "count": bands,
-        "width": HUGE_PX,
-        "height": HUGE_PX,
-        "crs": "EPSG:2154",
+        **{"driver": "GTiff", "dtype": "uint8", "count": 3, "width": HUGE_PX, "height": HUGE_PX},
+        **{"crs": LAMBERT, "tiled": True, "compress": "DEFLATE", "SPARSE_OK": "TRUE"},
         "transform": Affine(0.2, 0, 700_000 - 0.2 * half, 0, -0.2, 6_600_000 + 0.2 * half),
-        "compress": "DEFLATE",
-        "zlevel": 1,
-        "interleave": "pixel",
-        "tiled": True,
-        "SPARSE_OK": "TRUE",
     }
-    with rasterio.open(path, "w", **profile) as data:
-        if bands == 1:
-            data.write_colormap(1, {value: (value, 0, 0, 255) for value in range(256)})
+    with rasterio.open(ortho, "w", **profile) as data:
         for at in range(0, HUGE_PX, 4000):
-            data.write(block, window=rasterio.windows.Window(at, at, 2000, 2000))
-    return path
+            window = rasterio.windows.Window(at, at, 2000, 2000)
+            data.write(smooth_scene(2000), window=window)
+    return ortho
 
 
 @pytest.mark.slow

@@ -3,11 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-import rasterio
 from geotiffs import FRAME, LAMBERT, centres_en_m, from_local, placed, read, sheet_of, write
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery.mosaic import Mosaic
 
 BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
 VOSGES = LocalFrame(46.5, 7.5)
@@ -67,38 +65,6 @@ def test_marks_lie_where_proj_puts_them(tmp_path, crs, frame, source_gsd_m, turn
     assert pixels.valid.all()
     assert np.abs(off).max() < 0.1, f"marks are off by up to {np.abs(off).max():.2f} px"
     assert np.abs(off.mean(axis=0)).max() < 0.03
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "source_gsd_m, window", [pytest.param(0.3, 200, marks=pytest.mark.slow), (0.2, 63)]
-)
-def test_marks_of_a_palette_thinned_in_strips(tmp_path, monkeypatch, source_gsd_m, window):
-    monkeypatch.setattr("orthonav.ground.imagery.joined.STRIP_PX", 2_000)
-    size = int(290 / source_gsd_m)
-    transform = placed(LAMBERT, source_gsd_m, size, frame=BREST)
-    path = tmp_path / "ortho.tif"
-    source_with_marks(path, LAMBERT, transform, size, BREST, sigma_px=2.5 / source_gsd_m)
-    plain = read(path, 200, frame=BREST).grey
-    with rasterio.open(path, "r+") as data:
-        data.write_colormap(1, {value: (value, value, value, 255) for value in range(256)})
-    with sheet_of(path, 200, frame=BREST) as sheet:
-        rows = [
-            [sheet.read(col, row, window, window).grey for col in range(0, 200, window)]
-            for row in range(0, 200, window)
-        ]
-    grey = np.block(rows)[:200, :200]
-    assert np.abs(marks_off_px(grey, 1.0)).max() < 0.1
-    assert np.abs(grey.astype(int) - plain).max() <= 2
-
-
-def test_web_mercator_is_measured_in_true_metres(tmp_path):
-    """At 46.5 degrees its unit is 0.69 m on the ground."""
-    transform = placed("EPSG:3857", size=64)
-    assert transform.a == pytest.approx(1.45, abs=0.01)
-    bands = np.ones((1, 64, 64), np.uint8)
-    path = write(tmp_path / "a.tif", bands, crs="EPSG:3857", transform=transform)
-    assert Mosaic.open([path]).gsd_m == pytest.approx(1.0, abs=0.005)
 
 
 def rich_scene(size, source_gsd_m, seed=0):
@@ -178,13 +144,3 @@ def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
     assert pixels.valid[3:-3, 3:-3].all()
     assert inner.mean() == pytest.approx(127.5, abs=3)
     assert np.abs(inner - 127.5).max() <= 127.5 / coarser**2 * 2.5 + 3
-
-
-def test_across_the_antimeridian(tmp_path):
-    """An orthophoto in UTM 60 that reaches into the western hemisphere."""
-    frame = LocalFrame(-17.0, 180.0)
-    transform = placed("EPSG:32760", 1.0, 260, frame=frame)
-    path = tmp_path / "fiji.tif"
-    source_with_marks(path, "EPSG:32760", transform, 260, frame, 2.5)
-    pixels = read(path, 200, 1.0, frame)
-    assert pixels.valid.all() and np.abs(marks_off_px(pixels.grey, 1.0)).max() < 0.1

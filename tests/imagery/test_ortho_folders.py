@@ -6,13 +6,10 @@ import rasterio
 import rasterio.shutil
 from geotiffs import placed, read, smooth_scene, write
 from rasterio.drivers import raster_driver_extensions
-from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
-from orthonav.cli import main
 from orthonav.core.errors import ImageryError
 from orthonav.core.mapfile import open_map
-from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.source import date_of, system_of
 
@@ -21,25 +18,16 @@ PACKAGE = "BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D003_2013-01-01"
 TILES = f"{PACKAGE}/ORTHOHR/1_DONNEES_LIVRAISON_2013-11-00100/BDO_RVB_1M00_JP2-E080_LAMB93_D03-2013"
 
 
-def tiles(
-    folder,
-    suffix=".tif",
-    name="tile_{0}_{1}",
-    side=100,
-    scene=SCENE,
-    size=200,
-    is_placed=True,
-    **more,
-):
+def tiles(folder, suffix=".tif", name="tile_{0}_{1}", scene=SCENE, is_placed=True, **more):
     """The scene in four files."""
+    size, side = 200, 100
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for row in range(0, size, side):
         for col in range(0, size, side):
             part = np.ascontiguousarray(scene[:, row : row + side, col : col + side])
-            here = (
-                placed(size=size) * Affine.translation(col, row) if is_placed else Affine.identity()
-            )
+            here = placed(size=size) * Affine.translation(col, row)
+            here = here if is_placed else Affine.identity()
             path = folder / (name.format(row // side, col // side) + suffix)
             paths.append(write(path, part, transform=here, **more))
     return paths
@@ -48,14 +36,7 @@ def tiles(
 @pytest.fixture
 def whole(tmp_path):
     """The picture of the scene when it is one file."""
-    return read(
-        write(
-            tmp_path / "whole" / "a.tif" if False else tmp_path / "a.tif",
-            SCENE,
-            transform=placed(size=200),
-        ),
-        190,
-    )
+    return read(write(tmp_path / "a.tif", SCENE, transform=placed(size=200)), 190)
 
 
 def ign(folder, **more):
@@ -237,60 +218,18 @@ def test_tile_stores_are_read_at_their_finest(tmp_path, driver, suffix):
     assert off.mean() < 6  # GDAL resamples into the store's own zoom levels
 
 
-def test_naip_swissimage_and_drones(tmp_path):
-    """Four bands in UTM, Swiss LV95, 16 bits with an alpha band: as they come, in one folder."""
-    rgb = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
-    kinds = {
-        "m_4710060_ne_14_060_20200715.tif": (
-            "EPSG:32631",
-            np.concatenate([SCENE, 255 - SCENE[:1]]),
-            {},
-        ),
-        "dop_2056.tif": ("EPSG:2056", SCENE, {}),
-        "drone.tif": (
-            "EPSG:32631",
-            np.concatenate([SCENE * np.uint16(90), np.where(SCENE[:1] > 0, 65535, 0)]).astype(
-                np.uint16
-            ),
-            {"colours": [*rgb, ColorInterp.alpha]},
-        ),
-    }
-    for name, (crs, bands, more) in kinds.items():
-        folder = tmp_path / name[:4]
-        folder.mkdir()
-        write(folder / name, bands, crs=crs, transform=placed(crs, size=200), **more)
-        pixels = read(folder, 150)
-        assert pixels.valid.all() and pixels.grey.std() > 25, name
-    assert read(tmp_path / "m_47", 150).valid.all()
-    mixed = Mosaic.open([tmp_path / name[:4] for name in kinds])
-    assert len(mixed.sources) == 3 and len(mixed.describe()) == 3
-
-
 @pytest.mark.long
-def test_build_from_a_folder(tmp_path, capsys, monkeypatch):
+def test_build_from_a_folder(run, tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-    folder = tmp_path / "ortho_2019"
-    tiles(folder, side=130, size=390, scene=smooth_scene(390))
-    out = tmp_path / "map.onav"
-    more = [
-        "--tile-px",
-        "64",
-        "--overlap",
-        "0.5",
-        "--calibration-views",
-        "2",
-        "--workers",
-        "2",
-        "-q",
-    ]
-    assert main(["build", "--ortho", str(folder), *more, "--out", str(out)]) == 0
-    assert "9 files" in capsys.readouterr().out
-    (entry,) = open_map(out).manifest.imagery
-    assert entry["name"] == "ortho_2019" and entry["date"] == "2019" and entry["files"] == 9
-    one = tmp_path / "one.onav"
-    whole = write(tmp_path / "whole.tif", smooth_scene(390), transform=placed(size=390))
-    build_map(BuildRequest([whole], one, tile_px=64, overlap=0.5, calibration_views=2))
-    first, second = (
-        open_map(each).arrays["sheet0/embeddings"].astype(float) for each in (out, one)
-    )
+    whole = write(tmp_path / "whole.tif", SCENE, transform=placed(size=200))
+    tiles(tmp_path / "ortho_2019")
+    found = []
+    for ortho, said in ((tmp_path / "ortho_2019", "4 files"), (whole, "whole.tif")):
+        out = tmp_path / f"{ortho.stem}.onav"
+        more = ("--tile-px", 64, "--overlap", 0.5, "--calibration-views", 2, "--workers", 2)
+        assert said in run("build", "--ortho", ortho, *more, "--out", out).out
+        found.append(open_map(out))
+    (entry,) = found[0].manifest.imagery
+    assert (entry["name"], entry["date"], entry["files"]) == ("ortho_2019", "2019", 4)
+    first, second = (each.arrays["sheet0/embeddings"].astype(float) for each in found)
     assert np.einsum("nd,nd->n", first, second).min() > 0.99

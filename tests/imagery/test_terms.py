@@ -2,11 +2,11 @@
 
 import json
 
-import numpy as np
 import rasterio
+from geotiffs import smooth_scene, write
 
 from orthonav.cli.info import imagery_text
-from orthonav.ground.imagery.source import open_source
+from orthonav.ground.imagery.source import open_sources
 
 TAGS = {
     "ORTHONAV_ATTRIBUTION": "IGN,  BD\nORTHO",
@@ -18,12 +18,9 @@ TAGS = {
 
 
 def ortho(path, tags):
-    made = rasterio.transform.from_origin(500_000, 5_150_000, 1, 1)
-    how = {"width": 64, "height": 64, "count": 1, "dtype": "uint8", "crs": "EPSG:32631"}
-    with rasterio.open(path, "w", driver="GTiff", transform=made, **how) as data:
-        data.write(np.full((1, 64, 64), 90, np.uint8))
+    with rasterio.open(write(path, smooth_scene()), "r+") as data:
         data.update_tags(**tags)
-    return open_source(path).describe()
+    return open_sources([path])[0][0].describe()
 
 
 def test_terms_of_a_fetched_file(tmp_path):

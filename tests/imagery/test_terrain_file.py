@@ -6,7 +6,9 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+from rasterio.enums import Resampling
 from rasterio.transform import Affine
+from rasterio.vrt import WarpedVRT
 
 from orthonav.core.errors import ImageryError, MissingFileError
 from orthonav.core.geo.frames import LocalFrame
@@ -73,24 +75,13 @@ def test_heights_in_a_plane_are_means_of_squares(make_dem):
 
 @pytest.mark.parametrize("code", [32631, 4326, 2154])
 def test_any_coordinate_system_and_a_raster_that_begins_in_the_south(make_dem, tmp_path, code):
-    from rasterio.warp import Resampling, calculate_default_transform, reproject
-
-    with rasterio.open(make_dem()) as data:
-        box = data.bounds
-        step, width, height = calculate_default_transform(
-            data.crs, f"EPSG:{code}", data.width, data.height, *box
-        )
-        turned = np.full((height, width), np.nan, np.float32)
-        reproject(
-            rasterio.band(data, 1), turned, dst_transform=step, dst_crs=f"EPSG:{code}",
-            dst_nodata=np.nan, resampling=Resampling.bilinear,
-        )  # fmt: skip
-    upward = Affine(step.a, 0, step.c, 0, -step.e, step.f + height * step.e)
-    with rasterio.open(
-        tmp_path / "turned.tif", "w", driver="GTiff", count=1, height=height, width=width,
-        dtype="float32", crs=f"EPSG:{code}", transform=upward, nodata=np.nan,
-    ) as data:  # fmt: skip
-        data.write(turned[None, ::-1])
+    system = {"crs": f"EPSG:{code}", "nodata": np.nan, "resampling": Resampling.bilinear}
+    with rasterio.open(make_dem()) as data, WarpedVRT(data, **system) as turned:
+        heights, profile, step = turned.read(), turned.profile, turned.transform
+    upward = Affine(step.a, 0, step.c, 0, -step.e, step.f + turned.height * step.e)
+    profile |= {"driver": "GTiff", "transform": upward}
+    with rasterio.open(tmp_path / "turned.tif", "w", **profile) as data:
+        data.write(heights[:, ::-1])
     dem = open_dem(tmp_path / "turned.tif", "egm96")
     assert error_m(dem) < 0.2
     assert np.nanmax(np.abs(dem.in_plane(FRAME, 0, 0, 50, 3, 3)[1, 1] - slope(75, -75))) < 0.3

@@ -18,6 +18,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.confidence import Chances, RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN
+from orthonav.core.records import Fix, Prior
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import RegistrationCalibration
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -132,3 +133,17 @@ def _map_of(ortho, path):
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
         patch.setattr("orthonav.ground.build.build.calibrate_registration", lambda *_: learnt)
         build_map(BuildRequest([ortho], path, tile_px=128, overlap=0.75, gsd_m=1.0))
+
+
+def place_of(localizer, fix):
+    assert isinstance(fix, Fix), fix
+    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+
+
+def error_m(localizer, fix, place_en_m):
+    return float(np.hypot(*(place_of(localizer, fix) - place_en_m)))
+
+
+def prior_at(localizer, place_en_m, std_m):
+    lat, lon = localizer.sheet.frame.latlon_from_en(place_en_m)
+    return Prior(float(lat), float(lon), std_m)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from blots import error_m, place_of, prior_at
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -35,19 +36,6 @@ def fixes(views, flight, localizer):
         name: localizer.locate(View(grey, flight.camera, telemetry))
         for name, (grey, telemetry) in views.items()
     }
-
-
-def place_en_m(localizer, fix):
-    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-
-
-def error_m(localizer, fix, truth_en_m):
-    return float(np.hypot(*(place_en_m(localizer, fix) - truth_en_m)))
-
-
-def prior_at(localizer, place_en_m, std_m):
-    lat, lon = localizer.sheet.frame.latlon_from_en(place_en_m)
-    return Prior(float(lat), float(lon), std_m)
 
 
 @pytest.fixture(scope="module")
@@ -119,17 +107,6 @@ def test_a_fix_states_its_evidence(fixes, flight, localizer):
             fix.evidence["score"] = 1.0
 
 
-def same(one, other):
-    assert type(one) is type(other)
-    if isinstance(one, NoFix):
-        return (one.reason, one.detail) == (other.reason, other.detail)
-    values = [
-        (f.lat_deg, f.lon_deg, f.confidence, f.heading_deg, f.agl_m, dict(f.evidence))
-        for f in (one, other)
-    ]
-    return values[0] == values[1] and (one.cov_en_m2 == other.cov_en_m2).all()
-
-
 def test_a_prior_outside_the_map(views, flight, localizer, good):
     grey, telemetry = views[good]
     for place in ([50_000.0, 0.0], [0.0, -3000.0]):
@@ -137,45 +114,6 @@ def test_a_prior_outside_the_map(views, flight, localizer, good):
             View(grey, flight.camera, telemetry), prior=prior_at(localizer, place, 100.0)
         )
         assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
-
-
-def test_tiles_beyond_the_prior_are_not_searched(views, flight, localizer, good, truth_en_m):
-    grey, telemetry = views[good]
-    wrong = truth_en_m[good] + [-400.0 if truth_en_m[good][0] > 0 else 400.0, 0.0]
-    std_m = 40.0
-    fix = localizer.locate(
-        View(grey, flight.camera, telemetry), prior=prior_at(localizer, wrong, std_m)
-    )
-    reach_m = 3 * std_m + localizer.grid.stride_m
-    assert error_m(localizer, fix, wrong) <= reach_m + localizer.grid.stride_m
-    inside = np.linalg.norm(localizer.tiles.centres_en_m - wrong, axis=1) <= reach_m
-    # The gate is a little wider where the camera tilts and the heading is uncertain.
-    assert inside.sum() <= fix.evidence["tiles_searched"] <= 1.2 * inside.sum()
-
-
-def test_a_narrow_prior_does_not_raise_the_confidence_of_negatives(
-    views, flight, localizer, truth_en_m
-):
-    """Mirrored views show no place of the map, so no prior may make them look right."""
-    confident = []
-    for name, (grey, telemetry) in views.items():
-        mirrored = np.ascontiguousarray(grey[:, ::-1])
-        prior = prior_at(localizer, truth_en_m[name], 5.0)
-        fix = localizer.locate(View(mirrored, flight.camera, telemetry), prior=prior)
-        confident.append(isinstance(fix, Fix) and fix.confidence >= 0.9)
-    assert np.mean(confident) <= 0.1
-
-
-def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(views, flight, localizer, good):
-    """A camera that looks far ahead sees ground outside a narrow prior: that must be allowed."""
-    grey, telemetry = views[good]
-    ahead = replace(telemetry, pitch_deg=40.0, yaw_std_deg=0.0)
-    free = localizer.locate(View(grey, flight.camera, ahead))
-    assert isinstance(free, Fix)
-    prior = Prior(free.lat_deg, free.lon_deg, 1.0)
-    gated = localizer.locate(View(grey, flight.camera, ahead), prior=prior)
-    assert isinstance(gated, Fix)
-    assert (gated.lat_deg, gated.lon_deg) == (free.lat_deg, free.lon_deg)
 
 
 def test_unknown_heading(ground, localizer):
@@ -201,21 +139,13 @@ def test_tilt_is_compensated(ground, localizer, attitude):
     level = localizer.locate(View(*args_of(ground, place, (attitude[0], 0, 0))))
     tilted = localizer.locate(View(*args_of(ground, place, attitude)))
     assert error_m(localizer, level, place) <= localizer.grid.stride_m
-    apart = place_en_m(localizer, level) - place_en_m(localizer, tilted)
+    apart = place_of(localizer, level) - place_of(localizer, tilted)
     assert np.abs(apart).max() <= localizer.grid.stride_m
 
 
 def args_of(ground, place, attitude):
     grey, telemetry = ground.view(*place, *map(float, attitude))
     return grey, ground.camera, telemetry
-
-
-def test_a_fine_picture_of_the_same_ground(ground, localizer):
-    """Five times as many pixels, thinned before they are compared."""
-    fine = ground.camera.resized(1600, 1200)
-    grey, telemetry = ground.view(40.0, -10.0, camera=fine)
-    fix = localizer.locate(View(grey, fine, telemetry))
-    assert error_m(localizer, fix, np.array([40.0, -10.0])) <= localizer.grid.stride_m
 
 
 REFUSED_TELEMETRY = [

@@ -5,15 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from blots import CAMERA, GROUND, as_grey
+from lab.terrain import random_relief, seen_view
 
-from orthonav.core.localize.rectify import (
-    Orientation,
-    hidden,
-    node_px,
-    orthorectified,
-)
+from orthonav.core.localize.rectify import Orientation, hidden, node_px, orthorectified
 from orthonav.core.records import Telemetry, View
-from orthonav.ground.simulate.perspective import Raster, random_relief, seen_view
+from orthonav.ground.simulate.perspective import Raster
 
 PIXEL_M, POSTING_M, SIDE_M = 1.0, 10.0, 800.0
 MIDDLE_M = SIDE_M / 2

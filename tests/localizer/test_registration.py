@@ -14,17 +14,17 @@ from blots import (
     GROUND,
     Ground,
     as_grey,
+    error_m,
     known_map,
+    place_of,
     planned,
+    prior_at,
     rendered,
 )
 
-from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.place import Placer
 from orthonav.core.localize.policy import ClearMargin
-from orthonav.core.localize.search import FftStep, Search, TileStep
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
@@ -52,20 +52,6 @@ def localizer(map_path, known):
     offset = made.sheet.frame.en_from_latlon(known.frame.lat_deg, known.frame.lon_deg)
     assert made.registration is not None and np.hypot(*offset) < 1e-3
     return made
-
-
-def place_of(localizer, fix):
-    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-
-
-def error_m(localizer, fix, place_en_m):
-    assert isinstance(fix, Fix), fix
-    return float(np.hypot(*(place_of(localizer, fix) - place_en_m)))
-
-
-def prior_at(localizer, place_en_m, std_m):
-    lat, lon = localizer.sheet.frame.latlon_from_en(place_en_m)
-    return Prior(float(lat), float(lon), std_m)
 
 
 def turned_deg(one, other):
@@ -160,21 +146,6 @@ def test_the_position_is_that_of_the_camera(localizer, attitude):
     assert fix.agl_m == pytest.approx(AGL_M, rel=0.002)
 
 
-def test_a_tilted_view_with_wrong_heading_and_height(localizer):
-    place, yaw_deg = np.array([15.0, -40.0]), 140.0
-    grey = rendered(GROUND, place, (yaw_deg, 10.0, -8.0), 160.0)
-    fix = localizer.locate(View(grey, CAMERA, telemetry(yaw_deg + 5, 10.0, -8.0, 150.0)))
-    assert error_m(localizer, fix, place) < 0.15
-    assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
-    assert fix.agl_m == pytest.approx(160.0, rel=0.002)
-
-
-def test_the_principal_point_need_not_be_the_middle(localizer):
-    camera = replace(CAMERA, cx_px=130.0, cy_px=150.0)
-    fix = located(localizer, (-40.0, 22.0), (250.0, 0.0, 0.0), camera)
-    assert error_m(localizer, fix, (-40.0, 22.0)) < 0.15
-
-
 @pytest.mark.parametrize("yaw_deg", [3.0, pytest.param(125.0, marks=pytest.mark.slow), 257.0])
 def test_unknown_heading(localizer, yaw_deg):
     place = np.array([-60.0, 50.0])
@@ -230,41 +201,6 @@ def test_a_view_is_found_by_tiles_alone(localizer, plain, from_tiles_only):
     fix = localizer.locate(View(grey, CAMERA, reported))
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     assert len(from_tiles_only) > 5
-
-
-@pytest.mark.parametrize("std_m", [5.0, 30.0])
-def test_candidates_from_tiles_lie_within_the_prior(localizer, plain, from_tiles_only, std_m):
-    """Also where the best place near by a tile lies beyond it."""
-    grey, reported, place, _ = plain
-    offset = np.array([60.0, 45.0])
-    localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, place + offset, std_m))
-    grid = localizer.registration.grid
-    x, y = (place + offset - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m]
-    most_px = 3 * std_m / grid.gsd_m + 2.0 * 2**3
-    assert all(max(abs(each.x_px - x), abs(each.y_px - y)) <= most_px for each in from_tiles_only)
-
-
-@pytest.mark.parametrize("confidence, further", [(0.995, False), (0.95, True), (0.005, True)])
-def test_the_search_ends_with_tiles_only_where_the_place_is_confident(
-    localizer, plain, monkeypatch, confidence, further
-):
-    grey, reported, place, _ = plain
-    registration = localizer.registration
-    levels = registration.prepared(View(grey, CAMERA, reported), True).levels
-    directions, asked = [(math.radians(33.0), 0.0)], []
-
-    def steps(search):
-        for made, level, count in ((TileStep, levels.coarse, 20), (FftStep, levels.judged, 8)):
-            asked.append(level)
-            yield made(search, level, directions, count, 1)
-
-    plan = planned(clear_at_judged=ClearMargin(0.5, 1.0, 1.0))
-    monkeypatch.setattr(Search, "steps", steps)
-    monkeypatch.setattr(registration, "plan", plan)
-    monkeypatch.setattr(RegisteredConfidence, "__call__", lambda *_: confidence)
-    fix = localizer.locate(View(grey, CAMERA, reported))
-    assert error_m(localizer, fix, place) < 0.5
-    assert asked == [levels.coarse, levels.judged][: 1 + further]
 
 
 def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(localizer):
@@ -326,14 +262,6 @@ def test_negatives_have_low_confidence(localizer, name, heading_known):
         View(NEGATIVES[name](), CAMERA, reported), heading_known=heading_known
     )
     assert isinstance(outcome, NoFix) or outcome.confidence < 0.5
-
-
-def test_a_narrow_prior_does_not_raise_the_confidence_of_negatives(localizer):
-    """With hardly any place to choose from, a wrong one does not look right."""
-    for place in ((40.0, -25.0), (-100.0, 60.0)):
-        prior = prior_at(localizer, np.array(place), 3.0)
-        outcome = localizer.locate(View(mirrored(place), CAMERA, telemetry(33.0)), prior=prior)
-        assert isinstance(outcome, NoFix) or outcome.confidence < 0.7
 
 
 def same(one, other):
@@ -415,15 +343,6 @@ def test_a_damaged_layer_gives_no_fix(map_path, tmp_path, plain, caplog):
     assert [record.exc_info for record in caplog.records] == [None]  # a line, no traceback
 
 
-def test_a_fix_lies_near_its_prior(localizer, plain):
-    grey, reported, place, free = plain
-    wrong = place + np.array([-180.0, 120.0])
-    fix = localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, wrong, 20.0))
-    if isinstance(fix, Fix):
-        assert np.abs(place_of(localizer, fix) - wrong).max() < 3 * 20.0 + 25.0
-        assert fix.confidence < 0.5 < free.confidence
-
-
 @pytest.mark.parametrize(
     "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.5, 3.0, math.nan)]
 )
@@ -448,9 +367,3 @@ def test_invalid_deviations_are_tolerated(localizer, plain, changes):
     grey, reported, place, _ = plain
     fix = localizer.locate(View(grey, CAMERA, replace(reported, **changes)))
     assert error_m(localizer, fix, place) < 0.5 and 0 <= fix.heading_deg < 360
-
-
-def test_a_strip_of_a_view(localizer):
-    camera = Camera(320, 60, 250.0, 250.0, 160.0, 30.0)
-    fix = located(localizer, (30.0, 30.0), (20.0, 0.0, 0.0), camera)
-    assert error_m(localizer, fix, (30.0, 30.0)) < 0.3

@@ -51,8 +51,7 @@ def tilted(localizer):
         blots = cv2.GaussianBlur(rng.normal(0, 1, grey.shape), (0, 0), 4.0)
         grey += 15 * blots / blots.std() + rng.normal(0, 5, grey.shape)
         reported = Telemetry(
-            *(0, attitude[0] + rng.normal(0, YAW_STD_DEG), 0.0, 0.0),
-            agl_m * rng.normal(1, AGL_STD),
+            *(0, attitude[0] + rng.normal(0, YAW_STD_DEG), 0.0, 0.0), agl_m * rng.normal(1, AGL_STD)
         )
         lat, lon = localizer.sheet.frame.latlon_from_en(place + rng.normal(0, 10, 2))
         prior = Prior(float(lat), float(lon), 20.0)

@@ -7,15 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, Ground, known_map, rendered
+from blots import AGL_M, GROUND, Ground, known_map, place_of, rendered
 
 from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.track import Estimate, ReportedAttitude, Sighting, State
-from orthonav.core.track.model import STATE
 from orthonav.core.track.odometry import OdometryView, displacement
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings.localize import localize_flight, smoothed_track
@@ -87,10 +85,6 @@ def views(
         yield year(grey, rng), telemetry, place
 
 
-def place_of(localizer, fix):
-    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-
-
 def followed(tracker, localizer, seen):
     """Errors in m, confidences, states and fixes of a flight."""
     rows = []
@@ -154,29 +148,6 @@ def test_smoothing_corrects_the_beginning_of_a_flight(localizer):
     assert np.mean(after[:4]) < 6  # 5 deg of pitch are 13 m from 150 m
     with pytest.raises(ValueError, match="smooth=True"):
         Tracker(localizer).smoothed_track()
-
-
-@pytest.mark.parametrize("std_m, whole", [(20.0, False), (40.0, False), (400.0, True)])
-def test_the_search_stays_around_a_reported_start_unless_it_is_as_wide_as_the_map(
-    localizer, monkeypatch, std_m, whole
-):
-    tracker, priors = Tracker(localizer), []
-    search = localizer.registration.search
-
-    def noted(view, prior=None, *others, **named):
-        priors.append(prior)
-        return search(view, prior, *others, **named)
-
-    monkeypatch.setattr(localizer.registration, "search", noted)
-    lat, lon = localizer.sheet.frame.latlon_from_en(np.array([-150.0, -120.0]))
-    prior = Prior(float(lat), float(lon), std_m)
-    rows = []
-    for grey, telemetry, place in views(5):
-        found = tracker.locate(View(grey, WIDE, replace(telemetry, prior=prior)))
-        rows.append(np.hypot(*(place_of(localizer, found) - place)))
-    assert (priors[0] is None) == whole and max(rows) < 15
-    speed = found.evidence["vel_std_mps"]
-    assert 0 < speed < 30
 
 
 def out_and_back():
@@ -279,20 +250,6 @@ def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, tracking,
     assert max(row[1] for row in rows) <= 0.8
 
 
-def test_a_reported_start_needs_no_search(localizer):
-    lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
-    start = Prior(float(lat), float(lon), 15.0)
-    seen = [
-        (g, replace(t, prior=start if not n else None), p) for n, (g, t, p) in enumerate(views(10))
-    ]
-    rows = followed(Tracker(localizer), localizer, seen)
-    assert rows[0][0] < 15 and rows[0][1] == pytest.approx(0.8)
-    assert rows[-1][1] > 0.9 and rows[-1][2] == "tracking"
-    unused = Tracker(localizer, use_prior=False)
-    followed(unused, localizer, seen[:1])
-    assert all(each.parent == -1 for each in unused.mixture.hypotheses)
-
-
 def test_unknown_heading_is_tracked(localizer):
     seen = [(g, replace(t, yaw_deg=math.nan), p) for g, t, p in views(8)]
     rows = followed(Tracker(localizer, heading_known=False), localizer, seen)
@@ -366,21 +323,6 @@ def test_odometry_measures_the_displacement(moved, expected):
     assert 0 < seen.overlap < 1
 
 
-def test_odometry_refuses_views_without_common_ground():
-    telemetry = Telemetry(0, 0.0, 0.0, 0.0, AGL_M)
-    first = OdometryView.of(
-        View(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, telemetry), None
-    )
-    later = replace(telemetry, time_ns=2 * 10**9)
-    other = rendered(OTHER, (0, 0), (0, 0, 0), AGL_M, WIDE)
-    second = OdometryView.of(View(other, WIDE, later), first.pixel_m)
-    assert displacement(first, second, 0.01, np.array([1e-3, 4e-4])) is None
-    nan = OdometryView.of(View(other, WIDE, replace(later, yaw_deg=math.nan)), first.pixel_m)
-    assert displacement(first, nan, 0.01, np.array([1e-3, 4e-4])) is None
-    blank = OdometryView.of(View(np.full((240, 320), 90, np.uint8), WIDE, later), first.pixel_m)
-    assert blank is None or displacement(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
-
-
 @pytest.mark.long
 def test_a_fixed_lag_uses_the_views_after_each(localizer, usual):
     seen, whole, _ = usual
@@ -416,48 +358,6 @@ def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
     assert evidence["pitch_bias_std_deg"] < 1.5
     assert rows[-1][3].pitch_deg == pytest.approx(5.0, abs=1.0)
     assert rows[2][3].pitch_deg == pytest.approx(5.0, abs=2.0)
-
-
-@pytest.mark.long
-def test_a_wrong_place_found_after_a_loss_does_not_bias_the_search(localizer):
-    """Heading and height of a wrong place must not keep the true one from being found."""
-    tracker, seen = Tracker(localizer), list(views(22, year=lit))
-    followed(tracker, localizer, seen[:8])
-    assert tracker.state is State.TRACKING
-    wrong = np.array([170.0, 150.0, math.radians(14.0), 0.15, 0.0, 0.0])
-    spread = np.diag([4.0, 4.0, 1e-3, 1e-4, 1e-3, 1e-3])
-    states = []
-    for _, telemetry, _ in seen[8:11]:
-        tracker.passed(telemetry, NoFix("too_dark", "no picture"))
-        tracker.mixture.update(
-            ReportedAttitude(None, 0.0, 0.0), [Sighting(wrong, spread, 2.0, 0.05)]
-        )
-        states.append(tracker.mixture.estimate(15.0))
-    assert states[-1].belief > 0.9
-    assert np.hypot(*(states[-1].mean[:2] - wrong[:2])) < 20
-    rows = followed(tracker, localizer, seen[11:])
-    assert all(row[0] < 10 for row in rows if row[2] == "tracking")
-    assert rows[-1][2] == "tracking"
-
-
-@pytest.mark.parametrize(
-    ("state", "std_m", "confirms"),
-    [
-        (State.COASTING, 5.0, True),
-        (State.COASTING, 12.0, False),
-        (State.SEARCHING, 5.0, False),
-    ],
-)
-def test_exact_dead_reckoning_of_a_confirmed_track_is_confirmed_around_it(
-    localizer, state, std_m, confirms
-):
-    """Elsewhere only places that competed with the whole map confirm a track."""
-    covariance = np.eye(STATE) * std_m**2
-    expected = Estimate(np.zeros(STATE), covariance, 0.7, state, 0.5, 0.0, False, followed=True)
-    tracker = Tracker(localizer)
-    whole, around = (tracker._search_area(expected, whole_map=each) for each in (True, False))
-    assert whole == (None, True)
-    assert around.circle is not None and around.confirms is confirms
 
 
 @pytest.mark.long

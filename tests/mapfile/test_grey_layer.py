@@ -1,7 +1,6 @@
 """Windows of the registration layer are read right, from no more than is needed, or refused."""
 
 import dataclasses
-import tracemalloc
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -13,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from maps import arrays, manifest, put_together, taken_apart
 
-from helpers import textured
+from helpers import memory_below, textured
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
@@ -314,14 +313,11 @@ JPEGS = {
 def test_a_chunk_that_is_no_grey_jpeg_of_its_size(made, tmp_path, jpeg):
     info, parts = made
     layer = GreyLayer.of(write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, jpeg=jpeg)))
-    tracemalloc.start()
-    try:
-        with pytest.raises(MapFileError, match=r"damaged \(level 0, chunk 0, 2: .*odd.onav"):
-            layer.read(0, 0, 130, 10, 10)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 1e6
+    with (
+        memory_below(1e6),
+        pytest.raises(MapFileError, match=r"damaged \(level 0, chunk 0, 2: .*odd.onav"),
+    ):
+        layer.read(0, 0, 130, 10, 10)
     assert layer.read(0, 0, 64, 20, 20)[0].any()  # the others can still be read
 
 
@@ -340,14 +336,11 @@ MASKS = {
 def test_a_mask_that_is_none(made, tmp_path, mask):
     info, parts = made
     layer = GreyLayer.of(write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, mask=mask)))
-    tracemalloc.start()
-    try:
-        with pytest.raises(MapFileError, match=r"damaged \(level 0, chunk 0, 2: mask"):
-            layer.read(0, 0, 130, 10, 10)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 1e6
+    with (
+        memory_below(1e6),
+        pytest.raises(MapFileError, match=r"damaged \(level 0, chunk 0, 2: mask"),
+    ):
+        layer.read(0, 0, 130, 10, 10)
 
 
 @settings(max_examples=200)

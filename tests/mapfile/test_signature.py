@@ -337,10 +337,3 @@ def test_a_signature_cut_short(path, keys, share):
     data = signature_path(path).read_bytes().rstrip()
     signature_path(path).write_bytes(data[: int(share * len(data))])
     refused(path, keys, "signature of the map is broken")
-
-
-@pytest.mark.parametrize("junk", [b"", b"\xff" * 40, b"\x08" + bytes(7) + b"[[[[[[[[" * 9])
-def test_a_digest_of_what_is_no_map(tmp_path, junk):
-    (tmp_path / "a.onav").write_bytes(junk)
-    with pytest.raises(MapFileError, match=r"a\.onav"):
-        map_digest(tmp_path / "a.onav")

@@ -9,7 +9,6 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import Affine
@@ -17,12 +16,9 @@ from rasterio.transform import Affine
 from helpers import textured
 from orthonav.core.errors import ImageryError, OutputError
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
-from orthonav.core.tiles.represent import Gray
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.calibrate import CropSampler, RegistrationCalibration
-from orthonav.ground.build.sheet import AHEAD, SheetPictures, SheetReader, grid_of, in_order
-from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.area import Area
+from orthonav.ground.build.calibrate import RegistrationCalibration
+from orthonav.ground.build.sheet import AHEAD, SheetReader, in_order
 
 BLOCKS = 9
 SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
@@ -109,36 +105,6 @@ def test_an_interrupted_build_resumes(ortho, tmp_path, reads, names_in, workers,
     assert names_in(out.parent) == ["map.onav"]
 
 
-def test_images_for_networks_are_cached_too(ortho, tmp_path, reads):
-    mosaic = Mosaic.open([ortho])
-    outline = mosaic.outline_latlon_deg
-    area = Area.from_outline(outline[:, 0], outline[:, 1])
-    grid = grid_of(area, mosaic.gsd_m, None, 64, 0.75)
-
-    def read(workers, kept_in=None, stop=2.0):
-        def report(stage, share):
-            if share > stop:
-                raise KeyboardInterrupt
-
-        pictures = SheetPictures(grid, Gray())
-        sampler = CropSampler(64, 0)
-        reader = SheetReader(
-            mosaic, area, grid, Gray(), sampler, registration=False, pictures=pictures
-        )
-        with reader.block_cache(tmp_path / "beside", kept_in) as kept:
-            reader.read(report, workers, kept)
-        tiles = pictures.tiles(np.array([[0, 0], [100, 130], [200, 201]]))
-        return tiles.batch(np.arange(3)), len(sampler.crops)
-
-    whole, crops = read(1)
-    with pytest.raises(KeyboardInterrupt):
-        read(2, tmp_path / "kept", 0.5)
-    reads.clear()
-    again = read(3, tmp_path / "kept")
-    np.testing.assert_array_equal(again[0], whole)
-    assert again[1] == crops > 0 and 0 < len(reads) < 30
-
-
 KILLED = """
     import os, signal, sys
     from pathlib import Path
@@ -165,21 +131,13 @@ def test_a_killed_build_resumes(ortho, tmp_path, reads, names_in, whole):
     assert names_in(tmp_path) == ["killed.onav"]
 
 
-CHANGES = {
-    "seed": {"seed": 1},
-    "edges": {"edges": "gray", "registration": False},
-    "tiles": {"tile_px": 96},
-}
-
-
 @pytest.mark.parametrize(
     "change",
     [
-        CHANGES["seed"],
-        pytest.param(CHANGES["edges"], marks=pytest.mark.slow),
-        pytest.param(CHANGES["tiles"], marks=pytest.mark.slow),
+        {"seed": 1},
+        pytest.param({"edges": "gray", "registration": False}, marks=pytest.mark.slow),
+        pytest.param({"tile_px": 96}, marks=pytest.mark.slow),
     ],
-    ids=CHANGES.keys(),
 )
 def test_another_request_uses_nothing(ortho, tmp_path, reads, names_in, change):
     whole = built(ortho, tmp_path / "whole.onav", **change)
@@ -279,22 +237,6 @@ def test_too_little_disk_space_is_an_error_before_reading(ortho, tmp_path, monke
     assert not reads and not any(tmp_path.iterdir())
 
 
-@contextmanager
-def worker(log=None):
-    if log is not None:
-        log.append(threading.get_ident())
-    yield lambda item: item * item
-
-
-@pytest.mark.parametrize("workers", [1, 2, 7, 100])
-@pytest.mark.parametrize("count", [0, 1, 2, 50])
-def test_results_come_in_order(workers, count):
-    log = []
-    found = list(in_order(range(count), lambda: worker(log), workers))
-    assert found == [item * item for item in range(count)]
-    assert len(set(log)) == len(log) <= max(1, min(workers, count))
-
-
 @pytest.mark.parametrize("workers", [1, 3])
 def test_the_first_error_is_raised_and_no_thread_stays(workers):
     before = threading.active_count()
@@ -313,36 +255,3 @@ def test_the_first_error_is_raised_and_no_thread_stays(workers):
         for item in in_order(range(20), failing, workers):
             found.append(item)
     assert found == list(range(7)) and threading.active_count() == before
-
-
-@pytest.mark.parametrize("workers", [1, 3])
-def test_a_worker_that_cannot_begin(workers):
-    @contextmanager
-    def broken():
-        raise ImageryError("cannot open")
-        yield
-
-    with pytest.raises(ImageryError, match="cannot open"):
-        list(in_order(range(5), broken, workers))
-
-
-def test_memory_of_cells_is_that_of_what_is_written():
-    """A corridor across a large box: only its pages are there."""
-    code = """
-        import numpy as np
-        from orthonav.core.tiles.cells import CellLayout
-        from orthonav.core.tiles.whitened import CellSheet
-
-        sheet = CellSheet(CellLayout(8, 8), 40_000, 40_000, 7)
-        part = np.ones((128, 128, 7), np.float32), np.ones((128, 128), np.float32)
-        for at in range(0, 39_000, 1024):
-            sheet.put(at, at, *part)
-        tiles = np.array([[at, at] for at in range(0, 39_000, 1024)])
-        assert sheet.valid_share(tiles).min() > 0.9 and sheet.means.nbytes > 6e8
-        from pathlib import Path
-        print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True
-    )
-    assert int(done.stdout) < 300_000

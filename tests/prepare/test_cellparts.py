@@ -12,7 +12,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.represent import OrientedGradients
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.layer import StoredCells, cell_parts
 
@@ -51,15 +51,6 @@ def test_means_come_back_as_they_were(cells):
     assert ((share == 1) == (cells.valid == 1)).all() and (share[:10, :10] == 0).all()
 
 
-def test_tiles_are_embedded_as_from_the_imagery(cells):
-    tiles_px = np.mgrid[:6, :5].reshape(2, -1).T * 32
-    embedder = learn(WhitenedRecipe(dims=16), cells, tiles_px)
-    again = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 7)
-    again.put(0, 0, *stored(cells).read(0, 0, *cells.valid.shape))
-    alike = embedder.tiles(cells, tiles_px).astype(float) * embedder.tiles(again, tiles_px)
-    assert alike.sum(axis=1).min() > 0.999
-
-
 def test_windows_may_reach_beyond_the_sheet(cells):
     found = stored(cells)
     rows, cols = cells.valid.shape
@@ -70,16 +61,6 @@ def test_windows_may_reach_beyond_the_sheet(cells):
     for outside in ((-9, 0, 4, 4), (0, cols, 4, 4), (0, 0, 0, 0)):
         means, share = found.read(*outside)
         assert means.shape == (*outside[2:], 7) and not means.any() and not share.any()
-
-
-def test_shares_are_stored_only_for_incomplete_cells(cells):
-    assert set(cell_parts(cells)) == {f"sheet0/cells/{n}" for n in ("codes", "scale", "valid")}
-    whole = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 7)
-    whole.valid[:] = 1
-    parts = cell_parts(whole)
-    assert set(parts) == {"sheet0/cells/codes", "sheet0/cells/scale"}
-    means, share = stored(whole).read(0, 0, 4, 4)
-    assert (share == 1).all() and not means.any()
 
 
 @pytest.mark.parametrize("name", ["codes", "scale", "valid"])

@@ -1,20 +1,17 @@
 """The registration layer as built: the pyramid is exact, however its blocks come, and small."""
 
-import tracemalloc
-
 import cv2
 import numpy as np
 import pytest
 
 from helpers import textured
 from orthonav.core.mapfile import GreyLayer, open_map
-from orthonav.core.mapfile.layer import ChunkTable, decode_chunk, part_names
+from orthonav.core.mapfile.layer import part_names
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.layer import (
     CHUNK_PX,
     MAX_BYTES_PER_PX,
     GreyLayerWriter,
-    encode_chunk,
     halved,
 )
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -83,28 +80,6 @@ def test_halving(shape):
             np.testing.assert_array_equal(found, wanted)
 
 
-def test_each_level_is_half_the_one_before():
-    grey, valid = holes((150, 237))
-    info, parts = written(grey, valid, chunk_px=32, steps=(50, 70))
-    table = ChunkTable(150, 237, info.levels, 32)
-    level_grey, level_valid, expected = grey, valid, []
-    for level in range(info.levels):
-        assert table.shapes[level] == level_grey.shape
-        for row in range(0, level_grey.shape[0], 32):
-            for col in range(0, level_grey.shape[1], 32):
-                part = np.s_[row : row + 32, col : col + 32]
-                some = level_valid[part].any()
-                blobs = encode_chunk(level_grey[part], level_valid[part]) if some else (b"", b"")
-                expected.append(blobs)
-        level_grey, level_valid = naively_halved(level_grey, level_valid)
-    assert len(expected) == table.count and info.valid_px == valid.sum()
-    assert parts[NAMES["bytes"]].tobytes() == b"".join(jpeg for jpeg, _ in expected)
-    assert parts[NAMES["mask_bytes"]].tobytes() == b"".join(mask for _, mask in expected)
-    lengths = [[len(blob) for blob in blobs] for blobs in zip(*expected, strict=True)]
-    assert np.diff(parts[NAMES["offsets"]]).tolist() == lengths[0]
-    assert np.diff(parts[NAMES["mask_offsets"]]).tolist() == lengths[1]
-
-
 @pytest.mark.parametrize("steps", [(32, 32), (64, 128), (1, 237), (150, 5), (33, 47), (100, 100)])
 def test_how_the_blocks_come_does_not_matter(steps):
     grey, valid = holes((150, 237))
@@ -115,21 +90,6 @@ def test_how_the_blocks_come_does_not_matter(steps):
         for name, part in parts.items():
             assert part.dtype == other[name].dtype
             np.testing.assert_array_equal(part, other[name])
-
-
-def test_a_chunk_without_a_hole_has_no_mask_and_holes_cost_no_ringing():
-    grey = textured((64, 64))
-    full = np.ones((64, 64), bool)
-    jpeg, mask = encode_chunk(grey, full)
-    assert mask == b"" and len(jpeg) > 500
-    hole = full.copy()
-    hole[:, 32:] = False
-    half, mask = encode_chunk(np.where(hole, grey, 0).astype(np.uint8), hole)
-    assert 0 < len(mask) < 40 and len(half) < 0.75 * len(jpeg)
-    decoded, valid = decode_chunk(*(np.frombuffer(b, np.uint8) for b in (half, mask)), (64, 64))
-    np.testing.assert_array_equal(valid, hole)
-    assert (decoded[~hole] == 0).all()
-    assert np.abs(decoded[:, 24:32].astype(int) - grey[:, 24:32]).mean() < 6
 
 
 def noise(kind, shape=(700, 600)):
@@ -149,22 +109,6 @@ def test_noise_cannot_make_it_large(kind):
     assert total_bytes(parts) < 4 / 3 * MAX_BYTES_PER_PX * grey.size
     holed = written(grey, np.random.default_rng(1).random(grey.shape) < 0.7)[1]
     assert total_bytes(holed) < 0.8 * grey.size
-
-
-def test_memory_does_not_grow_with_the_sheet():
-    def peak(rows):
-        writer = GreyLayerWriter(rows, 1024)
-        grey, valid = np.full((200, 1024), 99, np.uint8), np.ones((200, 1024), bool)
-        tracemalloc.start()
-        try:
-            for row in range(0, rows, 200):
-                writer.add(row, 0, grey[: rows - row], valid[: rows - row])
-            return tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-
-    small, large = peak(2048), peak(8192)
-    assert large < 1.4 * small < 4e6
 
 
 @pytest.fixture(scope="module")

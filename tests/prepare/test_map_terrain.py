@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -206,18 +205,6 @@ def test_import_writes_heights_above_ground(run, flown, dem, tmp_path):
     assert [row["home_m"] for row in before] == [row["home_m"] for row in after]
     note = json.loads((tmp_path / "imported/flight.json").read_text())["note"]
     assert "above sea level minus the terrain of hill.tif" in note
-
-
-def test_views_over_holes_have_no_height(run, flown, frame, tmp_path):
-    path = write_dem(
-        tmp_path / "holes.tif", frame, hill,
-        change=lambda heights: np.where(np.arange(heights.shape[1]) > 62, -9999, heights),
-    )  # fmt: skip
-    done = run("import", flown, "--dem", path, "--dem-datum", "msl", "--out", tmp_path / "imported")
-    found = [row["agl_m"] for row in rows(tmp_path / "imported")]
-    unknown = sum(math.isnan(float(each)) for each in found)
-    assert 0 < unknown < len(found)
-    assert f"{unknown} views have no height above ground" in done.err
 
 
 def test_an_unknown_place_of_take_off_is_not_taken_for_level_ground(run, flown, frame, tmp_path):

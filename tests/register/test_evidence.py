@@ -5,12 +5,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.register.channels import (
-    COARSE,
-    FINE,
-    GROUPS,
-    channels_of,
-)
+from orthonav.core.register.channels import COARSE, FINE, GROUPS, channels_of
 
 RECIPES = {"fine": FINE, "coarse": COARSE}
 GRADIENT, GREY = GROUPS
@@ -44,28 +39,12 @@ def with_holes(shape):
     return frozen(valid)
 
 
-def alike(one, other):
-    """Correlation of two arrays whose mean means nothing."""
-    return float((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum()))
-
-
 @pytest.mark.parametrize("offset", [-40, 25, 60])
 def test_brightness_changes_nothing(recipe, offset):
     grey = soft()
     brighter = (grey.astype(int) + offset).astype(np.uint8)
     plain, other = (channels_of(each, everywhere(grey), recipe) for each in (grey, brighter))
     np.testing.assert_allclose(other, plain, atol=2e-3)
-
-
-@pytest.mark.parametrize("gain", [0.4, 0.7, 1.6])
-def test_contrast_changes_next_to_nothing(recipe, gain):
-    grey = soft()
-    stretched = np.rint((grey.astype(float) - 128) * gain + 128).astype(np.uint8)
-    plain, other = (channels_of(each, everywhere(grey), recipe) for each in (grey, stretched))
-    for group in GROUPS:
-        assert alike(plain[..., group], other[..., group]) > 0.985
-        powers = [(each[..., group] ** 2).sum() for each in (plain, other)]
-        assert 0.55 < powers[1] / powers[0] < 1.6
 
 
 def test_the_sign_of_contrast_is_seen_by_grey_only(recipe):
@@ -87,18 +66,6 @@ def test_gradients_turn_with_the_picture(recipe, quarters):
     np.testing.assert_allclose(turned, plain * sign, atol=2e-3)
 
 
-def test_a_bright_roof_says_no_more_than_its_surroundings():
-    """An edge ten times as strong as the others does not count ten times."""
-    grey = soft((160, 160)).copy()
-    plain = channels_of(grey, everywhere(grey))
-    grey[60:100, 60:100] = 250
-    roof = channels_of(grey, everywhere(grey))
-    assert np.hypot(*np.moveaxis(roof[..., GRADIENT], -1, 0)).max() < 1
-    strongest = np.hypot(*np.moveaxis(plain[..., GRADIENT], -1, 0)).max()
-    assert np.hypot(*np.moveaxis(roof[..., GRADIENT], -1, 0)).max() < 1.6 * strongest
-    assert np.abs(roof[..., GREY]).max() <= 3.0
-
-
 def test_what_is_not_valid_is_zero(recipe):
     valid = with_holes((120, 150))
     out = channels_of(soft(), valid, recipe)
@@ -117,40 +84,3 @@ def test_pixels_that_are_not_valid_do_not_leak(recipe, paint):
     assert (
         channels_of(painted, valid, recipe).tobytes() == channels_of(grey, valid, recipe).tobytes()
     )
-
-
-def test_holes_change_little_beside_them(recipe):
-    """What counts beside a hole is what it would be without it, so a cut view still fits."""
-    grey, valid = soft(), with_holes((120, 150))
-    holed, whole = channels_of(grey, valid, recipe), channels_of(grey, everywhere(grey), recipe)
-    counts = holed[..., 3] > 0
-    for group in GROUPS:
-        assert alike(holed[counts][:, group], whole[counts][:, group]) > 0.97
-
-
-def test_the_border_of_what_is_valid_is_no_edge(recipe):
-    valid = np.zeros((64, 64), bool)
-    valid[20:, 20:] = True
-    grey = np.where(valid, 200, 0).astype(np.uint8)
-    assert np.abs(channels_of(grey, valid, recipe)[..., :3]).max() < 1e-3
-
-
-def test_a_pixel_reaches_no_farther_than_the_margin(recipe):
-    reach = recipe.margin_px
-    side = 2 * reach + 41
-    grey = soft((side, side)).copy()
-    before = channels_of(grey, everywhere(grey), recipe)
-    middle = side // 2
-    grey[middle, middle] = 255 - grey[middle, middle]
-    grey[middle, middle + 1] = 0
-    changed = np.abs(channels_of(grey, everywhere(grey), recipe) - before).max(axis=-1)
-    changed[middle - reach : middle + reach + 1, middle - reach : middle + reach + 2] = 0
-    assert changed.max() < 1e-5
-
-
-@pytest.mark.parametrize("shape", [(8, 8), (5, 60)])
-def test_pictures_smaller_than_the_windows(recipe, shape):
-    """The windows shrink: what remains is still evidence, not only zeros."""
-    grey = soft(shape)
-    out = channels_of(grey, everywhere(grey), recipe)
-    assert np.abs(out[..., GRADIENT]).max() > 0.1 and np.abs(out[..., GREY]).max() > 0.1

@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import Ground, random_poses, reference_of, templates_of
-from test_place import VIEW_PX
+from scenes import Ground, random_poses, reference_of
 from test_refine import GROUND, HOLES, REACH_PX, SHAPE, errors, moved, noisy, normalized_squares
 
 from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.refine import Refiner
-from orthonav.core.register.search import SearchWindows, search
+from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.window import Reference
 
 
@@ -71,18 +70,6 @@ def test_where_the_ground_runs_in_one_direction_the_covariance_covers_the_errors
         off.append(errors(placed, pose))
         covariances.append(placed.covariance)
     assert normalized_squares(np.array(off), np.array(covariances)).mean() < 3.5
-
-
-@pytest.mark.parametrize("reach_px", [2e3, 1e6, math.inf])
-@pytest.mark.parametrize("centre", [(200.0, 170.0), (-1500.0, 100.0)])
-def test_a_part_is_no_larger_than_the_sheet_and_a_view_around_it(reach_px, centre):
-    reference = reference_of(GROUND, SHAPE)
-    window = SearchWindows(reference).part(1, FINE, VIEW_PX, centre, reach_px)
-    rows, cols = reference.shape(1)
-    assert window.height <= rows + 2 * VIEW_PX + 8 and window.width <= cols + 2 * VIEW_PX + 8
-    pose = Pose(150.0, 120.0, 0.2, 0.0)
-    best = search(templates_of(GROUND, pose).at(1), window, [(0.2, 0.0)], 1)[0]
-    assert math.hypot(best.pose.x_px - 150, best.pose.y_px - 120) < 1
 
 
 def test_threads_may_ask_for_windows_of_many_sizes():

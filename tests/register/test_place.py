@@ -6,21 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import (
-    Ground,
-    apart_px,
-    as_grey,
-    random_poses,
-    reference_of,
-    seen,
-    templates_of,
-    turned_rad,
-)
+from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-import orthonav.core.localize.place as place_module
-from orthonav.core.localize.place import EXCLUSION_SHARE, MAX_RATIO, MIN_HOPEFUL, Placer
+from orthonav.core.localize.place import Placer
 from orthonav.core.register.pose import Pose, PosePrior
-from orthonav.core.register.refine import Refiner
 from orthonav.core.register.search import SearchWindows, bank, search
 from orthonav.core.register.template import Levels, ViewTemplates
 
@@ -109,17 +98,6 @@ def test_a_place_that_is_there_twice_is_not_sure():
     assert found.fit.weighted > 0.9  # however well it fits
 
 
-def test_a_place_that_is_there_almost_twice_lowers_the_confidence():
-    ratios = []
-    for share in (0.0, 1.0):
-        twin = Twin(other=Ground(seed=7), share=share)
-        reference = reference_of(twin, SHAPE)
-        found = registered(reference, templates_of(GROUND, ONE), prior_of(ONE))
-        assert share == 0 or apart_px(found.pose, ONE) < 0.1
-        ratios.append(found.scores["peak_ratio"])
-    assert ratios[0] + 0.4 < ratios[1]
-
-
 @pytest.mark.parametrize("turn_deg", [25.0, -25.0])
 def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
     """The twin is turned: the reported heading decides between them."""
@@ -140,26 +118,6 @@ def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
         ratios.append(found.scores["peak_ratio"])
     assert min(ratios[:2]) > ratios[2] >= 0.99
     assert found_with(NO_PRIOR).scores["peak_ratio"] == pytest.approx(1, abs=0.05)
-
-
-@pytest.fixture
-def placer(reference):
-    return Placer(templates_of(GROUND, HERE), LEVELS, prior_of(HERE), reference)
-
-
-def test_what_lies_beside_the_best_is_no_rival(placer):
-    """Candidates closer than a quarter of the view are the same place."""
-    close = [near(HERE, *away) for away in ((0, 0), (1.5, 1), (15, 3), (-4, -16))]
-    assert math.hypot(4, 16) < EXCLUSION_SHARE * VIEW_PX - 8
-    alone = verified(placer, close, LEVELS.judged).scores
-    assert alone["rival"] == alone["look_rival"] == 0 and alone["candidates"] == 4
-    assert alone["peak_ratio"] == alone["look_ratio"] == MAX_RATIO
-    further = verified(placer, [*close, near(HERE, 90.0, 60.0)], LEVELS.judged).scores
-    assert further["rival"] > 0 and further["look_rival"] > 0 and further["peak_ratio"] > 1.8
-
-
-def test_without_candidates_there_is_no_place(placer):
-    assert placer.judge([], LEVELS.judged) == placer.judge([], LEVELS.coarse) == []
 
 
 def test_a_view_of_elsewhere_stands_out_nowhere(reference):
@@ -183,45 +141,6 @@ def test_blank_views_and_blank_maps_are_no_crash(reference, grey):
         assert math.isfinite(found.scores["peak_ratio"] + found.scores["look_ratio"])
 
 
-def test_two_searches_know_of_each_others_rivals():
-    """Each search found one of the twins: together neither is confident."""
-    placer = Placer(templates_of(GROUND, ONE), LEVELS, prior_of(ONE), reference_of(Twin(), SHAPE))
-    searches = [placer.judge([each], LEVELS.judged) for each in (ONE, SAME_AGAIN)]
-    for places in searches:
-        alone = placer.finished(places, 1).scores
-        assert alone["rival"] == alone["look_rival"] == 0 and alone["candidates"] == 1
-        assert placer.standing(places)[1] == 0
-    both = placer.finished(searches[0] + searches[1], 2).scores
-    assert both["candidates"] == 2
-    assert [both["peak_ratio"], both["look_ratio"]] == pytest.approx([1, 1], abs=0.05)
-    best, rival = placer.standing(searches[0] + searches[1])
-    assert best == pytest.approx(max(each[0].judged.score for each in searches), abs=0.01)
-    assert rival == pytest.approx(best, rel=0.05)
-
-
-def test_a_place_found_at_the_final_level_competes_with_the_judged_ones(placer):
-    places = placer.judge([near(HERE, 90.0, -40.0), near(HERE, -60.0, 80.0)], LEVELS.judged)
-    missed = placer.finished(places, 2)
-    assert apart_px(missed.pose, HERE) > 30
-    found = placer.finished(places, 3, placer.direct([near(HERE, 0.5)]))
-    assert apart_px(found.pose, HERE) < 0.3
-    assert found.scores["rival"] == missed.score
-    assert found.scores["look_rival"] == missed.scores["look"]
-
-
-def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(placer, monkeypatch):
-    rng = np.random.default_rng(0)
-    away = [near(HERE, *rng.uniform(60, 150, 2) * rng.choice([-1, 1], 2)) for _ in range(20)]
-    judged = placer.judge([*away, near(HERE, 2.0)], LEVELS.judged)
-    assert len(judged) == 21 and apart_px(judged[0].pose, HERE) < 0.3
-    scores = [each.judged.score - placer.prior.cost(each.pose) for each in judged]
-    assert scores == sorted(scores, reverse=True)
-    monkeypatch.setattr(place_module, "KEPT_TO_JUDGED", 8)
-    coarser = placer.judge([*away, near(HERE, 2.0)], LEVELS.coarse)
-    assert MIN_HOPEFUL <= len(coarser) <= 8
-    assert apart_px(coarser[0].pose, HERE) < 0.3
-
-
 def test_threads_may_share_a_sheet(reference):
     poses = random_poses(4, SHAPE, 90, seed=3, log_scale=0.05)
     alone = [registered(reference, templates_of(GROUND, pose), prior_of(pose)) for pose in poses]
@@ -233,69 +152,3 @@ def test_threads_may_share_a_sheet(reference):
         for one, other in zip(alone, shared, strict=True):
             assert one.scores == other.scores or str(one.scores) == str(other.scores)
             assert one.pose == other.pose
-
-
-class FineTwin:
-    """Two places that only fine detail tells apart: the right half has another one.
-
-    `changed`: amplitude of what changed at the place itself and not at its twin, coarsely.
-    """
-
-    def __init__(self, changed=0.0):
-        self.changed = changed
-        self.coarse = Ground(seed=1, px=(24, 80), contrast=22.0)
-        self.other = Ground(seed=4, px=(24, 80), contrast=22.0)
-        self.here, self.there = (
-            Ground(seed=seed, px=(6, 9), contrast=14.0, waves=200) for seed in (2, 3)
-        )
-
-    def view(self, x, y):
-        return self.coarse(x, y) + self.here(x, y) - 128
-
-    def __call__(self, x, y):
-        x, y = np.broadcast_arrays(x, y)
-        here = self.view(x, y) + self.changed * (self.other(x, y) - 128)
-        again = self.coarse(x - 384, y) + self.there(x, y) - 128
-        return np.where(x < 384, here, again)
-
-
-class FinerPlacer(Placer):
-    """Scores one level finer by the whole picture, `finer`."""
-
-    def _finer_score(self, place):
-        return self.finer.place(place.fit.pose, 2).score
-
-
-def twins(changed):
-    """Without and with one level finer: the best place of a view of `FineTwin`; and its pose."""
-    reference = reference_of(FineTwin(changed), (384, 768), levels=4)
-    pose, twin = Pose(190.0, 190.0, 0.2, 0.0), Pose(190.0 + 384, 190.0, 0.2, 0.0)
-    shape = (192, 224)
-    grey = as_grey(seen(FineTwin().view, pose, shape))
-    halves = grey.reshape(96, 2, 112, 2).mean(axis=(1, 3))
-    templates = ViewTemplates(as_grey(halves), np.ones((96, 112), bool), 1)
-    levels = Levels.of(math.sqrt(192 * 224), 4)
-    assert levels.final == 1
-    placer = FinerPlacer(templates, levels, prior_of(pose), reference)
-    placer.finer = Refiner(ViewTemplates(grey, np.ones(shape, bool), 0).at(0), reference)
-    candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
-    found, deep = (verified(placer, candidates, levels.judged, finer=f) for f in (False, True))
-    return found, deep, pose
-
-
-@pytest.mark.long
-def test_one_finer_level_tells_what_coarser_ones_cannot():
-    found, deep, pose = twins(changed=0.0)
-    assert apart_px(deep.pose, pose) < 0.3 and deep.fit.covariance is not None
-    assert math.isnan(found.fine) and deep.fine > deep.score and deep.scores["fine_rival"] > 0
-    assert deep.fine / deep.scores["fine_rival"] > found.scores["peak_ratio"] + 0.1
-
-
-@pytest.mark.long
-def test_the_finer_level_sets_right_what_coarser_ones_take_for_its_twin():
-    found, deep, pose = twins(changed=0.9)
-    assert apart_px(found.pose, pose) > 300
-    assert apart_px(deep.pose, pose) < 0.5 and deep.fine > deep.scores["fine_rival"]
-    # It does not hide that the coarser levels speak for another place, nor do its alternatives.
-    assert deep.scores["peak_ratio"] < 1 and deep.scores["look_ratio"] < 1
-    assert all(each.score <= deep.score for each in deep.rivals)

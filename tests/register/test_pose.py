@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.register.pose import NAT_SCORE, Pose, PosePrior
+from orthonav.core.register.pose import Pose
 
 poses = st.builds(
     Pose,
@@ -44,27 +44,3 @@ def test_a_step_is_undone_by_the_inverse_of_its_similarity(pose, step):
     stepped = point + small[:2] + turn * np.array([-point[1], point[0]]) + grow * point
     back = pose.stepped(small).map_px(stepped)
     np.testing.assert_allclose(back, pose.map_px(point), atol=1e-4)
-
-
-def test_a_step_of_a_bank_is_as_likely_as_the_likeliest_within_it():
-    prior = PosePrior(1.0, 0.2, 0.1)
-    assert prior.nats(1.3, 0.2) == pytest.approx(1.5**2 / 2 + 2)
-    assert prior.nats(1.3, 0.2, within=(0.1, 0.05)) == pytest.approx(1 / 2 + 1.5**2 / 2)
-    assert prior.nats(0.95, -0.04, within=(0.1, 0.05)) == 0
-    assert prior.nats(1.3, 0.2) == prior.cost(Pose(0.0, 0.0, 1.3, 0.2)) / NAT_SCORE
-
-
-def test_the_cost_of_being_unlikely():
-    prior = PosePrior(math.radians(170.0), math.radians(10.0), 0.1)
-    assert prior.cost(Pose(3.0, 4.0, math.radians(170.0), 0.0)) == 0
-    # Across south it is 20 degrees, not 340; a deviation twice as far costs four times as much.
-    across = prior.cost(Pose(0.0, 0.0, math.radians(-170.0), 0.0))
-    assert across == pytest.approx(prior.cost(Pose(0.0, 0.0, math.radians(150.0), 0.0)))
-    assert across == pytest.approx(4 * prior.cost(Pose(0.0, 0.0, math.radians(160.0), 0.0)))
-    assert across == pytest.approx(prior.cost(Pose(0.0, 0.0, math.radians(170.0), -0.2)))
-    both = prior.cost(Pose(0.0, 0.0, math.radians(190.0), 0.2))
-    assert both == pytest.approx(2 * across)
-    unknown = PosePrior(None, 1.0, 0.1)
-    assert unknown.cost(Pose(0.0, 0.0, 2.0, 0.0)) == 0 < unknown.cost(Pose(0.0, 0.0, 2.0, 0.1))
-    exact = PosePrior(0.0, 0.0, 0.0)
-    assert math.isfinite(exact.cost(Pose(0.0, 0.0, 1.0, 1.0)))

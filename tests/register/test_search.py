@@ -1,37 +1,21 @@
 """Views are found where they were cut, under any heading, or nothing is claimed."""
 
 import math
-from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
-from scenes import (
-    Ground,
-    apart_px,
-    random_poses,
-    reference_of,
-    templates_of,
-    turned_rad,
-)
+from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.register.channels import FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.search import (
-    MAX_KEPT_WINDOWS,
-    SearchWindow,
-    SearchWindows,
-    bank,
-    best_near,
-    search,
-)
+from orthonav.core.register.search import SearchWindow, bank, best_near, search
 from orthonav.core.register.template import Template
 
 SHAPE = (384, 448)
 GROUND = Ground()
 ALL_TURNS = bank(None, 0.06, turn_step_rad=math.radians(8), scale_step=0.13, sigmas=2)
 LEVEL = 1
-VIEW_PX = math.sqrt(96 * 128)
 
 
 @pytest.fixture(scope="module")
@@ -118,37 +102,11 @@ def test_the_best_place_near_by_is_that_of_a_whole_search(window):
         assert apart_px(missed.pose, guess) <= math.hypot(10.0, 10.0)
 
 
-def test_no_middle_is_sought_in_the_margin(reference):
-    """A view whose middle lies there is not found, one just inside is."""
-    made = reference.window(LEVEL, 20, 30, 120, 120)
-    window = SearchWindow(made, LEVEL, 20, 30, 55, 30)
-    for inside, x_px in ((True, 2 * (30 + 32.0)), (False, 2 * (30 + 24.0))):
-        pose = Pose(x_px, 2 * (20 + 60.0), 0.4, 0.0)
-        best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]
-        assert (apart_px(best.pose, pose) / 2**LEVEL < 0.25) == inside
-
-
 def test_a_view_over_the_border_of_the_sheet(window):
     """A part of it on the map is enough, and what lies across the sheet does not move it."""
     for pose in (Pose(20.0, 190.0, 0.3, 0.0), Pose(230.0, 370.0, -2.0, 0.05)):
         best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]
         assert apart_px(best.pose, pose) / 2**LEVEL < 0.6
-
-
-def test_candidates_are_counted_sorted_and_apart(window):
-    pose = Pose(200.0, 200.0, 0.0, 0.0)
-    template = templates_of(GROUND, pose).at(LEVEL)
-    apart = round(math.sqrt(template.pixels) / 8)
-    many = search(template, window, ALL_TURNS[::4], 60)
-    assert 20 < len(many) <= 60
-    assert all(one.score >= other.score for one, other in pairwise(many))
-    for number, one in enumerate(many):
-        for other in many[:number]:
-            x = abs(one.pose.x_px - other.pose.x_px) / 2**LEVEL
-            y = abs(one.pose.y_px - other.pose.y_px) / 2**LEVEL
-            assert max(x, y) >= apart  # less half a pixel on either side
-    few = search(template, window, ALL_TURNS[::4], 7)
-    assert few == many[:7]
 
 
 def test_a_view_of_elsewhere_stands_out_nowhere(window):
@@ -202,73 +160,3 @@ def test_nothing_to_compare_is_no_crash(reference):
     ):
         found = search(template, window, near(pose), 3)
         assert len(found) <= 3 and all(abs(each.score) < 1e-3 for each in found)
-
-
-@pytest.mark.parametrize(
-    "turn_std_deg, log_scale_std, turns, scales",
-    [(None, 0.05, 45, 3), (2.0, 0.01, 2, 1), (10.0, 0.2, 8, 10), (60.0, 0.0, 45, 1)],
-)
-def test_the_bank_reaches_what_is_likely(turn_std_deg, log_scale_std, turns, scales):
-    std = None if turn_std_deg is None else math.radians(turn_std_deg)
-    made = bank(std, log_scale_std, turn_step_rad=math.radians(8), scale_step=0.13, sigmas=3)
-    turns_rad, scales_tried = (np.unique(each) for each in zip(*made, strict=True))
-    assert (len(turns_rad), len(scales_tried)) == (turns, scales)
-    assert len(made) == turns * scales == len(set(made))
-    if turns == 45:  # all around, with no gap where the circle closes
-        gaps = np.diff([*turns_rad, turns_rad[0] + 2 * math.pi])
-        np.testing.assert_allclose(gaps, math.radians(8))
-    else:
-        reach = 3 * std
-        off = np.abs(np.linspace(-reach, reach, 99)[:, None] - turns_rad).min(axis=1)
-        assert off.max() <= math.radians(4) + 1e-9
-        assert turns_rad.sum() == pytest.approx(0, abs=1e-9)
-    off = np.abs(np.linspace(-3, 3, 99)[:, None] * log_scale_std - scales_tried).min(axis=1)
-    assert off.max() <= 0.065 + 1e-9
-
-
-@pytest.fixture(scope="module")
-def windows(reference):
-    return SearchWindows(reference)
-
-
-def test_no_more_windows_are_kept_than_a_few():
-    windows = SearchWindows(reference_of(GROUND, (128, 128)))
-    for view_px in np.geomspace(20, 400, 25):
-        windows.whole(1, FINE, float(view_px))
-    assert len(windows._windows) == MAX_KEPT_WINDOWS
-
-
-@pytest.mark.parametrize("level", [1, 2])
-def test_a_part_reaches_as_far_as_given(windows, level):
-    """Middles of views within the reach are sought, those well beyond it are not."""
-    centre, reach = (200.0, 170.0), 40.0
-    window = windows.part(level, FINE, VIEW_PX, centre, reach)
-    unit = 2**level
-    assert window.width < SHAPE[1] // unit
-    for x, y, inside in (
-        (0, 0, True),
-        (-39, 0, True),
-        (39, 39, True),
-        (0, -39, True),
-        (-39, 39, True),
-        (40 + 4 * unit, 0, False),
-        (0, -40 - 4 * unit, False),
-    ):
-        pose = Pose(centre[0] + x, centre[1] + y, 0.2, 0.0)
-        found = search(templates_of(GROUND, pose).at(level), window, [(pose.turn_rad, 0.0)], 5)
-        assert (apart_px(found[0].pose, pose) < 0.6 * unit) == inside
-        for each in found:
-            off = abs(each.pose.x_px - centre[0]), abs(each.pose.y_px - centre[1])
-            assert max(off) <= reach + 2.5 * unit
-
-
-@pytest.mark.parametrize(
-    "centre", [(5.0, 5.0), (440.0, 200.0), (-60.0, 190.0), (1e5, 1e5)], ids=str
-)
-def test_a_part_over_the_border_of_the_sheet(windows, centre):
-    window = windows.part(1, FINE, VIEW_PX, centre, 60.0)
-    pose = Pose(40.0, 50.0, 0.2, 0.0)
-    found = search(templates_of(GROUND, pose).at(1), window, [(0.2, 0.0)], 5)
-    assert all(math.isfinite(each.score) for each in found)
-    if centre == (5.0, 5.0):
-        assert apart_px(found[0].pose, pose) < 1.0

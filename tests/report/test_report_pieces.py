@@ -1,7 +1,6 @@
 """Report pages, drawings as PNG and SVG, and figures as files."""
 
 import base64
-import errno
 import hashlib
 import re
 import sys
@@ -112,25 +111,6 @@ def test_a_folder_with_files_that_are_not_ours_is_refused(tmp_path: Path, spoil)
     with pytest.raises(OutputError, match=r"figures$"):
         write_page(tmp_path, "after", [figure("map", "b")])
     assert names(tmp_path) == before and (tmp_path / "index.html").read_text() == "before"
-
-
-@pytest.mark.parametrize("fails_at", [1, 3, 5])
-def test_where_there_is_no_room_all_stays_as_it_was(tmp_path: Path, monkeypatch, fails_at) -> None:
-    write_page(tmp_path, "before", [figure("a"), figure("stale")])
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
-    written = []
-
-    def failing(self: Path, data: bytes) -> int:
-        written.append(self)
-        if len(written) == fails_at:
-            raise OSError(errno.ENOSPC, "no space")
-        with self.open("wb") as stream:
-            return stream.write(data)
-
-    monkeypatch.setattr(Path, "write_bytes", failing)
-    with pytest.raises(OutputError, match="disk full"):
-        write_page(tmp_path, "after", [figure("a", "b"), figure("c", "b")])
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
 def test_names_of_files_are_safe_and_differ() -> None:

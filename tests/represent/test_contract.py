@@ -61,14 +61,6 @@ def test_deterministic_and_inputs_untouched(variant):
     np.testing.assert_array_equal(grey, picture())
 
 
-def test_views_into_larger_pictures_are_taken(variant):
-    large = picture((200, 200))
-    window = large[10:106:2, 7:103]
-    np.testing.assert_array_equal(
-        variant(window, everywhere(window)), variant(window.copy(), everywhere(window))
-    )
-
-
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
 @pytest.mark.parametrize("shape", [(16, 16), (40, 41)])
 def test_blank_is_flat(variant, level, shape):

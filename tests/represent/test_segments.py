@@ -57,13 +57,6 @@ def test_without_noise_or_smoothing_borders_are_exact():
     np.testing.assert_array_equal(drawn(fields(noise=0), sigma=0.0) > 0, expected)
 
 
-@pytest.mark.parametrize("shift", [-40, 25])
-def test_brightness_does_not_matter(shift):
-    grey = np.clip(picture((128, 128)), 60, 200)
-    first, second = drawn(grey) > 0, drawn((grey + np.int16(shift)).astype(np.uint8)) > 0
-    assert (first & second).sum() > 0.97 * (first | second).sum() > 100
-
-
 def test_small_regions_are_joined():
     """A spot of 5 x 5 px is a region of its own only where regions so small may stay."""
     grey = np.full((64, 64), 90, np.uint8)

@@ -28,12 +28,6 @@ def inner_tile():
     return int(np.flatnonzero(([GRID.rows // 2, GRID.cols // 2] == TILES).all(axis=1))[0])
 
 
-def test_the_best_tile_is_where_it_is():
-    tile = inner_tile()
-    truth = CENTRES[tile] + [9.0, -12.0]
-    np.testing.assert_array_equal(position("best", scores_around(*truth)), CENTRES[tile])
-
-
 @pytest.mark.parametrize("rule, within_m", [("peak", 1.0), ("neighbours", 6.0)])
 def test_neighbours_tell_where_between_tiles(rule, within_m):
     tile = inner_tile()

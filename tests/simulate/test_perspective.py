@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from lab.landscape import generate_area, generate_heights
 from lab.landscape.epoch import DEFAULT_DATES
+from lab.terrain import seen_view
 from test_flight import FISH, LENS, PLAIN, SEEN
 
 from orthonav.core.errors import FlightError
@@ -14,7 +15,7 @@ from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
-from orthonav.ground.simulate.perspective import Raster, met, rays_enu, seen_view
+from orthonav.ground.simulate.perspective import Raster, met, rays_enu
 from orthonav.ground.simulate.render import render_view
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
@@ -76,7 +77,7 @@ def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
         assert telemetry.amsl_m == pytest.approx(below + 50.0, abs=0.1)
         pictures[name] = np.stack([read_image(view.path) for view in flight.views]).astype(float)
     assert (np.abs(pictures["dem"] - pictures["dsm"]) > 15).mean() > 0.005
-    with pytest.raises(FlightError, match="0 to 65 deg ahead"):
+    with pytest.raises(FlightError, match="camera pitch must be 0 to 65"):
         simulate_flight(SimulateRequest([ortho], tmp_path / "no", camera_pitch_deg=70.0, **request))
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,10 +14,8 @@ from orthonav.core.track import (
     ReportedAttitude,
     ReportedVelocity,
     Sighting,
-    State,
 )
-from orthonav.core.track.model import HORIZON, SEEN, STATE, TILT, WHITE_SHARE
-from orthonav.core.track.motion import by_camera, predicted
+from orthonav.core.track.model import SEEN, WHITE_SHARE
 
 SIDE_M, RADIUS_M, AGL_M, STEP_S, VIEWS = 2000.0, 35.0, 300.0, 1.0, 60
 EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
@@ -153,61 +150,3 @@ def test_a_velocity_that_is_wrong_by_metres_does_not_displace_a_track():
     assert 0.5 < of_place.mean() < 3
     assert (of_place < 13.8).mean() > 0.995  # 99.9 % of a chi-square of two
     assert track_m.mean() < 0.85 * view_m.mean()
-
-
-@pytest.mark.parametrize("corrected_deg", [(0.0, 0.0), (1.0, 0.5)], ids=["not", "partly"])
-@pytest.mark.parametrize("horizon_deg", [(2.0, -1.0), (-1.5, 0.5)])
-def test_a_displacement_by_a_changing_horizon_is_explained_by_it(horizon_deg, corrected_deg):
-    """An aircraft of known velocity: what the camera saw beyond it was its horizon's. So with views
-    that were already corrected by a part of it."""
-    seconds, horizon, corrected = 10.0, np.radians(horizon_deg), np.radians(corrected_deg)
-    known = np.zeros((STATE, STATE))
-    known[range(STATE), range(STATE)] = np.square([1.0] * 2 + [0.1] * 2 + [1e-3] * 6)
-    mean = np.concatenate([[50.0, -20.0], SPEED, np.zeros(6)])
-    velocity = ReportedVelocity(SPEED, SPEED, 0.1)
-    noise = np.square([1e-3, 1e-3, HORIZON_RAD])
-    displaced_m = LEVER_M @ (horizon - corrected)
-    camera = CameraDisplacement(
-        SPEED * seconds + displaced_m,
-        np.eye(2) * 0.25,
-        200.0,
-        levers_m=np.stack([LEVER_M, LEVER_M]),
-        corrected_rad=np.stack([corrected, np.zeros(2)]),
-    )
-    expected = predicted(MODEL, mean, known, seconds, velocity, noise, camera)
-    after, _ = by_camera(expected, camera)
-    assert np.degrees(after.mean[HORIZON]) == pytest.approx(horizon_deg, abs=0.35)
-    assert np.abs(np.degrees(after.mean[TILT])).max() < 0.1
-    assert after.mean[:2] == pytest.approx(mean[:2] + SPEED * seconds, abs=1.5)
-    assert np.degrees(math.sqrt(after.covariance[HORIZON, HORIZON][0, 0])) < 0.3
-    # Without levers it would have been taken as motion: it contradicts the velocity.
-    blind = CameraDisplacement(camera.moved_en_m, camera.covariance, camera.reach_m)
-    assert np.abs(by_camera(expected, blind)[0].mean[HORIZON]).max() == 0
-
-
-@pytest.mark.parametrize("shown_deg", [0.01, 0.1, 0.5, 2.0])
-@pytest.mark.parametrize("horizon_deg", [1.5, 3.0])
-def test_views_that_overlap_confirm_a_track_however_well_they_show_their_tilt(
-    shown_deg, horizon_deg
-):
-    """A place as expected is likelier than none, with a tilt that is known well or hardly."""
-    shown = math.radians(shown_deg)
-    model = replace(MODEL, horizon_rad=math.radians(horizon_deg))
-    mixture = Mixture(model, EXTENT)
-    spread = np.diag([1.0, 1.0, 1e-6, 1e-6, shown**2, shown**2])
-    spread[:2, :2] += shown**2 * LEVER_M @ LEVER_M.T
-    spread[:2, 4:] = -(shown**2) * LEVER_M
-    spread[4:, :2] = spread[:2, 4:].T
-    place = np.zeros(6)
-    for view in range(15):
-        if view:
-            place = place + np.array([*SPEED, 0.0, 0.0, 0.0, 0.0])
-            camera = CameraDisplacement(
-                SPEED, np.eye(2), 80.0, levers_m=np.stack([LEVER_M, LEVER_M])
-            )
-            mixture.predict(1.0, camera=camera)
-        mixture.update(LEVEL, [Sighting(place, spread, 25.0)], 0.15, new_ground=0.1)
-        found = mixture.estimate(RADIUS_M)
-    assert found.state is State.TRACKING and found.confidence > 0.99
-    last = [each.share for each in mixture.hypotheses if each.recognized > 0.5]
-    assert sum(last) > 0.9

@@ -11,8 +11,7 @@ from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.view.run import columns_of
 
 SHEET = SimpleNamespace(
-    frame=FRAME,
-    px_from_en=lambda en_m: (np.asarray(en_m) - [WEST_M, NORTH_M]) * [1, -1] / GSD_M,
+    frame=FRAME, px_from_en=lambda en_m: (np.asarray(en_m) - [WEST_M, NORTH_M]) * [1, -1] / GSD_M
 )
 
 

@@ -200,30 +200,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
 
 
-def test_keys_belong_to_what_has_the_focus(page):
-    """The slider of the overlay, the map, and where somebody types."""
-    page.locator("#opacity").focus()
-    page.keyboard.press("ArrowRight")
-    assert page.locator("#opacity").input_value() == "65"
-    page.locator("#map").focus()
-    before = page.on_screen((0, 0), CHUNK_PX)
-    page.keyboard.press("ArrowRight")
-    page.until(lambda: page.on_screen((0, 0), CHUNK_PX)[0] < before[0] - 20)
-    page.locator("#named").fill("view 0")
-    page.keyboard.press("ArrowLeft")
-    page.keyboard.press("b")
-    page.chosen(0, COUNT)
-    expect(page.locator("#shown-count")).to_have_text(f"0 of {COUNT} views")
-    page.locator("#named").fill("")
-    page.locator("#scrub").focus()
-    page.keyboard.press("ArrowRight")
-    page.chosen(1, COUNT)
-    page.locator("#list [aria-current]").focus()
-    page.keyboard.press("ArrowDown")
-    page.chosen(2, COUNT)
-    assert page.js("document.activeElement.dataset.view") == "2"
-
-
 def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
     box = page.locator("#chart").bounding_box()
     left, middle = box["x"] + 52, box["y"] + box["height"] / 2
@@ -241,27 +217,6 @@ def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
     page.click("#zoom-in")
     page.keyboard.press("End")  # brought into the part of the time that is seen
     page.chosen(COUNT - 1, COUNT)
-
-
-def test_everything_is_reached_by_tab_in_order(page):
-    """Once round: each control once, from top to bottom, and seen where it is."""
-    script = """() => { const is = document.activeElement; const style = getComputedStyle(is);
-      return [is.id || is.getAttribute("aria-label") || is.tagName.toLowerCase(),
-        style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2]; }"""
-    reached = []
-    for _ in range(60):
-        page.keyboard.press("Tab")
-        where, outlined = page.js(script)
-        if where == "body" or where in reached:
-            break
-        reached.append(where)
-        assert outlined, where
-    expected = ["help-open", "map", "Zoom in", "Zoom out", "copy", "opacity", "blink", "enlarge"]
-    expected += ["on-map", "summary"]
-    expected += ["which", "order", "named", "button", "first", "before", "play", "after", "last"]
-    expected += ["zoom-in", "zoom-out", "scrub"]
-    assert [each for each in reached if each in expected] == expected
-    assert set(reached) - set(expected) <= {"list-box"}
 
 
 def fits(page):

@@ -47,7 +47,7 @@ def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
     write_results(second, [replace(result(0), frame="other.png")], another)
     done = run("view", small.fixes, second, "--map", small.map_path)
     assert done.code == 0 and "no view has a position in the second run" in done.err
-    assert "the run is of another map (00000000)" in done.err
+    assert "fixes are of another map (00000000)" in done.err
 
 
 def test_a_public_address_is_warned_about(run, small, served):

@@ -27,7 +27,6 @@ EVERYDAY = {
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command and of its actions."""
     common = argparse.ArgumentParser(add_help=False)
     for flags, text in (
         (("-v", "--verbose"), "say more, on stderr"),
@@ -53,9 +52,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--deep", action="store_true", help="read every file, verify its checksum and its recipe"
     )
     check.add_argument(
-        "--clean",
-        action="store_true",
-        help="remove leftovers of interrupted builds",
+        "--clean", action="store_true", help="remove leftovers of interrupted builds"
     )
     check.add_argument(
         "--min-age-h",
@@ -97,7 +94,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _hours(text: str) -> float:
-    """Hours of 0 or more."""
     try:
         hours = float(text)
     except ValueError:
@@ -108,7 +104,6 @@ def _hours(text: str) -> float:
 
 
 def run(options: argparse.Namespace) -> int | None:
-    """Run the action."""
     actions = {
         "build": _build,
         "info": _info,
@@ -183,7 +178,6 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Build, print a summary; returns 1 where a sheet failed."""
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
     from orthonav.ground.planning.route import read_route
 
@@ -219,7 +213,6 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _recipe(options: argparse.Namespace) -> dict[str, Any]:
-    """The fields of `AtlasRecipe` that were given."""
     from orthonav.core.errors import AtlasError
 
     given = recipe_of(options)
@@ -244,7 +237,6 @@ def _runner(options: argparse.Namespace) -> "TaskRunner":
 
 
 def _build_text(plain: Mapping[str, Any]) -> str:
-    """The summary for people."""
     lines = [
         f"atlas        {plain['atlas']}",
         f"sheets       {plain['built']} built, {plain['unchanged']} unchanged, "
@@ -285,7 +277,6 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def summary(atlas: "Atlas") -> dict[str, Any]:
-    """Contents, size, dates and recipe of an atlas, as plain values."""
     sheets = list(atlas.sheets().values())
     dates = sorted({date for sheet in sheets for date in sheet.dates})
     sources = {}
@@ -312,7 +303,6 @@ def summary(atlas: "Atlas") -> dict[str, Any]:
 
 
 def summary_text(plain: dict[str, Any]) -> str:
-    """The summary for people."""
     recipe = dict(plain["recipe"])
     coarse = recipe.pop("coarse")
     values = ", ".join(f"{name} {value}" for name, value in recipe.items() if value is not None)
@@ -348,11 +338,7 @@ def _check(options: argparse.Namespace) -> int:
     atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
         found = check_atlas(
-            atlas,
-            options.deep,
-            shown,
-            clean=options.clean,
-            min_age_s=options.min_age_h * 3600,
+            atlas, options.deep, shown, clean=options.clean, min_age_s=options.min_age_h * 3600
         )
     left = [problem for problem in found if not problem.removed]
     if options.json:

@@ -62,10 +62,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     area = parser.add_argument_group("area (default: all imagery)")
     add_area(area, area.add_mutually_exclusive_group())
     add_recipe(parser.add_argument_group("map"))
-    _add_work(parser.add_argument_group("work"))
-
-
-def _add_work(group: argparse._ActionsContainer) -> None:
+    group = parser.add_argument_group("work")
     group.add_argument(
         "--work",
         type=Path,

@@ -2,19 +2,13 @@
 
 import argparse
 import json
-import logging
 import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.changed import (
-    add_report_changes,
-    changes_text,
-    changes_to_plain,
-    report_changes,
-)
+from orthonav.cli.changed import add_report_changes, changes_text, changes_to_plain, report_changes
 from orthonav.cli.common import beside, print_json, progress
 from orthonav.cli.needs import require_extras
 
@@ -26,8 +20,6 @@ if TYPE_CHECKING:
     from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.report.drawing import Background
-
-log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -171,7 +163,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
     from orthonav.ground.evaluate.contact_sheet import worst_rows
-    from orthonav.ground.evaluate.metrics import check_truth, compare, measure
+    from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.evaluate.track import measure_gnss, measure_track
     from orthonav.ground.report.imagery import SheetImagery
@@ -186,7 +178,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         known = read_truth(truth)
         comparison = compare(known, results, local)
         check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
-        _warn_of_another_run(fixes, truth, folders[i] if folders else None, opened)
+        warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
         worst: tuple[Row, ...] = ()
         if sheet and folders and options.report:
             worst = tuple(worst_rows(comparison, results, folders[i], sheet))
@@ -206,28 +198,15 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     return flights
 
 
-def _warn_of_another_run(
-    fixes: Path, truth: Path, flight: "FlightFolder | None", opened: "MapFile | None"
-) -> None:
-    """Log a warning where fixes were computed from another map or flight than the given ones.
-
-    Without a flight, it is the flight folder that holds the ground truth, if any.
-    """
+def _flight_of(truth: Path) -> "FlightFolder | None":
+    """The flight folder that holds the ground truth, if any."""
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity
 
-    if flight is None and (truth.parent / "telemetry.csv").is_file():
-        with suppress(OrthonavError):
-            flight = open_flight(truth.parent, images_needed=False)
-    given = Identity(
-        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
-    )
-    other = read_identity(fixes).differences(
-        given, opened.path if opened else None, flight.path if flight else None
-    )
-    if other:
-        log.warning("fixes are of %s: %s", other, fixes)
+    with suppress(OrthonavError):
+        if (truth.parent / "telemetry.csv").is_file():
+            return open_flight(truth.parent, images_needed=False)
+    return None
 
 
 def _names(paths: list[Path]) -> list[str]:

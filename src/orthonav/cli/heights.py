@@ -12,17 +12,11 @@ if TYPE_CHECKING:
     from orthonav.ground.planning.route import Route
     from orthonav.ground.recordings import Recording
 
-AREA_POINTS = 48
-"""Positions along a side of a map at which its terrain is averaged."""
+AREA_POINTS = 48  # positions along a side of a map at which its terrain is averaged
 log = logging.getLogger(__name__)
 
 
 def dem_of(options: argparse.Namespace) -> "Dem | None":
-    """The terrain model of `--dem`, None without one.
-
-    Raises `ImageryError`, `MissingFileError`, `MissingExtraError`, and `FlightError` for options
-    that exclude each other.
-    """
     from orthonav.core.errors import FlightError
 
     if options.dem is None:
@@ -39,10 +33,7 @@ def dem_of(options: argparse.Namespace) -> "Dem | None":
 
 
 def dem_for_route(options: argparse.Namespace, route: "Route") -> "Dem | None":
-    """The same for a route, at least one waypoint of which lies in it.
-
-    Raises also `ImageryError` where none does; it names swapped coordinates as the cause.
-    """
+    """The same for a route, at least one waypoint of which lies in it."""
     from orthonav.core.errors import ImageryError
     from orthonav.core.geo.swapped import swapped_hint
 
@@ -73,7 +64,6 @@ def map_heights(
 
 
 def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
-    """Latitudes and longitudes spread over a map."""
     import numpy as np
 
     sheet = opened.manifest.sheets[0]
@@ -87,16 +77,10 @@ def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
 
 
 def flight_heights(
-    options: argparse.Namespace,
-    opened: "MapFile",
-    flight: "Recording",
-    dem: "Dem | None",
+    options: argparse.Namespace, opened: "MapFile", flight: "Recording", dem: "Dem | None"
 ) -> "FlownHeights | None":
-    """Heights above ground of the views of a recorded flight; None without a terrain.
-
-    What is assumed about heights is logged once. Raises `ImageryError` where the terrain model lies
-    outside the map.
-    """
+    """Heights above ground of the views of a recorded flight; None without a terrain. What is
+    assumed about heights is logged once."""
     from orthonav.core.errors import ImageryError
 
     if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
@@ -125,10 +109,8 @@ def say_assumed_heights(
     terrain: str | None = None,
     advice: str = "give --dem, or build the map with it",
 ) -> None:
-    """Log what is assumed about the heights of a flight, over a terrain or without one.
-
-    `advice`: what would help. Other recordings than flights have said it when they were opened.
-    """
+    """Log what is assumed about the heights of a flight, over a terrain or without one. `advice`:
+    what would help. Other recordings than flights have said it when they were opened."""
     from orthonav.core.flight.heights import assumed_heights
 
     first = next(iter(flight.views), None)
@@ -138,10 +120,8 @@ def say_assumed_heights(
 
 
 def geoid_for(flight: "Recording") -> "Undulation | None":
-    """The geoid, where the height above the ellipsoid is known and that above the sea is not.
-
-    Where it is needed and missing, a warning says what to install.
-    """
+    """The geoid, where the height above the ellipsoid is known and that above the sea is not. Where
+    it is needed and missing, a warning says what to install."""
     from orthonav.core.errors import ImageryError, MissingExtraError
 
     first = next(iter(flight.views), None)

@@ -1,6 +1,7 @@
 """`orthonav plan`: derive map requirements from a route, a camera and a height."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,7 @@ EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
     *("--out", "--json"),
 )
-MAX_SHOWN = 12
-"""Sheets and legs named in the text."""
+MAX_SHOWN = 12  # sheets and legs named in the text
 
 if TYPE_CHECKING:
     from orthonav.ground.planning.area import Area, Extent
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+    number = partial(parser.add_argument, type=float)
     add_area(
         parser,
         parser.add_mutually_exclusive_group(required=True),
@@ -33,15 +33,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: 1280 x "
         "960 px, 65 by 51 deg",
     )
-    parser.add_argument("--agl-m", type=float, help="height above ground (default: from the route)")
-    parser.add_argument("--speed-mps", type=float, help="ground speed")
-    parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: from the view)"
-    )
+    number("--agl-m", help="height above ground (default: from the route)")
+    number("--speed-mps", help="ground speed")
+    number("--gsd-m", help="ground resolution, metres per pixel (default: from the view)")
     parser.add_argument("--tile-px", type=int, help="width of a tile (default: from the view)")
-    parser.add_argument(
+    number(
         "--overlap",
-        type=float,
         default=0.875,
         metavar="FRACTION",
         help="overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
@@ -65,7 +62,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compute and print the plan."""
     from orthonav.core.errors import RouteError
     from orthonav.core.files import write_text
     from orthonav.ground.planning.route import read_route
@@ -116,7 +112,6 @@ def run(options: argparse.Namespace) -> None:
 def _sheets(
     options: argparse.Namespace, route: "Route | None"
 ) -> "tuple[list[Route | Extent], list[Area]]":
-    """Sheets as arguments of `build` (routes or bounds), and their areas."""
     from orthonav.ground.planning.area import Area
     from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
 
@@ -128,7 +123,6 @@ def _sheets(
 
 
 def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
-    """The view from `--agl-m`, else from the lowest height of the route."""
     from orthonav.core.errors import CameraError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.planning.spacing import DEFAULT_CAMERA, ViewPlan
@@ -160,7 +154,6 @@ def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
 
 
 def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float, int]:
-    """Ground resolution and tile width: from the options, else chosen for the view."""
     from orthonav.core.errors import AreaError
     from orthonav.ground.planning.spacing import suited_map, suited_tile_px
 
@@ -275,7 +268,6 @@ def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
 
 
 def plan_text(plain: dict[str, Any]) -> str:
-    """Lines of text for a plan as `orthonav plan --json` prints it."""
     lines = []
     if plain["route"] is not None:
         lines.append(_row("route", _route_text(plain["route"])))

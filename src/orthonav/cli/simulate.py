@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 from orthonav.cli.common import ROUTE_HELP, add_dem, add_orthos, counted, print_json, progress
@@ -18,16 +19,15 @@ MOUNT_STD_DEG = HORIZON_STD_DEG = 1.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+    number = partial(parser.add_argument, type=float)
     add_orthos(parser, "orthophoto to fly over, of another year than the map")
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     where.add_argument(
         "--random", type=int, metavar="N", help="fly N views at random positions and headings"
     )
-    parser.add_argument(
+    number(
         "--agl-m",
-        type=float,
         help="height above ground (default: the shorter image side covers 256 px of imagery); with "
         "--dem the height at the first view of a route, which is flown at a constant altitude",
     )
@@ -37,34 +37,25 @@ def add(parser: argparse.ArgumentParser) -> None:
         "standing up); telemetry then reports heights above sea level and take-off instead of "
         "heights above ground",
     )
-    parser.add_argument(
+    number(
         "--camera-pitch-deg",
-        type=float,
         default=0.0,
         help="angle by which the camera looks ahead of straight down, 0 to 65; reported "
         "(default 0)",
     )
-    parser.add_argument(
-        "--spacing-m",
-        type=float,
-        help="distance between views on a route (default: flown in one second)",
-    )
-    parser.add_argument("--airspeed-mps", type=float, default=25.0, help="airspeed (default 25)")
-    parser.add_argument(
+    number("--spacing-m", help="distance between views on a route (default: flown in one second)")
+    number("--airspeed-mps", default=25.0, help="airspeed (default 25)")
+    number(
         "--turn-radius-m",
-        type=float,
         default=0.0,
         help="radius of the arcs at the corners of the route (default 0: sharp corners)",
     )
-    parser.add_argument(
+    number(
         "--wind-mps",
-        type=float,
         help="speed of the mean wind, with gusts; the aircraft crabs along its route (default: no "
         "wind)",
     )
-    parser.add_argument(
-        "--wind-from-deg", type=float, help="direction the wind comes from (default 270, west)"
-    )
+    number("--wind-from-deg", help="direction the wind comes from (default 270, west)")
     parser.add_argument(
         "--beyond",
         action="store_true",
@@ -108,8 +99,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_errors(parser: argparse.ArgumentParser) -> None:
-    """Options for the fields of `Errors`."""
-
     def option(
         flag: str, text: str, default: float | None = 0.0, metavar: str | None = None
     ) -> None:
@@ -166,7 +155,6 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate a flight and report the number of views."""
     from orthonav.core.errors import FlightError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.planning.route import read_route

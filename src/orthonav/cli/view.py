@@ -105,18 +105,14 @@ def _announce(server: "Server", options: argparse.Namespace) -> None:
         )
     address = server.url()
     print(f"{address}  (Ctrl-C ends)", flush=True)
-    if not options.no_browser and sys.stdout.isatty() and _has_screen():
+    # Without a screen a text browser would cover the output.
+    screen = not sys.platform.startswith("linux") or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
+    if not options.no_browser and sys.stdout.isatty() and screen:
         import threading
         import webbrowser
 
         # Some browsers return only when closed.
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-
-
-def _has_screen() -> bool:
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _port(text: str) -> int:

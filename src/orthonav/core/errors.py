@@ -2,8 +2,7 @@
 
 All derive from `OrthonavError`, which the command line turns into one line and `exit_code`,
 and from the builtin that fits, so that callers who know nothing of orthonav can still catch them.
-A view that cannot be placed is not an error: see `orthonav.core.records.NoFix`.
-"""
+A view that cannot be placed is not an error: see `orthonav.core.records.NoFix`."""
 
 
 class OrthonavError(Exception):

@@ -24,10 +24,8 @@ _ALMOST_NONE = 2**20  # with less free space, bytes, a failed write is that of a
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, synced and renamed to `path` on success.
-
-    On any exception it goes, with folders made for it. Raises `OutputError` (disk full, no
-    permission)."""
+    """A temporary path, synced and renamed to `path` on success, else removed. Raises
+    `OutputError`."""
     path = Path(path).resolve()
     if path.exists() and not path.is_file():
         raise OutputError(f"cannot write over a folder or a device: {path}")
@@ -58,10 +56,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) -> Iterator[Path]:
-    """Yield a temporary folder beside `path` that replaces it on success.
-
-    A folder with content is refused at once unless `is_ours` allows it. On any exception the old
-    one stays. Raises `OutputError`."""
+    """A temporary folder that replaces `path` on success. Raises `OutputError`, at once where it
+    has content, unless `is_ours` allows that."""
     path = Path(path)
     if not _may_be_replaced(path, is_ours):
         raise OutputError(
@@ -158,8 +154,7 @@ def with_paths(record: object, *names: str) -> None:
 
 
 def require_file(path: Path, what: str) -> Path:
-    """`path` if it is a file and no pointer of Git LFS, else raises `MissingFileError` naming
-    `what`."""
+    """`path` if it is a file and no pointer of Git LFS, else `MissingFileError` naming `what`."""
     path = Path(path)
     if not path.is_file():
         kind = "is a folder, not a file" if path.is_dir() else "does not exist"

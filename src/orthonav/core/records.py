@@ -21,9 +21,7 @@ PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outs
 DEFAULT_YAW_STD_DEG = 7.0
 """Magnetic compasses of the recorded flights are off by several degrees (docs/tracking.md)."""
 MIN_YAW_STD_DEG = 2.0  # the least that searches allow for
-TILE_YAW_STD_DEG = 5.0
-"""Where views are localized by tiles alone: three headings 6 deg apart
-(docs/decisions/embedding.md)."""
+TILE_YAW_STD_DEG = 5.0  # of tiles alone: three headings 6 deg apart (docs/decisions/embedding.md)
 DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = 3.0
 """Mounts lean by 1 to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
@@ -40,8 +38,7 @@ class Prior:
     """The position expected before a search: a round Gaussian.
 
     `lat_deg`, `lon_deg`: its mean, WGS 84. `std_m`: standard deviation per axis, m, 0 or more; the
-    search ends at `PRIOR_SIGMAS` of them.
-    """
+    search ends at `PRIOR_SIGMAS` of them."""
 
     lat_deg: float
     lon_deg: float
@@ -52,22 +49,16 @@ class Prior:
 class Telemetry:
     """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
 
-    time_ns: int
-    """Time of exposure, ns."""
-    yaw_deg: float
-    """Heading of the top of the picture, clockwise from true north."""
-    pitch_deg: float
-    """0 where the optical axis points straight down; positive looks ahead."""
-    roll_deg: float
-    """0 where the optical axis points straight down; positive looks left."""
-    agl_m: float
-    """Height above ground, above 0."""
+    time_ns: int  # time of exposure, ns
+    yaw_deg: float  # heading of the top of the picture, clockwise from true north
+    pitch_deg: float  # 0 where the optical axis points straight down; positive looks ahead
+    roll_deg: float  # 0 where the optical axis points straight down; positive looks left
+    agl_m: float  # height above ground, above 0
     yaw_std_deg: float | None = None
     """Standard deviation of the heading from view to view; `DEFAULT_YAW_STD_DEG` where None."""
     agl_std_m: float | None = None
     """The same of the height; `DEFAULT_AGL_STD` of the height where None."""
-    prior: Prior | None = None
-    """Expected position."""
+    prior: Prior | None = None  # expected position
     vel_en_mps: tuple[float, float] | None = None
     """Velocity over ground since the view before, true east and north."""
     tilt_std_deg: float | None = None
@@ -77,10 +68,8 @@ class Telemetry:
     """Standard deviation of the velocity per axis; see `orthonav.core.track.tracker`."""
     home_m: float | None = None
     """Height above the place of take-off, as recorded; it is not used in place of `agl_m`."""
-    amsl_m: float | None = None
-    """Height above mean sea level, as recorded."""
-    hae_m: float | None = None
-    """Height above the ellipsoid of WGS 84, as recorded."""
+    amsl_m: float | None = None  # height above mean sea level, as recorded
+    hae_m: float | None = None  # height above the ellipsoid of WGS 84, as recorded
     below: Ground | None = None
     """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
     Its deviation is part of `agl_std_m`."""
@@ -105,8 +94,7 @@ class View:
     `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
     `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
 
-    Raises `FlightError` for what is no image, `CameraError` where the aspect ratios differ.
-    """
+    Raises `FlightError` for what is no image, `CameraError` where the aspect ratios differ."""
 
     grey: NDArray[np.uint8]
     camera: Camera
@@ -139,8 +127,7 @@ class View:
 
         `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
         north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
-        `time_s`: of the exposure. The standard deviations are those of `Telemetry`.
-        """
+        `time_s`: of the exposure. The standard deviations are those of `Telemetry`."""
         heading = math.nan if heading_deg is None else float(heading_deg)
         return cls(
             image,
@@ -174,8 +161,7 @@ class Fix:
     `lat_deg`, `lon_deg`: WGS 84. `cov_en_m2` (2, 2): covariance of east and north, m2, of a correct
     fix. `confidence`: probability that the error is below `radius_m`, 0..1, NaN where the map was
     not calibrated. `heading_deg` (0..360) and `agl_m`: estimated, or as reported where the method
-    does not estimate them. `evidence`: the numbers behind the confidence.
-    """
+    does not estimate them. `evidence`: the numbers behind the confidence."""
 
     lat_deg: float
     lon_deg: float
@@ -234,8 +220,7 @@ class NoFix:
     """No position, and why. A value, not an exception.
 
     `reason` is a short stable word for programs (such as `blank`, `too_dark`, `outside_map`),
-    `detail` one sentence for people.
-    """
+    `detail` one sentence for people."""
 
     reason: str
     detail: str
@@ -254,8 +239,7 @@ class ViewResult:
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
     track (`searching`, `tracking`, `coasting`, `lost`), None where views are localized one by one.
-    `accepted`: whether a fix met the criterion of `--accept`, None where none was given.
-    """
+    `accepted`: whether a fix met the criterion of `--accept`, None where none was given."""
 
     frame: str
     time_ns: int

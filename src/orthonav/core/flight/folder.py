@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from decimal import Decimal
@@ -163,13 +164,18 @@ def read_truth(path: Path) -> dict[str, tuple[float, float]]:
     truth: dict[str, tuple[float, float]] = {}
     for line, row in csv_rows(path, ("frame", "lat_deg", "lon_deg")):
         lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
-        if not (abs(lat) <= 90 and abs(lon) <= 360):
-            hint = swapped_hint(lat, lon)
-            raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
+        check_latlon(lat, lon, line, path)
         if row["frame"] in truth:
             raise FlightError(f"line {line}: frame {row['frame']} appears twice: {path}")
         truth[row["frame"]] = (lat, lon)
     return truth
+
+
+def check_latlon(lat_deg: float, lon_deg: float, line: int, path: Path) -> None:
+    """Raise `FlightError` unless a line of a table has a latitude and longitude."""
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 360):  # NaN too
+        hint = swapped_hint(lat_deg, lon_deg)
+        raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
 
 
 def read_camera(path: Path) -> tuple[Camera, str]:
@@ -219,7 +225,7 @@ def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[Fligh
         if time_ns is None:
             raise FlightError(f"line {line}: time_s is not a time in seconds: {telemetry}")
         image = frames / frame
-        if images_needed and not _is_file(image):
+        if images_needed and not os.path.isfile(image):  # noqa: PTH113 - False for too long a name
             raise FlightError(
                 f"telemetry line {line} names an image that does not exist (localize "
                 f"--skip-bad-images goes on without it): {image}"
@@ -258,13 +264,6 @@ def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[st
                 yield rows.line, {k: v or "" for k, v in row.items() if isinstance(k, str)}
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name longer than the system allows
-        return False
 
 
 def time_ns_of(text: str | None) -> int | None:

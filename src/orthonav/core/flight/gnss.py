@@ -8,8 +8,7 @@ from pathlib import Path
 
 from orthonav.core.errors import FlightError
 from orthonav.core.files import replacing, require_file
-from orthonav.core.flight.folder import csv_rows, number_of, time_ns_of
-from orthonav.core.geo.swapped import swapped_hint
+from orthonav.core.flight.folder import check_latlon, csv_rows, number_of, time_ns_of
 from orthonav.core.records import Evidence
 
 FILE = "gnss.csv"
@@ -120,9 +119,8 @@ def read_gnss(path: Path) -> list[GnssSample]:
         fix_type = number_of(row["fix_type"])
         if arrived_ns is None or not 0 <= fix_type < 256:
             raise FlightError(f"line {line}: time_s or fix_type is not a number: {path}")
-        if fix_type >= FIX_3D and not (abs(lat) <= 90 and abs(lon) <= 360):
-            hint = swapped_hint(lat, lon)
-            raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
+        if fix_type >= FIX_3D:
+            check_latlon(lat, lon, line, path)
         vel = number_of(row.get("vel_east_mps")), number_of(row.get("vel_north_mps"))
         satellites, receiver = number_of(row.get("satellites")), number_of(row.get("receiver"))
         samples.append(

@@ -145,9 +145,7 @@ class FlownHeights:
         longitude and standard deviation (m) of the take-off position."""
         self._terrain, self._area_deg = terrain, area_deg
         self._use_prior = use_prior
-        known = None
-        if take_off is not None:
-            known = ground_around(terrain, take_off[:2], take_off[2])
+        known = take_off and ground_around(terrain, take_off[:2], take_off[2])
         self._heights = GroundHeights(terrain, known or self._whole, geoid)
         self._checked = known is None
         self._last: tuple[int, Place, float] | None = None
@@ -158,14 +156,17 @@ class FlownHeights:
         the terrain does not give it: level ground is not assumed."""
         if is_measured(telemetry):
             return telemetry
-        self._check(telemetry)
+        off_m = math.nan if self._checked else self._heights.mismatch_m(telemetry)
+        if math.isfinite(off_m):
+            self._checked = True
+            warn_of_mismatch(off_m)
         self._newest = telemetry
         place, std_m = self._place(telemetry)
         below = None if place is None else ground_around(self._terrain, place, std_m)
         below = below or self._whole
-        made = telemetry
-        if below is not None:
-            made = self._heights.above(telemetry, below, place or self._middle)
+        lat, lon = self._area_deg
+        middle = float(lat.mean()), float(lon.mean())
+        made = (below and self._heights.above(telemetry, below, place or middle)) or telemetry
         return replace(telemetry, agl_m=math.nan) if made is telemetry else made
 
     def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
@@ -200,20 +201,9 @@ class FlownHeights:
         std_m, place = min(found, default=(math.inf, None))
         return (place, std_m) if std_m <= LARGEST_STD_M else (None, math.inf)
 
-    def _check(self, telemetry: Telemetry) -> None:
-        off_m = math.nan if self._checked else self._heights.mismatch_m(telemetry)
-        if math.isfinite(off_m):
-            self._checked = True
-            warn_of_mismatch(off_m)
-
     @cached_property
     def _whole(self) -> Ground | None:
         return ground_over(self._terrain, *self._area_deg)
-
-    @property
-    def _middle(self) -> Place:
-        lat, lon = self._area_deg
-        return float(lat.mean()), float(lon.mean())
 
 
 def _aged(time_ns: int, place: Place, std_m: float, telemetry: Telemetry) -> tuple[float, Place]:

@@ -251,12 +251,11 @@ def telemetry_message(view: LoggedView) -> bytes:
         "picture": view.picture,
         **{name: float(getattr(telemetry, name)) for name in _REPORTED},
         **{name: _float_or_none(getattr(telemetry, name)) for name in _REPORTED_IF_KNOWN},
-        "prior": telemetry.prior
-        and {name: float(v) for name, v in asdict(telemetry.prior).items()},
+        "prior": _floats(telemetry.prior),
         "vel_en_mps": telemetry.vel_en_mps and [float(value) for value in telemetry.vel_en_mps],
     }
     if telemetry.below is not None:
-        plain["below"] = {name: float(v) for name, v in asdict(telemetry.below).items()}
+        plain["below"] = _floats(telemetry.below)
     if view.camera_latency_ms is not None:
         plain["camera_latency_ms"] = float(view.camera_latency_ms)
     if view.withheld:
@@ -268,25 +267,18 @@ def view_of(data: bytes) -> LoggedView:
     """The view in a message of `TELEMETRY`. Raises `FlightError`."""
     plain = from_json(data)
     try:
-        prior, velocity = plain["prior"], plain["vel_en_mps"]
-        reported: dict[str, Any] = {name: _number(plain[name]) for name in _REPORTED}
-        optional: dict[str, Any] = {
-            name: None if plain.get(name) is None else _number(plain[name])
-            for name in _REPORTED_IF_KNOWN
-        }
-        names, below = ("lat_deg", "lon_deg", "std_m"), plain.get("below")
-        ground = ("height_m", "std_m", "known")
+        velocity, latency = plain["vel_en_mps"], plain.get("camera_latency_ms")
+        known = [name for name in _REPORTED_IF_KNOWN if plain.get(name) is not None]
+        values: dict[str, Any] = {name: _number(plain[name]) for name in (*_REPORTED, *known)}
         telemetry = Telemetry(
             time_ns=_integer(plain["time_ns"]),
-            **reported,
-            **optional,
-            prior=None if prior is None else Prior(*(_number(prior[name]) for name in names)),
+            **values,
+            prior=_record(Prior, plain["prior"]),
             vel_en_mps=None if velocity is None else _pair(velocity),
-            below=None if below is None else Ground(*(_number(below[name]) for name in ground)),
+            below=_record(Ground, plain.get("below")),
         )
         index, number = _integer(plain["index"]), _integer(plain["number"])
         frame, picture = plain["frame"], plain["picture"]
-        latency = plain.get("camera_latency_ms")
         latency_ms = None if latency is None else _number(latency)
         if not isinstance(frame, str) or picture not in PICTURES:
             raise ValueError("invalid frame or picture")
@@ -419,6 +411,15 @@ def _worded(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_worded(each) for each in value]
     return value
+
+
+def _floats(record: Any) -> dict[str, float] | None:
+    return record and {name: float(value) for name, value in asdict(record).items()}
+
+
+def _record(kind: Any, plain: Any) -> Any:
+    """Inverse of `_floats`."""
+    return None if plain is None else kind(*(_number(plain[f.name]) for f in fields(kind)))
 
 
 def _float_or_none(value: float | None) -> float | None:

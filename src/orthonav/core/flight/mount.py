@@ -93,12 +93,12 @@ class MountedFlight:
 
 def write_mount(path: Path, mount: Mount) -> None:
     """Write a mount as JSON, whole or not at all."""
-    write_record(path, "mount", asdict(mount))
+    _write(path, "mount", asdict(mount))
 
 
 def read_mount(path: Path) -> Mount:
     """Read what `write_mount` wrote. Raises `MissingFileError` or `FlightError`."""
-    return read_record(path, "mount", "orthonav calibrate", mount_from_plain)
+    return _read(path, "mount", "orthonav calibrate", mount_from_plain)
 
 
 def mount_from_plain(plain: Any) -> Mount:
@@ -139,32 +139,28 @@ class CameraLatency:
 
 def write_latency(path: Path, latency: CameraLatency) -> None:
     """Write a latency as JSON, whole or not at all."""
-    write_record(path, "latency", asdict(latency))
+    _write(path, "latency", asdict(latency))
 
 
 def read_latency(path: Path) -> CameraLatency:
     """Read what `write_latency` wrote. Raises `MissingFileError` or `FlightError`."""
-    return read_record(path, "latency", "orthonav calibrate --latency", _from_plain)
+    return _read(path, "latency", "orthonav calibrate --latency", _latency)
 
 
-def _from_plain(plain: Any) -> CameraLatency:
+def _latency(plain: Any) -> CameraLatency:
     found = CameraLatency(float(plain["latency_ms"]), float(plain["std_ms"]), int(plain["pairs"]))
     if not (0 <= found.latency_ms <= MOST_MS and 0 <= found.std_ms < math.inf):
         raise ValueError("latency out of range")
     return found
 
 
-def write_record(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
-    """Write fields as JSON with the version in `orthonav_{kind}`, whole or not at all."""
+def _write(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
     plain = {f"orthonav_{kind}": VERSION, **fields}
     write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
 
-def read_record(path: Path, kind: str, command: str, from_plain: Callable[[Any], Record]) -> Record:
-    """Read what `write_record` wrote by `command`; `from_plain` raises one of `BROKEN`.
-
-    Raises `MissingFileError` or `FlightError`.
-    """
+def _read(path: Path, kind: str, command: str, from_plain: Callable[[Any], Record]) -> Record:
+    """What `command` wrote; `from_plain` raises one of `BROKEN` for impossible values."""
     path = require_file(path, f"{kind} file")
     try:
         if path.stat().st_size > MAX_BYTES:

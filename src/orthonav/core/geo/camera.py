@@ -8,8 +8,7 @@ positive roll makes it look left.
 
 Lenses in the camera plane, as OpenCV writes them. Brown (1966), "Decentering distortion of lenses":
 three radial and two tangential numbers. Fisheye: Kannala and Brandt (2006), "A generic camera model
-and calibration method", with four numbers of the angle off the optical axis.
-"""
+and calibration method", with four numbers of the angle off the optical axis."""
 
 import math
 from collections.abc import Sequence
@@ -43,8 +42,7 @@ class Camera:
     (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
-    for a calibrated camera. Raises `CameraError` on values no camera has.
-    """
+    for a calibrated camera. Raises `CameraError` on values no camera has."""
 
     width_px: int
     height_px: int
@@ -84,8 +82,7 @@ class Camera:
     def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
         """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
 
-        Stated fields of view are often those of the lens or of another mode: good to 5 %.
-        """
+        Stated fields of view are often those of the lens or of another mode: good to 5 %."""
         if not 0 < fov_deg < 180:
             raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
         focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
@@ -102,8 +99,7 @@ class Camera:
     ) -> "Camera":
         """A camera by the matrix (3, 3) and the distortion of OpenCV's calibration.
 
-        `size_px`: width and height of the images that it was calibrated with.
-        """
+        `size_px`: width and height of the images that it was calibrated with."""
         k = np.asarray(matrix, np.float64)
         if k.shape != (3, 3):
             raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
@@ -116,8 +112,7 @@ class Camera:
     def from_file(cls, path: Path | str) -> "Camera":
         """The camera of a `flight.json`, or of a calibration of OpenCV, ROS or Kalibr.
 
-        Raises `MissingFileError`, `CameraError` or `MissingExtraError`.
-        """
+        Raises `MissingFileError`, `CameraError` or `MissingExtraError`."""
         from orthonav.core.geo.camera_files import read_camera_file  # the readers make cameras
 
         return read_camera_file(Path(path))
@@ -144,8 +139,7 @@ class Camera:
         """The camera for images of this size.
 
         Raises `CameraError` where the aspect ratio differs: then the image is an unknown crop, not
-        a scaled version of the same view.
-        """
+        a scaled version of the same view."""
         if (self.width_px, self.height_px) == (width_px, height_px):
             return self
         apart = abs(self.height_px * width_px - height_px * self.width_px)
@@ -227,8 +221,7 @@ def axis_on_ground_en_m(
 
 
 def distort(camera: Camera, xy: Array) -> Array:
-    """Distorted camera-plane coordinates `(..., 2)`; NaN beyond the radius where the model folds
-    back."""
+    """Distorted camera-plane coordinates `(..., 2)`; NaN where the model folds back."""
     if camera.is_pinhole:
         return xy
     if camera.model == "fisheye":
@@ -282,8 +275,7 @@ def ground_en_m(
 
 
 def camera_rays(camera: Camera, px: Array) -> Array:
-    """Rays (N, 3), 1 along the optical axis, through image points (N, 2); NaN beyond the lens
-    model."""
+    """Rays (N, 3), 1 along the optical axis, of image points (N, 2); NaN beyond the lens model."""
     plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
     return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
 

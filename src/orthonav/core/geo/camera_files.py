@@ -1,8 +1,4 @@
-"""Camera files of other programs.
-
-OpenCV, ROS and Kalibr measure the principal point from the centre of the first pixel, orthonav
-from its outer corner, which adds half a pixel.
-"""
+"""Camera files of other programs: OpenCV, ROS and Kalibr count from the first pixel's centre."""
 
 import json
 import re
@@ -45,8 +41,7 @@ def read_camera_file(path: Path) -> Camera:
     """The camera of a `flight.json`, or of a file of OpenCV (YAML, JSON), ROS or Kalibr (YAML).
 
     `FILE#cam1` selects one camera of a Kalibr chain. Raises `MissingFileError`, `CameraError` or
-    `MissingExtraError`.
-    """
+    `MissingExtraError`."""
     path, name = _name_apart(Path(path))
     path = require_file(path, "camera file")
     if path.stat().st_size > MAX_BYTES:
@@ -107,10 +102,7 @@ def _yaml(text: str) -> Any:
 
 
 def _check_events(yaml: Any, text: str) -> None:
-    """Refuses YAML that could exhaust memory or time, before it is built.
-
-    Aliases expand exponentially, nesting fills the stack, numbers with colons take quadratic time.
-    """
+    """Refuses YAML whose aliases, nesting or numbers with colons could exhaust memory or time."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
         if getattr(event, "anchor", None) is not None:

@@ -36,10 +36,7 @@ class TileGrid:
         tile_px: int,
         overlap: float,
     ) -> "TileGrid":
-        """Grid over `extent_en_m` (west, south, east, north, m); `overlap`: share that neighbours
-        share.
-
-        Raises `AreaError` for impossible numbers or an empty extent."""
+        """Over west, south, east, north (m); `overlap` of neighbours. Raises `AreaError`."""
         west, south, east, north = extent_en_m
         if not (np.isfinite(gsd_m) and gsd_m > 0):
             raise AreaError(f"ground resolution must be above 0 m per pixel, got {gsd_m}")

@@ -41,8 +41,7 @@ def ground_over(terrain: TerrainHeights, lat_deg: Array, lon_deg: Array) -> Grou
 def ground_around(
     terrain: TerrainHeights, place_deg: tuple[float, float], std_m: float
 ) -> Ground | None:
-    """Over a disc around `place_deg` (latitude, longitude) with `std_m` per axis; None where
-    unknown."""
+    """Over a disc around `place_deg` (latitude, longitude); None where unknown."""
     if std_m <= 0:
         return ground_over(terrain, np.array([place_deg[0]]), np.array([place_deg[1]]))
     lat, lon = LocalFrame(*place_deg).latlon_from_en(2 * std_m * _DISC)
@@ -74,9 +73,8 @@ def bilinear(
 def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:
     """Metres east and north (2,) where a line of sight first meets the ground, else NaN.
 
-    `slope_en` (2,): its run per metre of descent. `ground_m`: heights at metres east and north of
-    the camera (N, 2), over the same level as `height_m`. Sought to `DEEPEST_M` below the camera's
-    ground."""
+    `slope_en` (2,): its run per metre of descent. `ground_m`: heights at (N, 2) east and north of
+    the camera, over the same level as `height_m`, down to `DEEPEST_M` below."""
     below_m = float(ground_m(np.zeros((1, 2)))[0])
     drops = np.linspace(0.0, height_m - below_m + DEEPEST_M, SIGHT_STEPS)
     above = height_m - drops - ground_m(drops[:, None] * slope_en)

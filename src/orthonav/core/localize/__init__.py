@@ -22,18 +22,10 @@ is embedded under a few headings and put on the most similar tile.
 
 `orthonav.core.track.tracker` places the views of a flight one after another: a search gives it
 places with their odds, `camera` their pitch and roll, `orthonav.core.track.odometry` the
-displacement between views, and `orthonav.core.track.mixture` joins all of it to one track.
-"""
+displacement between views, and `orthonav.core.track.mixture` joins all of it to one track."""
 
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.localize.tiles import Match, TileMatcher
 
-__all__ = [
-    "Localizer",
-    "Match",
-    "RectifiedView",
-    "TileMatcher",
-    "downsampled",
-    "rectify",
-]
+__all__ = ["Localizer", "Match", "RectifiedView", "TileMatcher", "downsampled", "rectify"]

@@ -1,9 +1,8 @@
 """The camera of a placed view: position, height, heading, pitch and roll from the picture.
 
-Reported pitch and roll are only a prior: mounts and horizons lean by degrees. Each block of the
-view says how well it fits the map a little aside (`orthonav.core.register.blocks`). The camera is
-the maximum of the posterior of blocks and telemetry, by Newton's method; changed ground is an
-outlier of a mixture. The view is orthorectified with it one level finer, and fitted again."""
+Blocks of the view say how well they fit the map a little aside (`orthonav.core.register.blocks`).
+The camera is the maximum of their posterior with the telemetry, by Newton's method; changed ground
+is an outlier of a mixture. Then the view is orthorectified one level finer, and fitted again."""
 
 import math
 from collections.abc import Sequence
@@ -28,8 +27,7 @@ BLURS_PX = (2.0, 1.0, 0.0, 0.0)
 """Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
 SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
 SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
-"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC, Fischler 1981).
-"""
+"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC)."""
 FINAL_STEPS = 2  # after the blocks' information was compared with the scatter of their slopes
 LONGEST_STEP_PX = 3.0  # of any block, per step
 PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
@@ -64,9 +62,9 @@ def resected(
 ) -> Resection | None:
     """The camera under which the blocks of a view fit the map best; None where too few are seen.
 
-    `seen`: per level, of one reach, the blocks and how far (N, 2, 6) each moves, pixels of the
-    level right and down, by metres and degrees of the camera. `prior`: correction (6,) and
-    information (6, 6). `block_px`: at level 0. `close`: the camera is known to a pixel or two."""
+    `seen`: per level the blocks and how far (N, 2, 6) each moves, pixels right and down, by the
+    camera. `prior`: correction (6,) and information (6, 6). `close`: the camera is known to a pixel
+    or two."""
     correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
     blocks = _Blocks.of(seen, correlated)
     if blocks is None:
@@ -97,8 +95,7 @@ def resected(
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Of all levels: correlations (L * N, S, S), pixels (L * N,), moves (L * N, 2, 6);
-    `CORRELATED`."""
+    """Of all levels: correlations (L * N, S, S), pixels (L * N,), moves (L * N, 2, 6)."""
 
     levels: int
     correlated: float
@@ -257,10 +254,8 @@ def _positive(matrices: Array) -> Array:
 def moved_by_camera(
     camera: Camera, orientation: Orientation, ground_m: Array, slopes: Array
 ) -> Array:
-    """Metres (N, 2, 6) by which an image point moves over the ground per unit of the camera.
-
-    `ground_m` (N, 3): east, north, above sea; `slopes` (N, 2): rise per metre. NaN where not seen.
-    """
+    """Metres (N, 2, 6) by which an image point moves over the ground per unit of the camera; NaN
+    where not seen. `ground_m` (N, 3): east, north, above sea; `slopes` (N, 2): its rise."""
     by_ground = []
     for axis in range(2):
         step = np.zeros((len(ground_m), 3))
@@ -285,19 +280,16 @@ def moved_by_camera(
 
 
 FIRST_REACH_PX, REACH_PX = 7, 4
-"""Reach of blocks, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide.
-"""
+"""Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
 FITS = 3  # at most,
 SMALL_SHARE = 0.2  # until a correction is below this share of its standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFound:
-    """The camera of a view.
+    """The camera of a view; `agl_m`: above the ground below it; `alone`: without telemetry.
 
-    - `agl_m`: above the ground below it. `covariance` (6, 6): m east, north, up, deg heading,
-      pitch, roll.
-    - `alone`, `alone_covariance`: by the view without telemetry; `WEAK` where it does not show it.
+    - covariances (6, 6): m east, north, up, deg heading, pitch, roll; `WEAK` where not shown.
     - `middle_en_m`, `middle_covariance` (2, 2): ground in the middle of the picture, None: unknown.
     """
 
@@ -311,8 +303,7 @@ class CameraFound:
 
 
 def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> CameraFound | None:
-    """Of a view whose window lies at `pose`; None where the tilt is exact or too few blocks are
-    seen."""
+    """Of a view at `pose`; None where the tilt is exact or too few blocks are seen."""
     if tilt_std_deg(seen.view.telemetry) == 0:
         return None
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
@@ -354,8 +345,7 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
 def _fitted(
     seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> Resection | None:
-    """A correction of `orientation`: the first at the final level and a coarser one, then one finer
-    too."""
+    """A correction: the first at the final level and a coarser one, then one finer too."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)

@@ -139,8 +139,6 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
 
 
 USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)
-
-
 TILE_FEATURES = ("score", "margin")
 USUAL_SHIFT = 0.42  # of the bias from map to map, under `USUAL_TILES`
 LIMIT = 60.0  # Beyond, the probability is 0 or 1 in floating point
@@ -193,11 +191,7 @@ def logit(likely: float, least: float) -> float:
     return math.log(inside / (1 - inside))
 
 
-CRITERIA = {
-    "confidence": (0.01, 1.0),
-    "peak_ratio": (1.0, 1000.0),
-    "lowe_ratio": (1.0, 1000.0),
-}
+CRITERIA = {"confidence": (0.01, 1.0), "peak_ratio": (1.0, 1000.0), "lowe_ratio": (1.0, 1000.0)}
 """Sensible thresholds: best over second best is at least 1."""
 
 
@@ -253,10 +247,8 @@ def within(
     radius_m: float,
     middle: NDArray[np.float64] | None = None,
 ) -> float:
-    """Probability that a state lies within a radius of `middle` (2,), None: its mean.
-
-    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
-    """
+    """Probability of being within a radius of `middle` (2,), None: the mean; exact for a round
+    Gaussian, else a distance from it counts as variance."""
     variance = float(covariance[0, 0] + covariance[1, 1]) / 2
     away = 0.0 if middle is None else math.dist(mean[:2], middle)
     if away > radius_m + 3 * math.sqrt(variance):

@@ -28,9 +28,7 @@ from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, Vi
 from orthonav.core.register.pose import Pose
 from orthonav.core.tiles.position import PositionRule
 
-ERROR_VARIANCE = 1.5
-"""Errors over their covariance: their tails are heavier than a Gaussian's
-(docs/decisions/camera.md)."""
+ERROR_VARIANCE = 1.5  # their tails are heavier than a Gaussian's (docs/decisions/camera.md)
 WIDEST_M = 2e7  # half the Earth's circumference
 
 
@@ -90,8 +88,7 @@ class Localizer:
 
         `prior` limits the search to three standard deviations around it. With `heading_known`
         false all headings are tried and the reported heading may be NaN. Any fault of a view makes
-        a `NoFix`.
-        """
+        a `NoFix`."""
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused
@@ -118,8 +115,7 @@ class Localizer:
 
         `heading_deg` None: all headings are tried. `prior`: searched within three of its standard
         deviations; None: on the whole map. Raises `FlightError` for what is no image and
-        `CameraError` where image and camera have different aspect ratios.
-        """
+        `CameraError` where image and camera have different aspect ratios."""
         view = View.of(
             image,
             camera,

@@ -29,8 +29,7 @@ KEPT_TO_FINISH = 3  # the best and its rivals
 KEPT_TO_FINEST = 12  # compared one level finer, at most, where they are in doubt
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
-"""Shares of the best score to stay, after one step and all of a level
-(docs/decisions/registration.md)."""
+"""Shares of the best score to stay, after one step and all (docs/decisions/registration.md)."""
 MIN_HOPEFUL = 4  # so many stay anyway: the scores need rivals
 FIRST_STEPS = 1
 FULL_STEPS = 4  # before and after the first of these decisions
@@ -40,8 +39,7 @@ ROUGH_STEP_PX = 0.1
 EXCLUSION_SHARE = 0.25  # A rival lies farther from the best than this share of the view's side
 MAX_RATIO = 10.0
 RIVAL_SHARE = 0.75
-"""Weaker ones on the terrain are finished on level ground: chance fits as well there, at half the
-cost."""
+"""Weaker ones are finished on level ground: chance fits as well there, at half the cost."""
 AGAIN_PX = 1.0  # A window moved by more (pixels of the level, at its rim) is orthorectified again,
 ROUNDS = 3  # at most so often
 AROUND = 6  # places whose surroundings are searched on the terrain, where none stands out,
@@ -115,8 +113,7 @@ class Placer:
         pool: Executor | None = None,
         ground: ViewOverGround | None = None,
     ) -> None:
-        """`pool` shares candidates; without `ground` it is level and none is compared one level
-        finer."""
+        """`pool` shares candidates; without `ground` it is level, and no level is finer."""
         self.templates, self.levels, self.prior = templates, levels, prior
         self.reference, self._pool, self._view_over_ground = reference, pool, ground
         self.is_level = ground is None or ground.relief.is_level
@@ -157,8 +154,7 @@ class Placer:
         return [Place(each) for each in fits]
 
     def direct(self, poses: Sequence[Pose]) -> list[Place]:
-        """Found at the final level, scored at the judged one: refined there they would be lost
-        again."""
+        """Found at the final level, scored at the judged one: refined there they would be lost."""
         refiner = self.refiner(self.levels.judged)
         return [Place(refiner.place(each, 0)) for each in poses]
 
@@ -214,10 +210,9 @@ class Placer:
     # On the terrain
 
     def on_terrain(self, places: Sequence[Place], at_most: int) -> list[Place]:
-        """The best judged places that lie apart, on the terrain where they are better there.
-
-        The surroundings of the first `AROUND` are searched: where relief displaces much, the right
-        one may be far down the list, and off by more than refinement follows."""
+        """The best judged places that lie apart, on the terrain where they are better there; the
+        first `AROUND` with their surroundings, for relief displaces more than refinement follows.
+        """
         if self.is_level:
             return list(places)
         chosen = self._best_apart(places, at_most)
@@ -289,10 +284,9 @@ class Placer:
         kept: int = KEPT_TO_FINISH,
         finer: bool = False,
     ) -> Place:
-        """The best of judged places, found by searches of `candidates` in all.
-
-        The best `kept` of them and all `direct` ones are refined at the final level; with `finer`
-        the best `KEPT_TO_FINEST` are compared one level finer."""
+        """The best of judged places, found by searches of `candidates` in all: the best `kept` and
+        all `direct` ones at the final level, with `finer` the best `KEPT_TO_FINEST` one level
+        finer."""
         ranked = sorted(places, key=lambda each: -self._value(each.judged))
         chosen = self._apart([each.judged for each in ranked], self._exclusion_px, kept)
         apart = [ranked[number] for number in chosen]
@@ -318,10 +312,8 @@ class Placer:
         )
 
     def _finish(self, place: Place) -> None:
-        """At the final level, once: on the terrain, unless level ground is as good or too little is
-        known.
-
-        Only a place not far below the best one before it is worth its terrain."""
+        """At the final level, once: on the terrain, unless level ground is as good, too little is
+        known, or it is far below the best one before."""
         if place.final is not None:
             return
         first = None

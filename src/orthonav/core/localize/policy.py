@@ -92,8 +92,7 @@ class SearchPolicy:
     last_ms: float = 900.0
     """A second search is left out above: about a second for a view on a large area (README)."""
     last_stage_ms: float = 60.0
-    """The last stage, poses of one view in seven, is left out above where the coarse level has
-    tried them."""
+    """The last stage, one view in seven, is left out above after the coarse level."""
 
     def candidates_from(self, tiles: int) -> int:
         least, most = self.tile_candidates
@@ -117,11 +116,7 @@ def _likely_directions(
 ) -> list[tuple[float, float, float]]:
     """Cached: the standard deviations are mostly those of the view before."""
     made = bank(
-        turn_std_rad,
-        log_scale_std,
-        turn_step_rad=steps[0],
-        scale_step=steps[1],
-        sigmas=sigmas,
+        turn_std_rad, log_scale_std, turn_step_rad=steps[0], scale_step=steps[1], sigmas=sigmas
     )
     known = turn_std_rad is not None
     prior = PosePrior(0.0 if known else None, turn_std_rad or 0.0, log_scale_std)
@@ -157,10 +152,8 @@ class CostModel:
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """A policy with its costs, and what the user allows.
-
-    `budget_ms`: no search after the first is begun that would end later than this after the first
-    began. `threads` share poses and candidates."""
+    """A policy with its costs, and what the user allows: none but the first search is begun that
+    would end later than `budget_ms`; `threads` share poses and candidates."""
 
     budget_ms: float = math.inf
     threads: int = 1

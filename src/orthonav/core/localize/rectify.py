@@ -164,10 +164,8 @@ def off_nadir_deg(telemetry: Telemetry) -> float:
 
 @dataclass(frozen=True)
 class NearPart:
-    """The part of a view seen finely enough, on flat ground, for a heading of 0.
-
-    `low_m`, `high_m`: its box, metres east and north; `area_m2`: seen of it; `finest_m`: of a
-    pixel."""
+    """The part of a view seen finely enough, on flat ground, for a heading of 0: its box `low_m`,
+    `high_m`, east and north, what is seen of it, and its finest pixel."""
 
     low_m: Array
     high_m: Array

@@ -1,8 +1,7 @@
 """The search for the place of one view: steps that find candidates, and when they are enough.
 
 `policy` says what is tried and what it costs; each step finds candidates in its way, `place` judges
-them. A search ends as soon as the best place stands out or is proven by its confidence.
-"""
+them. A search ends as soon as the best place stands out or is proven by its confidence."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,13 +21,7 @@ from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior
 from orthonav.core.register.pose import rotation
-from orthonav.core.register.search import (
-    PLACES_AT_ONCE,
-    Peak,
-    best_near,
-    largest_half_px,
-    search,
-)
+from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
 from orthonav.core.tiles.position import rows_within
 
 SAME_PLACE_SHARE = 1 / 8  # closer candidates from tiles are one place
@@ -382,11 +375,10 @@ class Search:
     def _proven_before(self, step: Step) -> Place | None:
         """The best place so far, if a trial before the next step proves it.
 
-        The best few are placed on the terrain and finished; where that proves none, they are
-        compared one level finer. Where only a part of all places was compared, the best must stand
-        out too. No trial before a step that costs less, except the final level, which only runs
-        after all directions of the judged one: the best need only be as certain as at the end of
-        all steps."""
+        The best few are finished on the terrain; where that proves none, they are compared one
+        level finer. Where only a part of all places was compared, the best must stand out too. No
+        trial before a step that costs less, except the final level, before which all directions
+        were tried."""
         policy, last, levels = self.policy, self.last, self.levels
         if last is None or self.sheet.confidence is None or levels.final == levels.judged:
             return None

@@ -37,10 +37,7 @@ MAX_RATIO = 10.0  # A rival at or below zero leaves the best without any
 
 
 def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
-    """Best score over second best (Di Piazza et al. 2024, section 4), up to `MAX_RATIO`.
-
-    `best`: index that counts as best. With dense overlap the second best is mostly its neighbour.
-    """
+    """Best score over second best (Di Piazza et al. 2024, section 4), up to `MAX_RATIO`."""
     if scores.size < 2:
         return MAX_RATIO
     if best is None:
@@ -50,10 +47,7 @@ def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
 
 
 def rival_score(
-    scores: NDArray[np.float32],
-    centres_en_m: NDArray[np.float32],
-    best: int,
-    exclusion_m: float,
+    scores: NDArray[np.float32], centres_en_m: NDArray[np.float32], best: int, exclusion_m: float
 ) -> float:
     """Best score farther than `exclusion_m` from the best tile.
 
@@ -186,10 +180,9 @@ class TileProposer:
         rows: NDArray[np.intp] | None,
         count: int,
     ) -> list[Peak]:
-        """Up to `count` tiles that no tile next to them exceeds, among `rows`.
-
-        `view`: heading-up at the map's resolution. `poses`: headings (rad) and log scales; scores
-        are multiplied by their `weights` (Q,)."""
+        """Up to `count` tiles that no tile next to them exceeds, among `rows`, for a view
+        heading-up at the map's resolution under headings (rad) and log scales with `weights` (Q,).
+        """
         queries = embed_poses(
             self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
         )
@@ -212,10 +205,8 @@ class TileProposer:
 def peak_poses(
     poses: NDArray[np.float64], scores: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Headings and log scales (N, 2) at the peak of scores (N, Q) of poses (Q, 2) on a grid.
-
-    By parabolas, or the best pose beside a missing one; weights (Q,) choose it, but do not move it.
-    """
+    """Headings and log scales (N, 2) at the peak of scores (N, Q), by parabolas, or the best pose
+    beside a missing one; weights (Q,) choose it, but do not move it."""
     off = poses - poses[:, None]
     off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
     best, tiles = (scores * weights).argmax(axis=1), np.arange(len(scores))

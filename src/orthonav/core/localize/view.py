@@ -141,17 +141,13 @@ MIN_AGL_STD = 0.03  # of the log scale searched, whatever is reported
 MAX_AGL_STD = 0.15
 """Three are 0.64 to 1.57, as far as chance was measured alike (docs/decisions/registration.md)."""
 NEAR_SHARE = 0.6
-"""A part far off nadir is no square: judged as one so many times smaller
-(docs/decisions/terrain.md)."""
+"""A part far off nadir is judged as one so many times smaller (docs/decisions/terrain.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedView:
-    """A view made ready for registration.
-
-    `gsd_m`: of level 0 of the map. `templates`: at the final level. `side_px`: root of the area
-    seen, `camera_px` (2,): of the camera from the middle of the view, right and down; pixels of
-    level 0."""
+    """A view made ready for registration. `side_px`: root of the area seen, `camera_px` (2,): of
+    the camera from the middle of the view, right and down; both in pixels of level 0."""
 
     view: View
     gsd_m: float

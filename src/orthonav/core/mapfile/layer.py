@@ -1,9 +1,7 @@
-"""The registration layer of a map: a grey pyramid of a sheet, read by windows.
+"""The registration layer of a map (`docs/map-format.md`): a grey pyramid, read by windows.
 
-Each level is divided into square chunks, each a grey JPEG with its own mask, see
-`docs/map-format.md`. Only the chunks that a window touches are decoded. Maps are untrusted files,
-so every length, size and offset is checked before it is used.
-"""
+Only the chunks (JPEG and mask) that a window touches are decoded. Maps are untrusted files, so
+every length, size and offset is checked before it is used."""
 
 import zlib
 from itertools import pairwise
@@ -116,8 +114,7 @@ class GreyLayer:
                 if chunk is None:
                     continue
                 inside = np.s_[
-                    top % side : top % side + bottom - top,
-                    left % side : left % side + right - left,
+                    top % side : top % side + bottom - top, left % side : left % side + right - left
                 ]
                 target = np.s_[top - row : bottom - row, left - col : right - col]
                 grey[target] = chunk[0][inside]

@@ -123,8 +123,7 @@ class MapParts(Mapping[str, NDArray[Any]]):
 class MapFile:
     """An opened map, or one that was built and not yet written.
 
-    `arrays`: its parts, read-only; those of an opened map are read when asked for.
-    """
+    `arrays`: its parts, read-only; those of an opened map are read when asked for."""
 
     path: Path
     size_bytes: int
@@ -174,8 +173,7 @@ class MapFile:
     def range(self, name: str, first: int, last: int) -> bytes:
         """Bytes `first` to `last` (excluded) of a part that is read in ranges.
 
-        Raises `MapChangedError` if they are not those of the opening.
-        """
+        Raises `MapChangedError` if they are not those of the opening."""
         if isinstance(self.arrays, MapParts):
             return self.arrays.range(name, first, last)
         return self.arrays[name][first:last].tobytes()

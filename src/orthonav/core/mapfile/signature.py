@@ -102,9 +102,7 @@ def new_key(folder: Path) -> str:
         raise OutputError(f"folder holds a key already; name another folder: {folder}")
     private = ed25519.Ed25519PrivateKey.generate()
     pem = private.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     public = private.public_key()
     public_pem = public.public_bytes(
@@ -131,10 +129,8 @@ def key_id(public: "Ed25519PublicKey") -> str:
 
 
 def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
-    """Sign a map, fully checked first, with a private key (PEM); returns the signature's path.
-
-    `serial`: 0 to `MAX_SERIAL`, by default seconds since 1970. Raises `MissingFileError`,
-    `MapFileError`, `OutputError`, `VariantError` or `MissingExtraError`."""
+    """Sign a map, fully checked first, with a private key (PEM); `serial`: 0 to `MAX_SERIAL`, by
+    default seconds since 1970. Raises `OrthonavError` of the kind that fits."""
     now = datetime.now(UTC)
     serial = int(now.timestamp()) if serial is None else serial
     if not 0 <= serial <= MAX_SERIAL:

@@ -3,5 +3,4 @@
 `channels` is what is compared (oriented gradients and locally normalized grey), `template` a view
 made ready at several resolutions, `window` the map made ready where it is looked at, `search`
 finds candidates by FFT over a bank of headings and scales, `refine` moves each candidate to its
-best position, heading and scale and says how well it fits and how exactly it is known.
-"""
+best position, heading and scale and says how well it fits and how exactly it is known."""

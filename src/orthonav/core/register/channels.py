@@ -17,10 +17,8 @@ GROUPS = (slice(0, 2), slice(2, 3))
 
 @dataclass(frozen=True)
 class ChannelRecipe:
-    """In pixels of the level.
-
-    `contrast_px`: window in which a gradient is weighed; `mean_px`, `deviation_px`: windows of mean
-    and contrast of grey; `grey_share`: weight of grey beside gradients."""
+    """Windows in pixels of the level: `contrast_px` of gradients' surroundings, `mean_px`,
+    `deviation_px` of grey; `grey_share`: weight of grey beside gradients."""
 
     gradient_sigma_px: float = 1.0
     contrast_px: int = 27

@@ -19,10 +19,8 @@ def rotation(turn_rad: float, scale: float = 1.0) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """The middle of a view's window on the map, level 0, pixel-is-area, y to the south.
-
-    `turn_rad`: heading, clockwise; `log_scale`: of true over reported height (and ground
-    resolution)."""
+    """The middle of a view's window on the map, level 0, pixel-is-area, y to the south; heading,
+    clockwise, and `log_scale` of true over reported height (and ground resolution)."""
 
     x_px: float
     y_px: float
@@ -66,8 +64,7 @@ HALF_STEP = 0.07  # and half a step of the bank farther
 
 @dataclass(frozen=True, eq=False)
 class ScaleMap:
-    """Log scales (true over reported height) at nodes (H, W), `step_px` of level 0 apart from (0,
-    0)."""
+    """Log scales (true over reported height) at nodes (H, W), `step_px` of level 0 apart."""
 
     values: NDArray[np.float32]
     step_px: float

@@ -190,10 +190,8 @@ class SpreadSums(NamedTuple):
     blocks: NDArray[np.float64]
 
     def covariance(self) -> NDArray[np.float64]:
-        """The curvature is that of the view's derivatives times the map's.
-
-        Noise and change have derivatives too: counted as if they held the view in place, they would
-        make the position appear known along ground that runs in one direction."""
+        """The curvature is that of the view's derivatives times the map's: noise and change have
+        derivatives too, and would make a position appear known along ground of one direction."""
         terms = self.blocks[:, :4]
         spread = terms.T @ terms * (BLOCKS**2 / (BLOCKS**2 - 4))
         inverse = _bounded_inverse((self.observed + self.observed.T) / 2, self.hessian)
@@ -206,8 +204,7 @@ class SpreadSums(NamedTuple):
         return float((sums[used] > 0).mean()) if used.any() else 0.0
 
     def blocks_t(self) -> float:
-        """Sum of the gradients' products over blocks, by the root of their squares: many agree, not
-        few."""
+        """Sum of the gradients' products over blocks, by the root of their squares."""
         sums = self.blocks[:, 4]
         return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))
 
@@ -223,10 +220,8 @@ def _bounded_inverse(
 
 
 class Comparison:
-    """A view beside the map under one pose.
-
-    Steps are gain * map - correlation^2 * view, by kind: plain differences would fall short by the
-    square of the correlation."""
+    """A view beside the map. Steps are gain * map - correlation^2 * view, by kind: plain
+    differences would fall short by the square of the correlation."""
 
     def __init__(self, template: Template, pose: Pose, sums: Sums) -> None:
         self.template, self.pose, self._sums = template, pose, sums

@@ -25,8 +25,6 @@ from orthonav.core.register.window import Reference, cut, thread_memory
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3  # of the typical energy, so that blank ground is not amplified
-
-
 POSES_AT_ONCE = 6
 PLACES_AT_ONCE = 50
 MAX_KEPT_WINDOWS = 4  # of whole sheets in the cache
@@ -64,10 +62,9 @@ class Peak(NamedTuple):
 
 
 class SearchWindow:
-    """Channels (H, W, 4) of the map at a level, first pixel (`row`, `col`), ready to be searched.
-
-    `view_px`: about the side of views; no middle is sought within `margin_px` of the border.
-    `half_px`: the largest `posed_half_px`; None: not known yet."""
+    """Channels (H, W, 4) of the map at a level, first pixel (`row`, `col`), ready to be searched
+    for views of about `view_px`, none within `margin_px` of the border; `half_px`: largest
+    `posed_half_px`."""
 
     def __init__(
         self,

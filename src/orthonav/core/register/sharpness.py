@@ -29,10 +29,8 @@ PHASE_FLOOR = 1e-3  # share of the mean power below which frequencies count less
 
 
 class Sharpness(NamedTuple):
-    """Over scores a little aside.
-
-    `ratio`: of all channels over the best aside, up to 10; 0 without correlation. `gradients`,
-    `phase`: over the mean aside, in standard deviations."""
+    """Over scores a little aside: `ratio` of all channels over the best, up to 10; 0 without
+    correlation; `gradients`, `phase` over the mean, in standard deviations."""
 
     ratio: float
     gradients: float

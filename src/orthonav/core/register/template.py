@@ -25,8 +25,7 @@ BLOCKS = 6  # along one side of a view, in which residuals are taken as one (see
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """`planes` (4, H, W): channels, each kind scaled to the energy of its weight, and 1 where it
-    counts."""
+    """`planes` (4, H, W): channels scaled to the energy of their weight, and 1 where it counts."""
 
     level: int
     planes: Array
@@ -92,8 +91,7 @@ class Template:
 
     @cached_property
     def jacobian(self) -> Array:
-        """By steps x, y (pixels of the level), turn (rad), log scale about the middle: (3, 4, H,
-        W)."""
+        """(3, 4, H, W) by steps x, y (pixels of the level), turn (rad), log scale."""
         return by_steps(self.gradients.swapaxes(0, 1)).swapaxes(0, 1)
 
     @cached_property

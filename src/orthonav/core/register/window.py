@@ -111,8 +111,7 @@ LARGEST_LOG_SCALE = 1.0  # Beyond, the map counts as missing: more than twice wh
 
 @dataclass(frozen=True, eq=False)
 class MapWindow:
-    """Channels (R, C, 4) of the map at a level, from (`row`, `col`), for windows (H, W) near a
-    pose."""
+    """Channels (R, C, 4) of a level, from (`row`, `col`), for windows (H, W) near a pose."""
 
     made: Array
     row: int
@@ -170,13 +169,8 @@ FULLY_VALID = 0.99  # A pixel counts where the sampled map is valid by more
 
 
 class Sums(NamedTuple):
-    """Over the pixels of a view that count and see valid map, by kind of channel.
-
-    - `products`, `energies` (2,): view times map, map squared; `slopes` (2, 4): derivatives times
-      map.
-    - `left_energies`, `left_slopes`: view squared, derivatives times view where it sees no valid
-      map.
-    - `left_pixels` (B * B,): number of these by block."""
+    """Over the pixels of a view that count and see valid map, by kind of channel: view times map,
+    map squared, derivatives times map; `left`: over its pixels that see no valid map, by block."""
 
     products: NDArray[np.float64]
     energies: NDArray[np.float64]
@@ -216,8 +210,7 @@ def compared(template: Template, seen: Array, valid: Array, slopes: bool = True)
 
 
 def sampled_planes(template: Template, window: MapWindow, pose: Pose) -> tuple[Array, Array]:
-    """Channels (3, H, W), and validity (H, W), in memory of the thread, overwritten by the next
-    call."""
+    """Channels (3, H, W), validity (H, W), in memory that the thread's next call overwrites."""
     shape = template.mask.shape
     planes = thread_memory("sampled", 10 * template.mask.size).reshape(10, *shape)
     interleaved = planes[:4].reshape(*shape, 4)

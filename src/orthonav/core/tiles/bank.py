@@ -25,8 +25,7 @@ Poses = NDArray[np.float64]
 
 
 class Representation(Protocol):
-    """One channel, or a magnitude and harmonics 1, 2, .. of the doubled direction, real and
-    imaginary."""
+    """One channel, or a magnitude and real and imaginary parts of harmonics 1, 2, .."""
 
     @property
     def channels(self) -> int:
@@ -157,10 +156,7 @@ def _samples(thinned: _Thinned, poses: Poses, tile_px: int) -> tuple[Array, Arra
 
 def _turned(cells: Array, poses: Poses) -> Array:
     """Cells (Q, cells, cells, C) as on the map: harmonic k of the doubled direction turns by 2 k
-    turns.
-
-    A step of grey levels spreads over more pixels of the map where the view is coarser than
-    reported."""
+    turns, and grey levels spread over more pixels where the view is coarser than reported."""
     channels = cells.shape[-1]
     if channels == 1:
         return np.ascontiguousarray(cells)

@@ -1,5 +1,4 @@
-"""Means of a representation over micro-cells, computed once for a sheet: overlapping tiles share
-them."""
+"""Means of a representation over micro-cells, computed once for tiles that overlap."""
 
 import math
 from dataclasses import dataclass
@@ -39,8 +38,7 @@ class CellLayout:
 def cell_means(
     maps: NDArray[np.float32], valid: NDArray[np.bool_], layout: CellLayout
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Means (h, w, C) of (C, H, W), and valid share (h, w); sample (i, j) begins at spacing * (i,
-    j)."""
+    """Of (C, H, W), valid share (h, w); sample (i, j) begins at spacing * (i, j)."""
     shape = (layout.samples(maps.shape[1]), layout.samples(maps.shape[2]))
     means = np.empty((*shape, len(maps)), dtype=np.float32)
     for channel, single in enumerate(maps):

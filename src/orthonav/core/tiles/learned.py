@@ -1,7 +1,7 @@
 """Edges by a network from a file: `onnx:weights=PATH`.
 
 It takes "grey" (1, 1, H + 2 m, W + 2 m) float32, 0 to 1 with a margin of m pixels, and gives
-"edges" (1, 1, H, W), positive on an edge; `python -m experiments.paper.between_dates` makes one. A
+"edges" (1, 1, H, W), positive on an edge, as that of `experiments/paper/between_dates.onnx`. A
 map stores its SHA-256, and flies with that network only."""
 
 import hashlib
@@ -48,9 +48,7 @@ class LearnedEdges:
     def path(self) -> str:
         return self.weights or os.environ.get(VARIABLE, "")
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:

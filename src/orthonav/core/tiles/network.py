@@ -145,8 +145,7 @@ class NetworkEmbedder:
         return np.asarray(self.views(np.where(valid, maps, np.float32(0))[None])[0])
 
     def views(self, maps: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N, D) of (N, C, S, S), zero where not valid; unit vectors for "cosine". Raises
-        `ValueError`."""
+        """(N, D) of (N, C, S, S); unit vectors for "cosine". Raises `ValueError`."""
         if maps.ndim != 4 or maps.shape[1:] != self.shape:
             raise ValueError(f"maps must be (N, {self.shape}), got {maps.shape}")
         out = np.empty((len(maps), self.dims), dtype=np.float32)

@@ -171,8 +171,7 @@ class ExactIndex:
     def best(
         self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
     ) -> NDArray[np.float32]:
-        """Highest (N,) of any query (Q, D), without memory of N times Q. Raises `ValueError` for
-        none."""
+        """Highest (N,) of any query (Q, D), without memory of N times Q. Raises `ValueError`."""
         if len(queries) == 0:
             raise ValueError("at least one query is needed, got none")
         columns = np.ascontiguousarray(queries.T, dtype=np.float32)

@@ -20,8 +20,7 @@ _SHARES = [np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2) for k in range(1, HAR
 
 @dataclass(frozen=True)
 class OrientedGradients:
-    """(7, H, W): magnitude, then real and imaginary part of harmonics 1 to 3, in grey levels per
-    pixel."""
+    """(7, H, W), levels per pixel: magnitude, real and imaginary part of harmonics 1 to 3."""
 
     sigma_px: float = 1.5
 
@@ -31,9 +30,7 @@ class OrientedGradients:
                 f"gradient sigma_px must be above 0 and at most 16, got {self.sigma_px}"
             )
 
-    @property
-    def channels(self) -> int:
-        return 1 + 2 * HARMONICS
+    channels = 1 + 2 * HARMONICS
 
     @property
     def margin_px(self) -> int:
@@ -66,8 +63,7 @@ class OrientedGradients:
 def _fill_harmonics(
     out: NDArray[np.float32], cos: NDArray[np.float32], sin: NDArray[np.float32]
 ) -> None:
-    """In place, each harmonic from the one before: fresh arrays would cost more than the
-    arithmetic."""
+    """In place, each from the one before: fresh arrays would cost more than the arithmetic."""
     product = np.empty_like(cos)
     np.multiply(out[0], cos, out=out[1])
     np.multiply(out[0], sin, out=out[2])
@@ -95,13 +91,9 @@ TABLE = {
 class Gray:
     """0..1, (1, H, W): the baseline of Di Piazza et al. 2024."""
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
-    @property
-    def margin_px(self) -> int:
-        return 0
+    margin_px = 0
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
         return np.where(valid, grey, 0).astype(np.float32)[None] / np.float32(255)
@@ -109,10 +101,8 @@ class Gray:
 
 @dataclass(frozen=True)
 class Canny:
-    """Binary edges, by default as in Di Piazza et al. 2024, section 4.
-
-    `low`, `high`: hysteresis on the Sobel gradient (L1 norm, 8-bit grey), `kernel`: aperture (3, 5,
-    7)."""
+    """Binary edges, by default as in Di Piazza et al. 2024, section 4; thresholds on the Sobel
+    gradient (L1 norm, 8-bit grey), aperture 3, 5 or 7."""
 
     low: float = 100.0
     high: float = 200.0
@@ -124,9 +114,7 @@ class Canny:
         if self.kernel not in (3, 5, 7):
             raise VariantError(f"canny kernel must be 3, 5 or 7, got {self.kernel}")
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:

@@ -219,8 +219,7 @@ class WhitenedEmbedder:
         return _unit(((features - self._mean) * weights) @ self._basis)
 
     def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """(D,), zero for an empty view. Raises `ValueError` unless a square of a multiple of
-        `MICRO`."""
+        """(D,), zero if empty. Raises `ValueError` unless a square of a multiple of `MICRO`."""
         channels, height, width = maps.shape
         if height != width or height % MICRO:
             raise ValueError(f"view must be square, a multiple of {MICRO} px, got {maps.shape}")
@@ -247,9 +246,7 @@ class WhitenedEmbedder:
         return np.asarray(np.linalg.solve(normal, seen @ centred))
 
     def cells(self, cells: NDArray[np.float32], valid: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(Q, D) of many views, as `view`.
-
-        `cells` (Q, cells, cells, C): micro-cells weighted by `recipe.pooling`, `valid`: their
+        """(Q, D) of many views, as `view`; sums of micro-cells by `recipe.pooling`, and of their
         shares."""
         out = np.empty((len(cells), self.dims), dtype=np.float32)
         along = self.recipe.pooling.sum(axis=1)
@@ -267,10 +264,8 @@ class WhitenedEmbedder:
     def _from_parts(
         self, centred: NDArray[np.float32], weights: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """`_from_part` of many views (Q, D).
-
-        By conjugate gradients, preconditioned as if every cell had the mean weight: a twentieth of
-        the time."""
+        """`_from_part` of many views (Q, D), by conjugate gradients, preconditioned as if every
+        cell had the mean weight: a twentieth of the time."""
         loadings = self._loadings
         noisy = weights / np.float32(PART_NOISE)
         power = np.square(loadings).sum(axis=0)
@@ -363,10 +358,7 @@ def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> Wh
 
 
 def _whitening(
-    recipe: WhitenedRecipe,
-    mean: NDArray[np.float16],
-    scatter: NDArray[np.float64],
-    count: int,
+    recipe: WhitenedRecipe, mean: NDArray[np.float16], scatter: NDArray[np.float64], count: int
 ) -> WhitenedEmbedder:
     """Of `count` features with mean (F,) and scatter matrix (F, F)."""
     variances, vectors = np.linalg.eigh(scatter / count)

@@ -93,8 +93,7 @@ class Measurement:
 def measurement(
     model: Model, reported: ReportedAttitude, sighting: Sighting
 ) -> tuple[Array, Array, Array]:
-    """Mean (6,) and two covariances (6, 6): of map and view, and of telemetry noise, new at each
-    view."""
+    """Mean (6,), covariances (6, 6) of map and view, and of telemetry noise, new at each view."""
     noise = sighting.covariance.copy()
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)

@@ -125,10 +125,8 @@ def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def _divergence(means: Array, covariances: Array) -> Array:
-    """Kullback-Leibler divergence (nats) of each of several Gaussians from the first, (N,).
-
-    `means` (N, 6), `covariances` (N, 6, 6): of `COMPARED`. A well-known place must not vanish in a
-    wide hypothesis around it (docs/decisions/tracking.md)."""
+    """Kullback-Leibler divergence (nats, (N,)) of Gaussians (N, 6) of `COMPARED` from the first: a
+    well-known place must not vanish in a wide hypothesis (docs/decisions/tracking.md)."""
     inverse = np.linalg.inv(covariances[0])
     off = means - means[0]
     turned = inverse @ covariances
@@ -173,8 +171,7 @@ def distance(one: Hypothesis, other: Hypothesis) -> float:
 
 
 MIN_SPLIT = 1e-5
-"""Less likely predictions are not followed. Values without a source: by the flights of
-docs/tracking.md."""
+"""Least share to be followed. Values without a source: by the flights of docs/tracking.md."""
 MINOR_SHARE = 1e-4  # less likely hypotheses are not split for rare events,
 MAJOR_SHARE = 0.05  # nor these without odometry, where hypotheses are not merged between views
 START_SHARE = 0.9  # of a reported start position
@@ -249,10 +246,7 @@ class Mixture:
         self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
 
     def move(
-        self,
-        plane: LocalFrame,
-        other: LocalFrame,
-        extent_en_m: tuple[float, float, float, float],
+        self, plane: LocalFrame, other: LocalFrame, extent_en_m: tuple[float, float, float, float]
     ) -> None:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
@@ -303,10 +297,8 @@ class Mixture:
         camera: CameraDisplacement | None = None,
         telemetry_noise: Array | None = None,
     ) -> None:
-        """By the reported velocity and the camera's odometry.
-
-        `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view and of
-        the horizon (rad); None: those of the model."""
+        """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
+        (rad), log scale, horizon (rad), None: the model's."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays = 1 - self.model.lost
         made = []
@@ -409,10 +401,7 @@ class Mixture:
         return replace(each, share=share, sighted=_forgotten(each.sighted, ground))
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
-        """The best cluster, None where there is no hypothesis.
-
-        It updates the state of the track, except with `between_views`: after the prediction, before
-        the update."""
+        """The best cluster, None without hypotheses. Updates the state, except `between_views`."""
         if not self.hypotheses:
             return None
         best = self._best(radius_m)
@@ -433,10 +422,8 @@ class Mixture:
         return Estimate(mean, covariance, confidence, self._state, belief, seen, confirmed, follows)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
-        """Largest probability of having recognized the map at the estimated position.
-
-        Hypotheses farther from it than it is certain, or that hardly contribute to it, do not
-        count."""
+        """Largest probability of having recognized the map, of hypotheses no farther away than it
+        is certain and that contribute."""
         reach_m = RECOGNIZED_SIGMAS * math.sqrt(float(np.trace(covariance[POSITION, POSITION])) / 2)
         least = RECOGNIZED_SHARE * sum(each.share for each in near)
         return max(
@@ -516,10 +503,8 @@ class Mixture:
         ground: float,
         confirms: bool,
     ) -> Iterator[Hypothesis]:
-        """After a measurement, without those for which it lies outside the gate.
-
-        `found`: probability that a view is found. `ground`: share that the last view did not show.
-        """
+        """After a measurement, without those for which it lies outside the gate. `found`:
+        probability that a view is found. `ground`: share that the last view did not show."""
         near = [each for each in starts if self._is_near(each, seen)]
         if not near:
             return

@@ -20,8 +20,7 @@ HEADING, SCALE, TILT, HORIZON = 4, 5, slice(6, 8), slice(8, 10)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Least standard deviations of heading and log scale of a registered view."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
-"""Misalignment of a good mount: metres on the ground, within these angles
-(docs/decisions/tracking.md)."""
+"""Of a good mount: metres on the ground, within these angles (docs/decisions/tracking.md)."""
 TILT_WALK_SHARE = 1 / 30
 """Drift per root of a second, over the misalignment: as much in a quarter of an hour."""
 SEEN: Array = np.zeros((6, STATE))
@@ -33,16 +32,14 @@ WHITE_SHARE = 0.2  # share of the error of a reported tilt that is independent a
 
 @dataclass(frozen=True)
 class Model:
-    """Standard deviations and probabilities; those without a source are by the flights of
-    docs/tracking.md."""
+    """Standard deviations, probabilities; without a source by the flights of docs/tracking.md."""
 
     speed_mps: float = 30.0  # of an unknown velocity, per axis
     accel_mps2: float = 4.0  # while no velocity is reported, per axis
     reported_velocity_s: float = 120.0
     """Correlation time of the error of a reported velocity (docs/decisions/tracking.md)."""
     coasting_walk: float = 1.3
-    """Of its drift while views do not show the map, m/s per root of a second: 9 m after 5 s, 24 m
-    after 10."""
+    """Of its drift while views do not show the map, m/s per root of a second."""
     heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)  # of the constant error,
     heading_noise_rad: float = math.radians(2.0)  # from view to view, without `yaw_std_deg`,
     heading_walk: float = math.radians(0.05)
@@ -62,8 +59,7 @@ class Model:
     bias_jump: float = 0.01
     """Per view: a gimbal that moved (by `off_tilt_rad`), a compass that was reset."""
     odometry_outlier: float = 0.01
-    """A displacement that fits well and is wrong: clouds, fields that repeat
-    (docs/decisions/tracking.md)."""
+    """A displacement that fits well and is wrong (docs/decisions/tracking.md)."""
     turn: float = 0.03  # per second: the velocity changes by more than `accel_mps2` allows
     miss: float = 0.5  # A view of ground on the map cannot be found on it
     wide_m: float = 50.0  # per axis: less certain positions are confirmed again after a while
@@ -73,8 +69,7 @@ class Model:
     """Belief that returns to "elsewhere" with every view, so that no error is permanent."""
 
     def at_height(self, agl_m: float) -> "Model":
-        """High flights need good mounts: expected to be off by `MOUNT_M` on the ground, within
-        `MOUNT_RAD`."""
+        """With a mount off by `MOUNT_M` on the ground, within `MOUNT_RAD`: high flights need it."""
         low, high = MOUNT_RAD
         return self.with_mount(min(max(MOUNT_M / max(agl_m, 1e-3), low), high))
 

@@ -150,10 +150,8 @@ def _add(noise: Array, position: float, both: float, velocity: float) -> None:
 
 
 def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected, float]:
-    """With a displacement by the camera, and the log density of that.
-
-    It measures the position less that before (stochastic cloning, Roumeliotis and Burdick 2002),
-    rotated and scaled by the errors before; errors of both tilts look like motion."""
+    """With a displacement by the camera, and the log density of that (stochastic cloning,
+    Roumeliotis and Burdick 2002), under errors of heading, scale and both tilts."""
     mean = np.concatenate([expected.mean, expected.mean_before])
     now, before = slice(0, STATE), slice(STATE, 2 * STATE)
     joint = np.empty((2 * STATE, 2 * STATE))  # filled: np.block takes ten times as long

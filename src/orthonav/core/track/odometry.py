@@ -20,15 +20,13 @@ from orthonav.core.register.window import Reference
 from orthonav.core.track import CameraDisplacement
 
 VIEW_PX = 160
-"""Across: half the resolution of a fix. Values without a source: by the flights of
-docs/tracking.md."""
+"""Across: half that of a fix. Values without a source: by the flights of docs/tracking.md."""
 LEVELS = 3  # of a view that serves as the map of the next one
 TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
 """Of the search from a coarse level: about that of `policy.SearchPolicy`."""
 MAX_SPEED_MPS = 80.0  # for which a displacement is sought
 MIN_SCORE_RATIO = 2.5
-"""Over the strongest rival: right ones have at least 4 on Arroio and generated land, wrong ones
-1.7."""
+"""Over the strongest rival: at least 4 for right ones, at most 1.7 for wrong ones."""
 MIN_CORRELATION = 0.4
 """Right ones have at least 0.56, wrong ones at most 0.11 (docs/decisions/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
@@ -135,12 +133,7 @@ class OdometryView:
         return np.asarray(self.en_from_px @ -self.camera_px)
 
     @classmethod
-    def of(
-        cls,
-        view: View,
-        pixel_m: float | None,
-        bias: Array = NO_BIAS,
-    ) -> "OdometryView | None":
+    def of(cls, view: View, pixel_m: float | None, bias: Array = NO_BIAS) -> "OdometryView | None":
         """None where it shows too little."""
         camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
@@ -161,9 +154,7 @@ class OdometryView:
         )
 
     def corrected(self, bias: Array) -> "OdometryView | None":
-        """With the present estimate of the biases.
-
-        Both views need the same: what was learnt between them would appear as motion
+        """With the present biases: what was learnt between two views would else appear as motion
         (docs/decisions/tracking.md)."""
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
             return OdometryView.of(self.view, self.pixel_m, bias)
@@ -224,9 +215,7 @@ def displacement(
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Ground that is not level.
-
-    `below`, `seen` (2,): rise per metre east and north below the camera, and where both views look.
+    """Ground that is not level: rise (2,) per metre below the camera and where both views look;
     `rise`: of the ground there over that below, as a share of the height."""
 
     below: Array

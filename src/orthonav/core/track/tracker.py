@@ -59,9 +59,7 @@ from orthonav.core.track.odometry import (
 )
 from orthonav.core.track.smooth import History, Smoothed
 
-LOCAL_SHARE = 0.75
-"""Belief from which on only its surroundings are searched. Values without a source:
-docs/tracking.md."""
+LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
 LOCAL_SIGMAS = 4.0  # half width of that search,
 MIN_LOCAL_M = 30.0  # and its least
 LEAST_NEW = 0.15
@@ -78,9 +76,7 @@ UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
 NEAR_SHARE = 0.05  # of the side of a view: closer places are one
 KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
 KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
-SIGHT_STEPS = 4
-"""To the ground that a view shows: each leaves a share of the error, slope over that of the line.
-"""
+SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a share of the error
 Array = NDArray[np.float64]
 
 
@@ -151,8 +147,7 @@ class Tracker:
     def continue_on(self, localizer: Localizer) -> None:
         """Continue the track between two views on another map, which shows the aircraft too.
 
-        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor.
-        """
+        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor."""
         frame = self._localizer.sheet.frame
         self.mixture.move(frame, localizer.sheet.frame, self._use(localizer))
 
@@ -160,8 +155,7 @@ class Tracker:
         """The position of the aircraft, by this view and all before it.
 
         A view that shows nothing is bridged by dead reckoning. Raises `CameraError` if the camera
-        has another size than the picture.
-        """
+        has another size than the picture."""
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
         if self._usual_scale:
             self._usual_scale = False
@@ -192,8 +186,7 @@ class Tracker:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
         `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
-        reported velocity over ground. Raises as `View.of`.
-        """
+        reported velocity over ground. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
@@ -424,8 +417,7 @@ class Tracker:
         return over_terrain(made, heights_m, terrain, ahead_en_m)
 
     def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
-        """None where it is unknown. `ahead_en_m` (2,), by heading and height as reported, on level
-        ground."""
+        """None where unknown. `ahead_en_m` (2,): as reported, on level ground."""
         best = self.mixture.likeliest
         if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
             return None
@@ -478,8 +470,7 @@ class Tracker:
         return None
 
     def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
-        """Height above the expected ground: the correction includes the error of the ground assumed
-        before."""
+        """The correction includes the error of the ground assumed before."""
         relief = self._registration.relief
         height_m = float(relief.terrain.at_en_m(place_en_m))
         if relief.is_level or not math.isfinite(height_m):
@@ -537,8 +528,7 @@ class Tracker:
         log_scale: float,
         searched_share: float,
     ) -> list[Sighting]:
-        """`telemetry`: corrected by the track, its height by `log_scale`. `searched_share`: of the
-        map."""
+        """`telemetry`: corrected, its height by `log_scale`. `searched_share`: of the map."""
         near_px = NEAR_SHARE * search.view.side_px
         places = places_of(best, self._confidence, near_px, searched_share)
         made = []

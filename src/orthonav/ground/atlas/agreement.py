@@ -16,104 +16,60 @@ from numpy.typing import NDArray
 from orthonav.core.geo.frames import LocalFrame, distances_m
 
 # Values without another source were chosen with `benchmarks.atlas_lost` at d63ac91.
-MAX_SPEED_MPS = 120.0
-"""Faster than the aircraft that this program is for; a slower limit would exclude some."""
-SLACK_M = 60.0
-"""Errors of two registered positions, seven pixels of 8 m."""
-TURN_RATE_RAD_S = math.radians(12.0)
-"""Four times a standard-rate turn (3 deg/s)."""
-TURN_SLACK_RAD = math.radians(12.0)
-"""Errors of two registered headings."""
-SCALE_SLACK = 0.12
-"""Greatest difference of log scale between two views of a chain, besides climbing."""
-CLIMB_PER_S = 0.02
-"""Change of log scale per second: 20 m/s at 1000 m."""
-MIN_NEW = 0.15
-"""Share of a view that must be new ground for it to count: hovering proves nothing. The track
-weighs views in the same way (docs/decisions/tracking.md)."""
-ANCHORS = 30
-"""Places that counted and are remembered: circling over them proves nothing more."""
-MAX_REACH_M = 5_000.0
-"""A chain whose aircraft may be farther from the expected place is dropped: no gap is bridged
-blindly."""
-MIN_VELOCITY_S = 0.5
-"""Views closer in time do not give a velocity."""
-AGILE_MPS = 10.0
-"""The velocity may change by so much, and by half, between two views."""
-MISSED = 1.6
-"""Nats that a view which does not support a chain costs it: exp(-1.6) is 0.2, `1 - FOUND`."""
-CHANCE = 0.05
-"""Least probability that a wrong place lies by chance where a chain expects the view."""
-FOUND = 0.8
-"""Probability that the right place is found where a chain expects the view."""
-MAX_LOG_ODDS = 5.0
-"""No single view counts more than this: odds of 150."""
+MAX_SPEED_MPS = 120.0  # faster than the aircraft that this program is for
+SLACK_M = 60.0  # errors of two registered positions, seven pixels of 8 m
+TURN_RATE_RAD_S = math.radians(12.0)  # four times a standard-rate turn (3 deg/s)
+TURN_SLACK_RAD = math.radians(12.0)  # errors of two registered headings
+SCALE_SLACK = 0.12  # greatest difference of log scale between two views, besides climbing
+CLIMB_PER_S = 0.02  # change of log scale per second: 20 m/s at 1000 m
+MIN_NEW = 0.15  # share of a view that must be new ground (docs/decisions/tracking.md)
+ANCHORS = 30  # places that counted and are remembered: circling over them proves nothing more
+MAX_REACH_M = 5_000.0  # a chain whose aircraft may be farther away is dropped
+MIN_VELOCITY_S = 0.5  # views closer in time do not give a velocity
+AGILE_MPS = 10.0  # the velocity may change by so much, and by half, between two views
+MISSED = 1.6  # nats that a view without support costs a chain: exp(-1.6) is 0.2, `1 - FOUND`
+CHANCE = 0.05  # least probability that a wrong place lies by chance where a chain expects the view
+FOUND = 0.8  # probability that the right place is found where a chain expects the view
+MAX_LOG_ODDS = 5.0  # no single view counts more than this: odds of 150
 MAX_CHAINS = 12
-HOPELESS = 9.0
-"""Chains less likely than the best by more nats are dropped."""
-MIN_VIEWS = 1.7
-"""Views of new ground that must agree before there is a fix: two views that overlap by 30 %."""
-MAX_CHAIN_LOG_ODDS = 14.0
-"""Chains remember no more nats, so that a chain that became wrong is given up after some views."""
+HOPELESS = 9.0  # chains less likely than the best by more nats are dropped
+MIN_VIEWS = 1.7  # views of new ground that must agree: two that overlap by 30 %
+MAX_CHAIN_LOG_ODDS = 14.0  # so that a chain that became wrong is given up after some views
 
 
 @dataclass(frozen=True)
 class Placement:
-    """How a view may have been taken.
-
-    `lat_deg`, `lon_deg`: place of the camera, if nothing else is said.
-    `turn_rad`: heading of the top of the view.
-    `log_scale`: logarithm of true over reported height.
-    """
+    """How a view may have been taken. `lat_deg`, `lon_deg`: place of the camera, if nothing else is
+    said."""
 
     lat_deg: float
     lon_deg: float
-    turn_rad: float
-    log_scale: float
+    turn_rad: float  # heading of the top of the view
+    log_scale: float  # logarithm of true over reported height
 
     @property
     def latlon_deg(self) -> tuple[float, float]:
-        """Latitude and longitude."""
         return self.lat_deg, self.lon_deg
 
 
 @dataclass(frozen=True)
 class PlaceEvidence(Placement):
-    """A possible placement with its evidence.
-
-    `log_odds`: of this place against all others of the atlas, from this view alone (nats).
-    `key`: number by which the caller recognizes the view.
-    """
-
-    log_odds: float
-    key: int
+    log_odds: float  # of this place against all others of the atlas, from this view alone (nats)
+    key: int  # number by which the caller recognizes the view
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A chain of places.
-
-    `last`: the latest place.
-    `time_ns`: when it was seen.
-    `log_odds`: of the chain (nats).
-    `views`: how many agree, in views of new ground.
-    `latest_log_odds`: what the latest view alone says of its place (nats).
-    `anchors`: the places of the views that counted.
-    `velocity_en_mps`: east and north, None where unknown.
-    `missed`: views since the latest place that did not support the chain.
-    """
-
-    last: PlaceEvidence
-    time_ns: int
-    log_odds: float
-    views: float
-    latest_log_odds: float
-    anchors: tuple[PlaceEvidence, ...]
-    velocity_en_mps: NDArray[np.float64] | None = None
-    missed: int = 0
+    last: PlaceEvidence  # the latest place
+    time_ns: int  # when it was seen
+    log_odds: float  # of the chain (nats)
+    views: float  # how many agree, in views of new ground
+    latest_log_odds: float  # what the latest view alone says of its place (nats)
+    anchors: tuple[PlaceEvidence, ...]  # the places of the views that counted
+    velocity_en_mps: NDArray[np.float64] | None = None  # east and north, None where unknown
+    missed: int = 0  # views since the latest place that did not support the chain
 
     def latest(self, count: int) -> tuple[PlaceEvidence, ...]:
-        """The latest places that counted, and the last one; at most `count`."""
         places = self.anchors if self.anchors[-1] is self.last else (*self.anchors, self.last)
         return places[-count:]
 
@@ -121,7 +77,6 @@ class Chain:
         return max(0.0, (time_ns - self.time_ns) / 1e9)
 
     def reach_m(self, time_ns: int) -> float:
-        """How far the aircraft may be from the expected place."""
         speed = MAX_SPEED_MPS
         if self.velocity_en_mps is not None:
             latest = float(np.hypot(*self.velocity_en_mps))
@@ -129,7 +84,6 @@ class Chain:
         return SLACK_M + speed * self._seconds(time_ns)
 
     def expected(self, time_ns: int) -> tuple[float, float]:
-        """Latitude and longitude where the aircraft is expected."""
         if self.velocity_en_mps is None:
             return self.last.latlon_deg
         frame = LocalFrame(*self.last.latlon_deg)
@@ -137,12 +91,10 @@ class Chain:
         return float(lat), float(lon)
 
     def turn_std_rad(self, time_ns: int) -> float:
-        """Standard deviation of the change of heading since the latest place."""
         turned = TURN_SLACK_RAD + TURN_RATE_RAD_S * self._seconds(time_ns)
         return min(math.pi / 2, turned / 3)
 
     def reaches(self, place: PlaceEvidence, time_ns: int) -> bool:
-        """Whether the aircraft can have flown to that place."""
         dt_s = self._seconds(time_ns)
         away = distances_m([self.expected(time_ns)], [place.latlon_deg])[0]
         turned = abs(math.remainder(place.turn_rad - self.last.turn_rad, 2 * math.pi))
@@ -163,11 +115,9 @@ class Agreement:
     def add_view(
         self, places: Sequence[PlaceEvidence], time_ns: int, side_m: float, chance: float
     ) -> None:
-        """Take in the places where a view `side_m` wide may have been taken.
-
-        `chance`: probability that the best of the wrong places lies where a chain expects the view,
-        the share of the searched area that was searched there.
-        """
+        """Take in the places where a view `side_m` wide may have been taken. `chance`: probability
+        that the best of the wrong places lies where a chain expects the view, the share of the
+        searched area that was searched there."""
         gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
         made: list[Chain] = []
         supporting = [each for each in places if _support(each, gain) > 0]
@@ -191,12 +141,10 @@ class Agreement:
 
     @property
     def best(self) -> Chain | None:
-        """The likeliest chain, None where there is none."""
         return self.chains[0] if self.chains else None
 
     @property
     def probability(self) -> float:
-        """Probability of the likeliest chain, against the other chains and none of them."""
         if not self.chains:
             return 0.0
         odds = np.array([0.0, *(each.log_odds for each in self.chains)])
@@ -213,13 +161,11 @@ class Agreement:
 
     @property
     def agreed(self) -> bool:
-        """Whether enough views support the likeliest chain, the latest view among them."""
         best = self.best
         return best is not None and best.views >= MIN_VIEWS and best.missed == 0
 
 
 def _support(place: PlaceEvidence, gain: float) -> float:
-    """Nats by which a view found at an expected place supports the chain."""
     return min(place.log_odds, MAX_LOG_ODDS) + gain
 
 
@@ -244,7 +190,6 @@ def _extended(
 
 
 def _velocity(chain: Chain, place: PlaceEvidence, dt_s: float) -> NDArray[np.float64] | None:
-    """Metres per second east and north from the latest place of a chain to this one."""
     if dt_s < MIN_VELOCITY_S:
         return chain.velocity_en_mps
     frame = LocalFrame(*chain.last.latlon_deg)
@@ -254,7 +199,6 @@ def _velocity(chain: Chain, place: PlaceEvidence, dt_s: float) -> NDArray[np.flo
 
 
 def _distinct(made: Sequence[Chain], side_m: float) -> list[Chain]:
-    """The likeliest of the chains that end at the same place, best first, without hopeless ones."""
     chains: list[Chain] = []
     for each in sorted(made, key=lambda one: (-one.log_odds, -one.views)):
         if chains and each.log_odds < chains[0].log_odds - HOPELESS:
@@ -267,5 +211,4 @@ def _distinct(made: Sequence[Chain], side_m: float) -> list[Chain]:
 
 
 def nearest_m(place: tuple[float, float], others: Sequence[tuple[float, float]]) -> float:
-    """Distance to the nearest of other places, infinite where there are none."""
     return float(distances_m([place] * len(others), others).min(initial=math.inf))

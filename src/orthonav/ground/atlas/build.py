@@ -43,39 +43,28 @@ from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.sheets import sheets_of_route
 
-MARGIN_PX = 64
-"""Pixels beyond a tile that gradients and resampling use, and some more."""
-TOUCH_DEG = 1e-9
-"""Boxes that overlap by less than this only touch: a tenth of a millimetre."""
-_POINTS = 17
-"""Points along a side of a sheet at which it is compared with a search band."""
+MARGIN_PX = 64  # pixels beyond a tile that gradients and resampling use, and some more
+TOUCH_DEG = 1e-9  # boxes that overlap by less than this only touch: a tenth of a millimetre
+_POINTS = 17  # points along a side of a sheet at which it is compared with a search band
 
 
 @dataclass(frozen=True)
 class AtlasRequest:
-    """What to build into an atlas.
+    """What to build into an atlas. `recipe`: fields of `AtlasRecipe` that were requested, `coarse`
+    with some or all of its own; the others are the atlas's, or the defaults (`gsd_m`: that of the
+    imagery). `route`, `band_m`: area: a search band around a route, in metres. Without bounds or
+    route all imagery is the area. `replace`: rebuild sheets of other imagery or program versions
+    instead of refusing them. `dem`, `dem_datum`: terrain model of which sheets get a terrain layer
+    where it has heights, and what its heights count from."""
 
-    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
-    `orthos`: files and folders of orthophotos; the first covers the next.
-    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
-    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
-    `bounds_deg`: area: west, south, east, north.
-    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
-    imagery is the area.
-    `replace`: rebuild sheets of other imagery or program versions instead of refusing them.
-    `index`: also make the index of the coarse tiles.
-    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
-    what its heights count from.
-    """
-
-    url: str
-    orthos: Sequence[Path]
+    url: str  # the atlas, a folder or an fsspec URL, created where it does not exist
+    orthos: Sequence[Path]  # files and folders of orthophotos; the first covers the next
     recipe: Mapping[str, Any] = field(default_factory=dict)
-    bounds_deg: Extent | None = None
+    bounds_deg: Extent | None = None  # area: west, south, east, north
     route: Route | None = None
     band_m: float | None = None
     replace: bool = False
-    index: bool = True
+    index: bool = True  # also make the index of the coarse tiles
     dem: Path | None = None
     dem_datum: str | None = None
 
@@ -85,25 +74,18 @@ class AtlasRequest:
 
 @dataclass(frozen=True)
 class SheetTask:
-    """A sheet to be built, with all that a worker on another machine needs.
+    """A sheet to be built, with all that a worker on another machine needs. `dem`, `dem_datum`:
+    terrain model and what its heights count from, as for a map."""
 
-    `sheet`: its description, without tiles and area yet.
-    `atlas`: folder or URL of the atlas.
-    `orthos`: the files and folders that may show it.
-    `recipe`: how it is made.
-    `dem`, `dem_datum`: terrain model and what its heights count from, as for a map.
-    """
-
-    sheet: Sheet
-    atlas: str
-    orthos: tuple[Path, ...]
-    recipe: AtlasRecipe
+    sheet: Sheet  # its description, without tiles and area yet
+    atlas: str  # folder or URL of the atlas
+    orthos: tuple[Path, ...]  # the files and folders that may show it
+    recipe: AtlasRecipe  # how it is made
     dem: Path | None = None
     dem_datum: str | None = None
 
 
 def versions() -> dict[str, str]:
-    """The versions that determine the bytes of a map."""
     return {
         "orthonav": __version__,
         "numpy": np.__version__,
@@ -114,7 +96,6 @@ def versions() -> dict[str, str]:
 
 
 def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
-    """The differences, each as `name this, not that`."""
     return [
         f"{name} {found.get(name, 'absent')}, not {version}"
         for name, version in wanted.items()
@@ -124,10 +105,7 @@ def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> 
 
 def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> list[SheetTask]:
     """A task for each sheet of an area that imagery may touch, from south to north, west to east.
-
-    `mosaic`: that of the orthophotos of the request. Raises `AreaError` where there is no sheet,
-    and for recipes by which no sheet could be built.
-    """
+    `mosaic`: that of the orthophotos of the request."""
     imagery = Imagery(mosaic)
     names = sorted(_names(recipe, imagery, request))
     if not names:
@@ -163,10 +141,8 @@ def request_digest(
     dem_datum: str | None = None,
 ) -> str:
     """Digest of what a sheet depends on: recipe, versions, the imagery under it, and the terrain.
-
     Each file counts with its name, size and second of change, in the order in which files cover
-    each other; its folder does not count, as it may differ between machines.
-    """
+    each other; its folder does not count, as it may differ between machines."""
     stamps = [
         [Path(name).name, size, changed_ns // 10**9]
         for source in part.sources
@@ -180,7 +156,6 @@ def request_digest(
 
 
 def margin_m(recipe: AtlasRecipe) -> float:
-    """Width of the margin around its box on which a sheet may depend."""
     reach_m = (recipe.tile_px + MARGIN_PX) * recipe.gsd_m
     if recipe.coarse is None:
         return reach_m
@@ -188,13 +163,10 @@ def margin_m(recipe: AtlasRecipe) -> float:
 
 
 class Imagery:
-    """The sources of a mosaic by place."""
-
     def __init__(self, mosaic: Mosaic) -> None:
         self.mosaic = mosaic
 
     def under(self, bounds_deg: Extent, reach_m: float) -> Mosaic:
-        """The sources that may show a box and a margin of `reach_m` around it."""
         west, south, east, north = box_around(Area.from_bounds(bounds_deg), reach_m)
         boxes = self._boxes
         middle = (west + east) / 2
@@ -206,7 +178,6 @@ class Imagery:
         return Mosaic(sources, tuple(self.mosaic.stretches[index] for index in chosen))
 
     def sheets(self, recipe: AtlasRecipe) -> set[str]:
-        """Names of the sheets that the boxes of the sources touch."""
         found: set[str] = set()
         for west, south, east, north in self._boxes.tolist():
             around = turned(west) if east - west < 360 else -180.0
@@ -240,7 +211,6 @@ def _swapped(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> st
 
 
 def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iterable[str]:
-    """Names of the sheets of an area that imagery may touch."""
     route, bounds_deg = request.route, request.bounds_deg
     require_one_area(route, request.band_m, bounds_deg)
     there = imagery.sheets(recipe)
@@ -256,7 +226,6 @@ def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iter
 def _along(
     recipe: AtlasRecipe, route: Route, band_m: float | None, there: set[str]
 ) -> Iterator[str]:
-    """The sheets that the search band of a route crosses, and some that it nearly touches."""
     world = recipe.sheets
     for part in sheets_of_route(route, band_m):
         area = Area.from_route(part, band_m)
@@ -271,7 +240,6 @@ def _along(
 
 
 def _overlap(bounds_deg: Extent, other: Extent) -> bool:
-    """Whether two boxes share more than an edge."""
     west, south, east, north = bounds_deg
     shift = 360 * round(((other[0] + other[2]) / 2 - (west + east) / 2) / 360)
     across = min(east + shift, other[2]) - max(west + shift, other[0])
@@ -279,10 +247,8 @@ def _overlap(bounds_deg: Extent, other: Extent) -> bool:
 
 
 def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: float) -> None:
-    """Raise `AreaError` for recipes by which this sheet cannot be built with any imagery.
-
-    An `AreaError` of a worker then means that there is no imagery.
-    """
+    """Raise `AreaError` for recipes by which this sheet cannot be built with any imagery. An
+    `AreaError` of a worker then means that there is no imagery."""
     area = Area.from_bounds(bounds_deg)
     grid = grid_of(
         area, min(imagery_gsd_m, recipe.gsd_m), recipe.gsd_m, recipe.tile_px, recipe.overlap
@@ -294,11 +260,9 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
-    """The files and folders that a worker needs to read the same pixels as from all of them.
-
-    All of them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from
-    many files together.
-    """
+    """The files and folders that a worker needs to read the same pixels as from all of them. All of
+    them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from many
+    files together."""
     common = any(each is not None for each in mosaic.stretches)
     if common or any(source.marked_alpha for source in mosaic.sources):
         return tuple(orthos)
@@ -308,7 +272,6 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
-    """Raise `AtlasError` naming the sheets of the atlas (`known`) of other imagery or versions."""
     sheets = [task.sheet for task in tasks if task.sheet.id in known]
     other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
     if not other:
@@ -333,67 +296,47 @@ Status = Literal["built", "unchanged", "empty", "failed"]
 
 @dataclass(frozen=True)
 class SheetResult:
-    """The result of one sheet and its cost.
+    """The result of one sheet and its cost. `status`: `built`; `unchanged`, it was there already;
+    `empty`, there is no imagery; `failed`. `size_bytes`, `area_km2`, `tiles`: of the sheet."""
 
-    `sheet`: name.
-    `status`: `built`; `unchanged`, it was there already; `empty`, there is no imagery; `failed`.
-    `error`: why it failed.
-    `cpu_s`: processor time.
-    `wall_s`: time that the worker spent on it.
-    `size_bytes`, `area_km2`, `tiles`: of the sheet.
-    `peak_bytes`: greatest memory that the worker process ever had.
-    """
-
-    sheet: str
+    sheet: str  # name
     status: Status
-    error: str = ""
-    cpu_s: float = 0.0
-    wall_s: float = 0.0
+    error: str = ""  # why it failed
+    cpu_s: float = 0.0  # processor time
+    wall_s: float = 0.0  # time that the worker spent on it
     size_bytes: int = 0
     area_km2: float = 0.0
     tiles: int = 0
-    peak_bytes: int = 0
+    peak_bytes: int = 0  # greatest memory that the worker process ever had
 
 
 @dataclass
 class BuildReport:
-    """The results of a build of `total` sheets; grows while sheets are finished.
+    """The results of a build of `total` sheets; grows while sheets are finished."""
 
-    `url`: the atlas.
-    `total`: sheets asked for.
-    `started_s`: monotonic clock at the start.
-    `results`: sheets that are finished or failed.
-    `finish_error`: why snapshot or index could not be written.
-    """
-
-    url: str
-    total: int
-    started_s: float = field(default_factory=time.monotonic)
-    results: list[SheetResult] = field(default_factory=list)
-    finish_error: str | None = None
+    url: str  # the atlas
+    total: int  # sheets asked for
+    started_s: float = field(default_factory=time.monotonic)  # monotonic clock at the start
+    results: list[SheetResult] = field(default_factory=list)  # sheets that are finished or failed
+    finish_error: str | None = None  # why snapshot or index could not be written
     wall_s: float = 0.0
 
     def names(self, status: Status) -> list[str]:
-        """Names of the sheets with that status, sorted."""
         return sorted(each.sheet for each in self.results if each.status == status)
 
     @property
     def untried(self) -> int:
-        """Number of sheets that were not begun."""
         return self.total - len(self.results)
 
     @property
     def share(self) -> float:
-        """Share of the sheets that is done."""
         return len(self.results) / max(1, self.total)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all that was asked for is there."""
         return not self.names("failed") and not self.untried and self.finish_error is None
 
     def line(self) -> str:
-        """Progress in one line."""
         plain = self.to_plain()
         text = f"{len(self.results):,} of {self.total:,} sheets"
         if plain["area_km2"]:
@@ -409,9 +352,7 @@ class BuildReport:
 
     def to_plain(self, cpu_hour_price: float | None = None) -> dict[str, Any]:
         """Sums and rates as plain values; `cpu_hour_price` is the price of an hour of a core.
-
-        `core_s` is how long workers were busy with sheets, which is what machines are paid for.
-        """
+        `core_s` is how long workers were busy with sheets, which is what machines are paid for."""
         built = [each for each in self.results if each.status == "built"]
         tried = [each for each in self.results if each.status != "unchanged"]
         wall_s = self.wall_s or time.monotonic() - self.started_s
@@ -450,7 +391,6 @@ class BuildReport:
 
 
 def duration(seconds: float) -> str:
-    """A time for people: `2 h 05 min`."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -463,15 +403,11 @@ def _rate(value: float, by: float, digits: int = 4) -> float | None:
 
 log = logging.getLogger(__name__)
 
-PROGRESS_EVERY_S = 10.0
-"""Between two lines of progress."""
-GIVE_UP_AFTER = 8
-"""Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
-SCRATCH = "orthonav-sheet-"
-"""Names of temporary folders begin with it."""
+PROGRESS_EVERY_S = 10.0  # between two lines of progress
+GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
+SCRATCH = "orthonav-sheet-"  # names of temporary folders begin with it
 _LOCK = "in-use"
-LEARNT = ("autoencoder", "caevl", "triplet")
-"""Methods for which a worker is given a GPU."""
+LEARNT = ("autoencoder", "caevl", "triplet")  # methods for which a worker is given a GPU
 
 
 def build_atlas(
@@ -480,13 +416,11 @@ def build_atlas(
     progress: Progress = no_progress,
     report: Callable[[str], None] = log.info,
 ) -> BuildReport:
-    """Build the missing sheets with a runner that was entered, and report the results.
-
-    A sheet that fails is listed in the result, and the others are built. `progress` is called
-    with a stage and its share done, `report` with lines for people. Raises `AreaError`,
-    `ImageryError`, `MissingFileError`; `AtlasError` where present sheets are of other imagery or
-    versions; `WorkerError` where workers have other versions; `StorageError`.
-    """
+    """Build the missing sheets with a runner that was entered, and report the results. A sheet that
+    fails is listed in the result, and the others are built. `progress` is called with a stage and
+    its share done, `report` with lines for people. Raises `AreaError`, `ImageryError`,
+    `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
+    `WorkerError` where workers have other versions; `StorageError`."""
     started_s = time.monotonic()
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
@@ -521,7 +455,6 @@ def build_atlas(
 
 
 def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
-    """The requested recipe. Raises `AtlasError` where it is impossible, or not the atlas's."""
     try:
         if Store(request.url).size(CATALOG) is not None:
             atlas = Atlas.open(request.url)
@@ -535,7 +468,6 @@ def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
 
 
 def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
-    """The requested fields of the recipe; those of the coarse tiles completed."""
     fields = dict(request.recipe)
     if isinstance(fields.get("coarse"), Mapping):
         fields["coarse"] = replace(coarse or CoarseRecipe(), **fields["coarse"])
@@ -543,11 +475,6 @@ def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, 
 
 
 def build_sheet(task: SheetTask) -> SheetResult:
-    """Build a sheet and put it into the atlas. Depends only on the task and the imagery.
-
-    Raises `WorkerError` where this program has other versions than the task, `AtlasError` where it
-    sees other imagery, `ImageryError`, `OutputError`, `StorageError`.
-    """
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     wanted = task.sheet
     if differences := version_differences(wanted.made_by, versions()):
@@ -572,7 +499,6 @@ def build_sheet(task: SheetTask) -> SheetResult:
 
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
-    """The sheet, which is now in the atlas; None where it has no imagery."""
     recipe = asdict(task.recipe)
     del recipe["sheet_km"], recipe["coarse"]
     name, bounds_deg = task.sheet.id, task.sheet.bounds_deg
@@ -608,7 +534,6 @@ def _build_sheets(
     progress: Progress,
     report: Callable[[str], None],
 ) -> None:
-    """Have the sheets built and add what comes of them to `result`."""
     reported_s = time.monotonic()
     not_stored = 0
     gpu = recipe.method.partition(":")[0] in LEARNT
@@ -633,7 +558,6 @@ def _build_sheets(
 
 
 def _require_same_versions(runner: TaskRunner) -> None:
-    """Raise `WorkerError` where a machine has other versions and would make other bytes."""
     wanted = versions()
     for name, found in runner.everywhere(versions):
         if isinstance(found, Failure):
@@ -664,11 +588,8 @@ def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards.
-
-    It is locked while this process lives; folders of processes that were killed are removed first.
-    Raises `OutputError`.
-    """
+    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards. It is
+    locked while this process lives; folders of processes that were killed are removed first."""
     root = Path(tempfile.gettempdir())
     for path in root.glob(f"{SCRATCH}*/{_LOCK}"):
         with contextlib.suppress(OSError), path.open("r+") as lock:
@@ -687,10 +608,8 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _peak_bytes() -> int:
-    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown.
-
-    Linux's own count: that of getrusage includes the parent's.
-    """
+    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown. Linux's
+    own count: that of getrusage includes the parent's."""
     with contextlib.suppress(OSError):
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         for line in status.splitlines():

@@ -39,7 +39,6 @@ SCHEMA = 1
 
 
 def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
-    """Raise `AtlasError` where a value has another type than its field, or is impossible."""
     for each in fields(recipe):
         value, kind = getattr(recipe, each.name), cast(type, each.type)
         if kind in (int, float):
@@ -58,14 +57,11 @@ def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
 @dataclass(frozen=True)
 class CoarseRecipe:
     """The coarse tiles in which a view is searched in the whole atlas: wide, at low resolution.
+    `overlap`: share that neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views
+    are found (docs/decisions, the atlas)."""
 
-    `gsd_m`: metres per pixel, above 0. `tile_px`: width of a tile. `overlap`: share that
-    neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views are found
-    (docs/decisions, the atlas). Raises `AtlasError` for impossible values.
-    """
-
-    gsd_m: float = 8.0
-    tile_px: int = 128
+    gsd_m: float = 8.0  # metres per pixel, above 0
+    tile_px: int = 128  # width of a tile
     overlap: float = 0.875
 
     def __post_init__(self) -> None:
@@ -73,21 +69,15 @@ class CoarseRecipe:
 
     @property
     def tile_m(self) -> float:
-        """Width of a tile in metres."""
         return self.gsd_m * self.tile_px
 
 
 @dataclass(frozen=True)
 class AtlasRecipe:
     """How every sheet is made; fields and defaults not listed here are those of `BuildRequest`.
+    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior."""
 
-    `gsd_m`: metres per pixel.
-    `sheet_km`: greatest width of a sheet.
-    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior.
-    Raises `AtlasError` and `AreaError` for impossible values.
-    """
-
-    gsd_m: float
+    gsd_m: float  # metres per pixel
     tile_px: int = 256
     overlap: float = 0.875
     method: str = "gradient"
@@ -95,7 +85,7 @@ class AtlasRecipe:
     seed: int = 0
     registration: bool = True
     calibration_views: int = 24
-    sheet_km: float = 10.0
+    sheet_km: float = 10.0  # greatest width of a sheet
     coarse: CoarseRecipe | None = CoarseRecipe()
 
     def __post_init__(self) -> None:
@@ -104,16 +94,13 @@ class AtlasRecipe:
 
     @property
     def sheets(self) -> WorldSheets:
-        """The sheets of the world at this size."""
         return WorldSheets(self.sheet_km * 1000)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for the catalogue."""
         return asdict(self)
 
     @classmethod
     def from_plain(cls, plain: Any) -> "AtlasRecipe":
-        """Inverse of `to_plain`; raises `AtlasError` for unknown fields and impossible values."""
         try:
             values = {each.name: plain[each.name] for each in fields(cls)}
             coarse = values.pop("coarse")
@@ -122,7 +109,6 @@ class AtlasRecipe:
             raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
 
     def differences(self, other: "AtlasRecipe") -> list[str]:
-        """The fields that differ, each as `name: this, not that`."""
         mine, theirs = self.to_plain(), other.to_plain()
         return [
             f"{name}: {mine[name]}, not {theirs[name]}"
@@ -132,16 +118,12 @@ class AtlasRecipe:
 
 
 CATALOG = "atlas.json"
-_SAME_PLACE_DEG = 1e-9
-"""A tenth of a millimetre: rounding only."""
+_SAME_PLACE_DEG = 1e-9  # a tenth of a millimetre: rounding only
 
 
 class Atlas:
-    """An existing atlas. The list of sheets is read once, and again on request.
-
-    Several processes may put sheets into it at the same time. Raises `StorageError` where the
-    storage fails.
-    """
+    """An existing atlas. The list of sheets is read once, and again on request. Several processes
+    may put sheets into it at the same time."""
 
     def __init__(self, store: Store, recipe: AtlasRecipe) -> None:
         self.store = store
@@ -150,12 +132,10 @@ class Atlas:
 
     @property
     def url(self) -> str:
-        """Its folder or URL."""
         return self.store.url
 
     @classmethod
     def open(cls, url: str | Path) -> "Atlas":
-        """Open an atlas. Raises `AtlasError` where there is none, or it is not ours."""
         store = Store(str(url))
         if store.size(CATALOG) is None:
             raise AtlasError(f"no atlas: it has no {CATALOG}: {store}")
@@ -163,11 +143,6 @@ class Atlas:
 
     @classmethod
     def open_or_create(cls, url: str | Path, recipe: AtlasRecipe) -> "Atlas":
-        """Open an atlas, or create it where there is none.
-
-        Raises `AtlasError` with the differences where it has another recipe, and where the folder
-        holds other files.
-        """
         store = Store(str(url))
         if store.size(CATALOG) is None:
             if _is_free(store):
@@ -177,7 +152,6 @@ class Atlas:
         return cls.open(url).require_recipe(recipe)
 
     def sheets(self, refresh: bool = False) -> dict[str, Sheet]:
-        """All sheets by name, sorted. Raises `AtlasError` where an item is damaged."""
         if self._sheets is None or refresh:
             found, broken = read_items(self.store)
             if broken:
@@ -199,7 +173,6 @@ class Atlas:
 
     @property
     def bounds_deg(self) -> Extent | None:
-        """West, south, east, north of all sheets, never across the antimeridian; None if empty."""
         boxes = [sheet.bounds_deg for sheet in self.sheets().values()]
         if not boxes:
             return None
@@ -207,12 +180,9 @@ class Atlas:
         return min(west), min(south), max(east), max(north)
 
     def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
-        """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`.
-
-        Nothing is written where the same files of the same request are there already. Safe with
-        several processes; after a kill the sheet is as before or as described. Raises `AtlasError`
-        where the sheet does not belong to the lattice, `MissingFileError`.
-        """
+        """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`. Nothing is
+        written where the same files of the same request are there already. Safe with several
+        processes; after a kill the sheet is as before or as described."""
         sheet_id = described.id
         stored = {key: _stored(key, sheet_id, Path(path)) for key, path in sorted(files.items())}
         there = self._revisions(sheet_id)
@@ -249,18 +219,15 @@ class Atlas:
             self._sheets.pop(sheet_id, None)
 
     def path(self, sheet: Sheet, kind: str = "map") -> Path:
-        """A local path of a file of a sheet, verified: a copy where the atlas is remote."""
         found = sheet.files.get(kind)
         if found is None:
             raise AtlasError(f"sheet {sheet.id} has no {kind}: {self.store}")
         return self.store.fetch(found.name, found.size_bytes, found.sha256)
 
     def snapshot(self) -> None:
-        """Write all items into one file, which opens faster and in any GIS. Items are decisive."""
         self.store.write(SNAPSHOT, snapshot_of(self.sheets(refresh=True).values()))
 
     def require_recipe(self, recipe: AtlasRecipe) -> "Atlas":
-        """This atlas; raises `AtlasError` with the differences where it has another recipe."""
         if differences := self.recipe.differences(recipe):
             raise AtlasError(
                 "all sheets of an atlas are made alike; this one has "
@@ -269,7 +236,6 @@ class Atlas:
         return self
 
     def require_place(self, sheet: Sheet) -> None:
-        """Raise `AtlasError` where a sheet does not belong to the lattice of this atlas."""
         try:
             box = self.recipe.sheets.bounds_deg(sheet.id)
         except AreaError as error:
@@ -281,7 +247,6 @@ class Atlas:
             )
 
     def _revisions(self, sheet_id: str) -> dict[str, Sheet | None]:
-        """The items of one sheet by file name; None for damaged ones."""
         names = self.store.names(ITEMS, f"{sheet_id}.")
         found, broken = read_some(self.store, names)
         return {**found, **dict.fromkeys(broken)}
@@ -294,7 +259,6 @@ class Atlas:
                 self.store.write(file.name, Path(files[key]))
 
     def _remove_items(self, names: Iterable[str], there: Mapping[str, Sheet | None]) -> None:
-        """Remove some of the items of a sheet, then the files that the others do not name."""
         names = sorted(names)
         for name in names:
             self.store.remove(f"{ITEMS}/{name}")
@@ -313,11 +277,7 @@ def copy_sheets(
     progress: Progress = no_progress,
 ) -> tuple[list[str], list[str]]:
     """Copy sheets of one atlas into another of the same recipe: names of copied sheets, and of
-    those that were there and left unchanged.
-
-    With `replace` sheets that differ are replaced. Raises `AtlasError` where the recipes differ or
-    a sheet is not in the source.
-    """
+    those that were there and left unchanged. With `replace` sheets that differ are replaced."""
     atlas.require_recipe(source.recipe)
     found, there = source.sheets(), atlas.sheets(refresh=True)
     unknown = [each for each in sheet_ids or () if each not in found]
@@ -340,7 +300,6 @@ def copy_sheets(
 
 
 def _is_free(store: Store) -> bool:
-    """Whether there are no files but hidden ones."""
     names: Iterable[str] = store.names()
     if store.is_local and (folder := Path(store.url)).exists():
         names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name]
@@ -348,7 +307,6 @@ def _is_free(store: Store) -> bool:
 
 
 def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:
-    """Names of the files that items name."""
     return {file.name for sheet in items.values() if sheet for file in sheet.files.values()}
 
 
@@ -382,11 +340,7 @@ def _catalog(recipe: AtlasRecipe) -> bytes:
                 {"rel": "root", "href": "./atlas.json", "type": "application/json"},
                 {"rel": "items", "href": f"./{SNAPSHOT}", "type": "application/geo+json"},
             ],
-            "orthonav:atlas": {
-                "format": FORMAT,
-                "schema": SCHEMA,
-                "recipe": recipe.to_plain(),
-            },
+            "orthonav:atlas": {"format": FORMAT, "schema": SCHEMA, "recipe": recipe.to_plain()},
         }
     )
 

@@ -24,49 +24,35 @@ log = logging.getLogger(__name__)
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
-RETRIES = 3
-"""How often an item is started again where its process or machine died."""
-WINDOW = 2
-"""Items submitted at a time for each core: one running, one waiting."""
-POLL_S = 1.0
-"""How long is waited for results before free cores are counted again."""
-PROBE_S = 120.0
-"""How long a machine may take to start a process and answer."""
-STOP_S = 15.0
-"""How long processes may take to clean up before they are killed."""
-OBJECTS_BYTES = 100 * 2**20
-"""Shared memory of a local cluster; items and results are small."""
-ENVIRONMENT = {
+RETRIES = 3  # how often an item is started again where its process or machine died
+WINDOW = 2  # items submitted at a time for each core: one running, one waiting
+POLL_S = 1.0  # how long is waited for results before free cores are counted again
+PROBE_S = 120.0  # how long a machine may take to start a process and answer
+STOP_S = 15.0  # how long processes may take to clean up before they are killed
+OBJECTS_BYTES = 100 * 2**20  # shared memory of a local cluster; items and results are small
+ENVIRONMENT = {  # environment of the workers, as the command line sets it for itself
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_LOG_LEVEL": "OFF",
     "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**28),
 }
-"""Environment of the workers, as the command line sets it for itself."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why an item failed: name and text of the error, and the traceback of an unexpected one."""
-
     kind: str
     text: str
     trace: str = ""
 
 
 class SerialRunner:
-    """Runs items in this process, one after the other."""
-
-    at_once = 1
-    """Number of items that run at the same time."""
+    at_once = 1  # number of items that run at the same time
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """The result of a function on every machine, each with the machine's name: here on one."""
         return [("this machine", probe())]
 
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Each item with its result, in order; `gpu` has no effect."""
         for item in items:
             yield item, attempted(work, item)
 
@@ -79,9 +65,7 @@ class SerialRunner:
 
 class RayRunner:
     """Runs items on a Ray cluster: a local one, started and stopped here, or one at an address.
-
-    `workers`: greatest number of items at a time, None: the number of cores.
-    """
+    `workers`: greatest number of items at a time, None: the number of cores."""
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
         if workers is not None and workers < 1:
@@ -92,12 +76,10 @@ class RayRunner:
 
     @property
     def at_once(self) -> int:
-        """The number of cores of the cluster at present, at most `workers`."""
         cores = int(self._ray.cluster_resources().get("CPU", 0))
         return max(1, cores if self._workers is None else min(cores, self._workers))
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """The result of the function on every machine that has cores and is present now."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         probes = []
@@ -112,10 +94,8 @@ class RayRunner:
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
         """Each item with its result, when it is finished; closing the iterator stops the others.
-
         With `gpu` each item has a GPU to itself, where there are any. Items whose process died are
-        tried again `RETRIES` times.
-        """
+        tried again `RETRIES` times."""
         has_gpu = gpu and self._ray.cluster_resources().get("GPU", 0) >= 1
         task = self._task(num_cpus=1, num_gpus=1 if has_gpu else 0)
         waiting = iter(items)
@@ -187,8 +167,7 @@ class RayRunner:
             self._ray.shutdown()
 
 
-TaskRunner = SerialRunner | RayRunner
-"""A context manager that runs tasks."""
+TaskRunner = SerialRunner | RayRunner  # a context manager that runs tasks
 
 
 def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:

@@ -32,35 +32,26 @@ from orthonav.ground.planning.sheets import in_box
 
 FORMAT = "orthonav-coarse"
 SCHEMA = 1
-EDGES = "gradient"
-"""Representation of coarse tiles and of views searched among them, independent of the maps'."""
+EDGES = "gradient"  # of coarse tiles and of views searched among them, independent of the maps'
 POOLING = WhitenedRecipe()
-MAX_TILES = 1_000_000
-"""Greatest number of a sheet: 45 km with tiles 50 m apart are 800,000."""
-MAX_FEATURES = 16_384
-"""Greatest number per tile: 16 x 16 cells of 64 channels."""
-FULL = 255
-"""A cell that is valid everywhere."""
+MAX_TILES = 1_000_000  # greatest number of a sheet: 45 km with tiles 50 m apart are 800,000
+MAX_FEATURES = 16_384  # greatest number per tile: 16 x 16 cells of 64 channels
+FULL = 255  # a cell that is valid everywhere
 _CHUNK_TILES = 512
 _SLACK_DEG = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseTiles:
-    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only.
+    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only. `bounds_deg`: box
+    of the sheet: west, south, east, north. `centres_latlon_deg` (N, 2) float64; N is 0 where no
+    tile shows enough imagery."""
 
-    `recipe`: how they were made.
-    `bounds_deg`: box of the sheet: west, south, east, north.
-    `centres_latlon_deg` (N, 2) float64; N is 0 where no tile shows enough imagery.
-    `features` (N, F) float16: F is cells x cells x channels.
-    `valid` (N, cells x cells) uint8: 255 where all of a cell shows imagery.
-    """
-
-    recipe: CoarseRecipe
+    recipe: CoarseRecipe  # how they were made
     bounds_deg: Extent
     centres_latlon_deg: NDArray[np.float64]
-    features: NDArray[np.float16]
-    valid: NDArray[np.uint8]
+    features: NDArray[np.float16]  # (N, F) float16; F is cells x cells x channels
+    valid: NDArray[np.uint8]  # (N, cells x cells) uint8; 255 where all of a cell shows imagery
 
     def features_of(self, tiles: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Features (n, F) of some tiles, and weights (n, F): the valid share of each feature's
@@ -71,17 +62,13 @@ class CoarseTiles:
 
 
 def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
-    """The grid of the coarse tiles of an area. Raises `AreaError` for impossible recipes."""
     return TileGrid.covering(
         area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
     )
 
 
 def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
-    """The coarse tiles whose centres lie in a box, made from the imagery with one thread.
-
-    Raises `AreaError` for impossible recipes, `ImageryError` where the imagery cannot be read.
-    """
+    """The coarse tiles whose centres lie in a box, made from the imagery with one thread."""
     area = Area.from_bounds(bounds_deg)
     grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
@@ -111,10 +98,8 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
 
 
 def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
-    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number.
-
-    The bytes are the same every time. Raises as `make_coarse`, and `OutputError`.
-    """
+    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number. The
+    bytes are the same every time."""
     made = make_coarse(mosaic, bounds_deg, recipe)
     arrays: dict[str, NDArray[Any]] = {
         "centres_latlon_deg": made.centres_latlon_deg,
@@ -126,7 +111,6 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
 
 
 def tile_count(path: Path) -> int:
-    """Number of coarse tiles in a file, from its header alone. Raises as `read_coarse`."""
     try:
         with safe_open(require_file(path, "coarse tiles"), framework="numpy") as stored:
             return int(stored.get_slice("valid").get_shape()[0])
@@ -135,10 +119,6 @@ def tile_count(path: Path) -> int:
 
 
 def read_coarse(path: Path) -> CoarseTiles:
-    """The coarse tiles in a file, completely checked.
-
-    Raises `MissingFileError`, and `AtlasError` where `write_coarse` cannot have written it.
-    """
     path = require_file(path, "coarse tiles")
     try:
         with safe_open(path, framework="numpy") as stored:
@@ -156,10 +136,7 @@ def read_coarse(path: Path) -> CoarseTiles:
 
 
 class _NoCrops(CropSampler):
-    """A sampler without crops: coarse tiles are not calibrated."""
-
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        """No places (0, 2)."""
         return np.zeros((0, 2), np.intp)
 
 

@@ -75,12 +75,9 @@ from orthonav.ground.planning.sheets import WorldSheets, in_box
 
 log = logging.getLogger(__name__)
 
-MAX_TILES = 20_000
-"""Tiles of an area that are checked; more are checked at even spacing."""
-EDGE_POINTS = 33
-"""Points along an edge of a box: edges are not straight in degrees."""
-NAMED = 8
-"""Missing sheets named in a message, at most."""
+MAX_TILES = 20_000  # tiles of an area that are checked; more are checked at even spacing
+EDGE_POINTS = 33  # points along an edge of a box: edges are not straight in degrees
+NAMED = 8  # missing sheets named in a message, at most
 Array = NDArray[np.float64]
 
 
@@ -101,7 +98,6 @@ def box_deg(area: Area, margin_m: float) -> Extent:
 
 
 def turned(lon_deg: float) -> float:
-    """A longitude from -180, without 180."""
     return (lon_deg + 180) % 360 - 180
 
 
@@ -132,9 +128,7 @@ def check_covered(
     allow_holes: bool,
 ) -> None:
     """Warn where sheets under an area are missing; `AtlasError` where they lie under the route.
-
-    With `allow_holes` that is a warning too. Raises `AreaError` where no part is covered.
-    """
+    With `allow_holes` that is a warning too."""
     tiles = _some_tiles(area, grid)
     lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
     covered = np.any([source.covers(lat, lon) for source in sources], axis=0)
@@ -151,9 +145,7 @@ def check_covered(
 
 def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool) -> None:
     """Warn where the sheets under an area show no imagery; `AtlasError` where the route is there.
-
-    With `allow_holes` that is a warning too.
-    """
+    With `allow_holes` that is a warning too."""
     route = grid.tiles_rc(_route_en_m(area, grid)).clip(0, [grid.rows - 1, grid.cols - 1])
     tiles, lacks = _some_tiles(area, grid), "has no imagery in the atlas"
     on_route, bare = (
@@ -186,7 +178,6 @@ def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:
 
 
 def _some_tiles(area: Area, grid: TileGrid) -> NDArray[np.intp]:
-    """Tiles (N, 2) in an area, all or evenly spaced; at least one near its middle."""
     step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MAX_TILES))))
     tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T.astype(np.intp)
     inside = area.contains(grid.centres_en_m(tiles), grid.stride_m * np.sqrt(0.5))
@@ -205,12 +196,10 @@ def _route_en_m(area: Area, grid: TileGrid) -> Array:
     return np.concatenate(parts)
 
 
-CACHE_BYTES = 24 * 2**20
-"""Decoded chunks cached of each sheet: those along the border of a row of blocks."""
+CACHE_BYTES = 24 * 2**20  # decoded chunks of each sheet: those along the border of a row of blocks
 REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
 
-DECIDING = 0.5, 0.99
-"""Thresholds of acceptance lie in this range of probabilities."""
+DECIDING = 0.5, 0.99  # thresholds of acceptance lie in this range of probabilities
 SCORES = np.linspace(0.05, 1.0, 20)
 MARGINS = np.linspace(0.0, 0.6, 13)
 """Evidence at which the pooled confidence is compared with the sheets': scores and margins of
@@ -218,7 +207,6 @@ tiles."""
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
-    """Open and verify sheets. Raises `AtlasError` where one is damaged or differs from others."""
     found: list[SheetSource] = []
     for sheet in sheets:
         try:
@@ -231,7 +219,6 @@ def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list
 
 
 def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
-    """Recipe of the embedding, and representation. Raises `AtlasError` for other methods."""
     try:
         recipe = variant_from_recipe(embed.TABLE, manifest.recipe.get("embed"))
         representation = variant_from_recipe(represent.TABLE, manifest.recipe.get("represent"))
@@ -248,7 +235,6 @@ def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
 def pooled_manifest(
     members: Sequence[SheetSource], shares: NDArray[np.float64], sheet: SheetInfo
 ) -> Manifest:
-    """Manifest of a map with that sheet, cut from sheets that make up these shares of it."""
     manifests = [member.manifest for member in members]
     tiles = float(np.average([each.sheets[0].tiles for each in manifests], weights=shares))
     known = [
@@ -296,10 +282,8 @@ def pooled_tiles(
     confidences: Sequence[LogisticConfidence], shares: Sequence[float], more_tiles: float
 ) -> LogisticConfidence | None:
     """Confidence of tile search on a map made of sheets in these shares; None without sheets.
-
     `more_tiles`: tiles of the map over tiles of a sheet. As many times more tiles resemble a view
-    by chance, and the odds of the best tile are lower by that factor.
-    """
+    by chance, and the odds of the best tile are lower by that factor."""
     if not confidences:
         return None
     bias = float(np.average([each.bias for each in confidences], weights=shares))
@@ -316,10 +300,8 @@ def pooled_tiles(
 
 
 def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> RegisteredConfidence | None:
-    """Confidence of registered views on a map made of sheets; None without sheets.
-
-    It is the usual one, with the scores of chance of the sheet where they are highest.
-    """
+    """Confidence of registered views on a map made of sheets; None without sheets. It is the usual
+    one, with the scores of chance of the sheet where they are highest."""
     if not confidences:
         return None
     chances = Chances(
@@ -329,7 +311,6 @@ def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> Registered
 
 
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
-    """All orthophotos of all sheets, each once, by date and name."""
     sources = {json.dumps(each, sort_keys=True): each for one in manifests for each in one.imagery}
 
     def place(key: str) -> tuple[str, str, str]:
@@ -373,11 +354,8 @@ def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
 
 
 def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> TerrainParts | None:
-    """The terrain layer of a map cut from sheets; None where none of them has one.
-
-    A place has the height of the sheet whose box holds it, else of one that reaches over its
-    border. Raises `MapFileError` for a damaged layer.
-    """
+    """The terrain layer of a map cut from sheets; None where none of them has one. A place has the
+    height of the sheet whose box holds it, else of one that reaches over its border."""
     layers = [(each, each.terrain) for each in members if each.terrain is not None]
     if not layers:
         return None
@@ -406,8 +384,7 @@ def _heights(
     return found
 
 
-COARSER = 4
-"""Factor by which blocks are reduced for the preview."""
+COARSER = 4  # factor by which blocks are reduced for the preview
 
 
 def cut_map(
@@ -420,11 +397,9 @@ def cut_map(
     progress: Progress = no_progress,
 ) -> BuildResult:
     """Cut the map of an area, which may be the band of a route, and write it to `out` as a whole.
-
     Missing sheets under the route are an error unless `allow_holes`; other missing sheets are a
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
-    or cannot be cut from, `StorageError`, `OutputError`.
-    """
+    or cannot be cut from, `StorageError`, `OutputError`."""
     out = Path(out)
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
@@ -443,11 +418,7 @@ def cut_map(
 
 
 def cut_in_memory(atlas: Atlas, area: Area) -> MapFile:
-    """The map of an area, flown at once and never written; missing sheets are holes in it.
-
-    Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged or cannot
-    be cut from, `StorageError`.
-    """
+    """The map of an area, flown at once and never written; missing sheets are holes in it."""
     cutter = _MapCutter(atlas, area)
     cutter.read(no_progress, 1)
     manifest, arrays = _learnt(cutter, 1, no_progress)
@@ -455,8 +426,6 @@ def cut_in_memory(atlas: Atlas, area: Area) -> MapFile:
 
 
 class _MapCutter:
-    """Collects cells, grey layer and preview of the map from the sheets under it."""
-
     def __init__(self, atlas: Atlas, area: Area) -> None:
         common = atlas.recipe
         self.area = area
@@ -474,7 +443,6 @@ class _MapCutter:
         self.preview = Preview(grid, PREVIEW_PX)
 
     def read(self, progress: Progress, workers: int) -> None:
-        """Resample all blocks with `workers` threads. Raises `AtlasError` for a damaged sheet."""
         blocks = blocks_of_area(self.area, self.grid, self._layout)
         with one_opencv_thread():
             made = in_order(blocks, lambda: nullcontext(self._made), workers)
@@ -510,7 +478,6 @@ class _MapCutter:
 def _learnt(
     cutter: _MapCutter, workers: int, progress: Progress
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
-    """Manifest and arrays of the map."""
     area, grid, members = cutter.area, cutter.grid, cutter.members
     tiles_rc = tiles_of(area, grid, cutter.cells)
     tiles_px = tiles_rc * grid.stride_px
@@ -538,7 +505,6 @@ def _learnt(
 def _shares(
     area: Area, centres_en_m: NDArray[np.float64], members: Sequence[SheetSource]
 ) -> NDArray[np.float64]:
-    """Share of the tiles in the box of each sheet; equal shares where there are none."""
     lat, lon = area.frame.latlon_from_en(centres_en_m)
     boxes = [each.sheet.bounds_deg for each in members]
     found = np.array([np.count_nonzero(in_box(box, lat, lon)) for box in boxes], np.float64)

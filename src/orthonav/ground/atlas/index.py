@@ -41,24 +41,19 @@ from orthonav.ground.atlas.vectors import (
 FOLDER = "index"
 MANIFEST = f"{FOLDER}/index.json"
 FORMAT = "orthonav-index"
-SCHEMA = 2
-"""2: shards have no manifests of their own."""
-MAX_ROWS = 10**6
-"""Rows of a sheet: as many as it may have coarse tiles (`orthonav.ground.atlas.coarse`)."""
+SCHEMA = 2  # 2: shards have no manifests of their own
+MAX_ROWS = 10**6  # rows of a sheet: `orthonav.ground.atlas.coarse.MAX_TILES`
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
 
 
 @dataclass(frozen=True)
 class IndexManifest:
-    """What an index consists of; `files` has all its files by their names in the folder."""
-
     recipe: VectorRecipe
     shards: tuple[ShardInfo, ...]
     files: Mapping[str, StoredFile]
 
     @property
     def sheets(self) -> dict[str, str]:
-        """SHA-256 of the coarse tiles of each indexed sheet."""
         return {
             part.sheet: part.sha256
             for shard in self.shards
@@ -67,7 +62,6 @@ class IndexManifest:
         }
 
     def to_json(self) -> bytes:
-        """Canonical JSON."""
         return canonical({"format": FORMAT, "schema": SCHEMA, **asdict(self)}) + b"\n"
 
     @classmethod
@@ -108,19 +102,16 @@ def _shard(plain: Any) -> ShardInfo:
 
 
 def read_manifest(atlas: Atlas) -> IndexManifest | None:
-    """The manifest of the index of an atlas, None where it has no index. Raises `AtlasError`."""
     if atlas.store.size(MANIFEST) is None:
         return None
     return IndexManifest.from_json(atlas.store.read(MANIFEST))
 
 
 def indexed_sheets(atlas: Atlas) -> dict[str, Sheet]:
-    """The sheets of an atlas that have coarse tiles, by name."""
     return {name: each for name, each in atlas.sheets().items() if "coarse" in each.files}
 
 
 def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list[str]]:
-    """Names of the sheets that are new or changed since indexing, and of those that are gone."""
     there = {name: each.files["coarse"].sha256 for name, each in indexed_sheets(atlas).items()}
     known = manifest.sheets
     new = [name for name, sha256 in there.items() if known.get(name) != sha256]
@@ -128,10 +119,8 @@ def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list
 
 
 WHITENING_NAME = "whitening.safetensors"
-MAX_TRAINING_TILES = 40_000
-"""Tiles that the whitening is learnt from: twice those of a map (`MAX_LEARNT_TILES`)."""
-SHARD_ROWS = 10_000_000
-"""Rows of a shard, at most: 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)."""
+MAX_TRAINING_TILES = 40_000  # of the whitening: twice those of a map (`MAX_LEARNT_TILES`)
+SHARD_ROWS = 10_000_000  # 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)
 REBUILD_SHARE = 0.3
 FEW_ROWS = 200_000
 """The index is rebuilt where more than this share of the rows is new or gone, or where it has so
@@ -140,27 +129,20 @@ POWER = 0.5
 """Exponent of the whitening: full whitening (1) does not recognize a place an eighth of a tile off.
 On 2,500 generated km2 half whitening ranks the right tile first for 87 instead of 83 % of views of
 another year."""
-MANY_TILES, MANY_DIMS = 3_000_000, 64
-"""Above this number of tiles so many components are stored: half of the time and memory of a
-search."""
-MIN_TILES = 16
-"""Fewer tiles than codes of a quantizer cannot train it."""
+MANY_TILES, MANY_DIMS = 3_000_000, 64  # above so many tiles, so many components
+MIN_TILES = 16  # fewer tiles than codes of a quantizer cannot train it
 BATCH_TILES = 4096
-LEARN_PASSES = 3
-"""Passes over the coarse tiles: mean and scatter of the features, sample of the vectors."""
+LEARN_PASSES = 3  # mean and scatter of the features, sample of the vectors
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
-Counted = tuple[Sheet, int]
-"""A sheet and the number of its coarse tiles."""
+Counted = tuple[Sheet, int]  # a sheet and the number of its coarse tiles
 
 
 def make_index(
     atlas: Atlas, progress: Progress = no_progress, rebuild: bool = False
 ) -> IndexManifest | None:
-    """Bring the index of an atlas up to date; None where its sheets have no coarse tiles.
-
-    The same sheets give the same bytes where the index is rebuilt, or built for the first time.
-    Raises `AtlasError`, `StorageError`, `MissingExtraError`.
-    """
+    """Bring the index of an atlas up to date; None where its sheets have no coarse tiles. The same
+    sheets give the same bytes where the index is rebuilt, or built for the first time. Raises
+    `AtlasError`, `StorageError`, `MissingExtraError`."""
     atlas.sheets(refresh=True)
     sheets = indexed_sheets(atlas)
     if not sheets:
@@ -187,13 +169,10 @@ def make_index(
 
 
 class _IndexBuilder:
-    """Builds an index in a local folder and puts it into the atlas."""
-
     def __init__(self, atlas: Atlas, folder: Path, progress: Progress) -> None:
         self._atlas, self._folder, self._progress = atlas, folder, progress
 
     def build(self, sheets: Sequence[Sheet]) -> IndexManifest:
-        """The index of these sheets."""
         counted = self._counted(sheets)
         total = sum(count for _, count in counted)
         if total < MIN_TILES:
@@ -206,7 +185,6 @@ class _IndexBuilder:
         return self._extended(empty, embedder, quantizers, _groups(counted))
 
     def _learnt(self, sheets: Sequence[Sheet], total: int) -> tuple[WhitenedEmbedder, Quantizers]:
-        """Whitening and quantizers of an index of `total` tiles, written to the folder."""
         step = max(1, total // MAX_TRAINING_TILES)
         dims = POOLING.dims if total <= MANY_TILES else MANY_DIMS
         shares = _shares(LEARN_PASSES * len(sheets))
@@ -227,7 +205,6 @@ class _IndexBuilder:
         return embedder, quantizers
 
     def update(self, before: IndexManifest, new: Sequence[Sheet], stale: set[str]) -> IndexManifest:
-        """`before` with a shard of the new sheets and the rows of stale sheets retired."""
         embedder = load_whitening(index_file(self._atlas, before, WHITENING_NAME))
         quantizers = Quantizers.load(index_file(self._atlas, before, QUANTIZERS_NAME))
         shards = tuple(
@@ -286,10 +263,8 @@ class _IndexBuilder:
     def _tiles(
         self, sheets: Sequence[Sheet], stage: str, shares: Iterator[float], step: int = 1
     ) -> Iterator[tuple[NDArray[np.float64], Features]]:
-        """Places (n, 2) and features of every `step`-th tile of sheets, some at a time.
-
-        `shares`: share of the stage that is done after each sheet.
-        """
+        """Places (n, 2) and features of every `step`-th tile of sheets, some at a time. `shares`:
+        share of the stage that is done after each sheet."""
         for sheet in sheets:
             tiles = read_coarse(self._atlas.path(sheet, "coarse"))
             for start in range(0, len(tiles.valid), step * BATCH_TILES):
@@ -299,12 +274,10 @@ class _IndexBuilder:
 
 
 def _shares(count: int) -> Iterator[float]:
-    """Shares done after each of so many steps."""
     return (number / count for number in range(1, count + 1))
 
 
 def _groups(counted: Sequence[Counted]) -> list[list[Counted]]:
-    """The sheets of each shard, of about `SHARD_ROWS` rows at most."""
     groups: list[list[Counted]] = [[]]
     rows = 0
     for sheet, count in counted:
@@ -317,14 +290,12 @@ def _groups(counted: Sequence[Counted]) -> list[list[Counted]]:
 
 
 def _shortened(embedder: WhitenedEmbedder, dims: int) -> WhitenedEmbedder:
-    """The embedder with at most `dims` components, an even number: quantizers code halves."""
     dims = min(dims, embedder.dims)
     basis = np.ascontiguousarray(embedder.basis[:, : dims - dims % 2])
     return replace(embedder, basis=basis)
 
 
 def vectors_of(embedder: WhitenedEmbedder, features: Features) -> NDArray[np.float32]:
-    """Unit vectors (N, D) of features and weights (N, F)."""
     return half_whitened(embedder, embedder.features(*features))
 
 
@@ -337,7 +308,6 @@ def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> 
 
 
 def load_whitening(path: Path) -> WhitenedEmbedder:
-    """The whitening of an index; raises `AtlasError`."""
     try:
         parts = load_file(path)
         mean, basis = parts["mean"], parts["basis"]
@@ -350,7 +320,6 @@ def load_whitening(path: Path) -> WhitenedEmbedder:
 
 
 def index_file(atlas: Atlas, manifest: IndexManifest, name: str) -> Path:
-    """A local path of a file of an index, verified. Raises `AtlasError`, `StorageError`."""
     file = manifest.files.get(name)
     if file is None:
         raise AtlasError(f"index of the atlas names no file {name}: {atlas.url}")

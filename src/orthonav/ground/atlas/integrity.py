@@ -57,13 +57,10 @@ def check_atlas(
     clean: bool = False,
     min_age_s: float = MIN_AGE_S,
 ) -> list[Problem]:
-    """All problems of an atlas by name; empty where it is whole.
-
-    `deep` reads every file, verifies its checksum, opens it and compares it with the recipe.
-    `clean` removes leftovers older than `min_age_s` (files that no item names, temporary files,
-    replaced revisions) and rewrites a stale snapshot; nothing else is changed. Raises
-    `StorageError` where the storage fails.
-    """
+    """All problems of an atlas by name; empty where it is whole. `deep` reads every file, verifies
+    its checksum, opens it and compares it with the recipe. `clean` removes leftovers older than
+    `min_age_s` (files that no item names, temporary files, replaced revisions) and rewrites a stale
+    snapshot; nothing else is changed."""
     store, clean_s = atlas.store, min_age_s if clean else None
     items, broken = read_items(store)
     files = _files(store)
@@ -98,7 +95,6 @@ def check_atlas(
 
 
 def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float | None) -> Problem:
-    """A file that is left over; removed where it has that age, None never."""
     if min_age_s is None:
         return Problem(kind, name, detail)
     age_s = store.age_s(name)
@@ -109,7 +105,6 @@ def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float 
 
 
 def _snapshot_problems(store: Store, sheets: Iterable[Sheet], clean: bool) -> Iterator[Problem]:
-    """A snapshot that does not show these sheets; rewritten with `clean`."""
     expected = snapshot_of(sorted(sheets, key=lambda sheet: sheet.id))
     size = store.size(SNAPSHOT)
     if size is None or (
@@ -123,7 +118,6 @@ def _snapshot_problems(store: Store, sheets: Iterable[Sheet], clean: bool) -> It
 
 
 def _current(items: Mapping[str, Sheet]) -> dict[str, Sheet]:
-    """The items of the highest revisions."""
     last = {items[name].id: name for name in sorted(items)}
     return {name: items[name] for name in last.values()}
 
@@ -139,8 +133,6 @@ def _files(store: Store) -> dict[str, int]:
 def _orphans(
     store: Store, files: Mapping[str, int], items: Mapping[str, Sheet], not_whole: set[str]
 ) -> list[str]:
-    """Files of sheets that no item names, except those of sheets with an unreadable item."""
-
     def unnamed(items: Mapping[str, Sheet]) -> list[str]:
         named = {file.name for sheet in items.values() for file in sheet.files.values()}
         return [
@@ -182,10 +174,8 @@ def _file_problems(
     remedy: str,
     content: Callable[[Path], Problem | None] = lambda path: None,
 ) -> Iterator[Problem]:
-    """The problem of a file that is `size` bytes long, None where it is missing.
-
-    `content` finds that of the content of a file whose checksum is right.
-    """
+    """The problem of a file that is `size` bytes long, None where it is missing. `content` finds
+    that of the content of a file whose checksum is right."""
     if size is None:
         yield Problem("missing file", file.name, remedy)
     elif size != file.size_bytes:
@@ -218,7 +208,6 @@ def _index_problems(atlas: Atlas, deep: bool) -> Iterator[Problem]:
 
 @contextmanager
 def _local_path(store: Store, name: str) -> Iterator[Path]:
-    """A file of the atlas on this machine, while the context lasts."""
     if store.is_local:
         yield Path(store.url, *name.split("/"))
         return
@@ -243,7 +232,6 @@ def _content_problem(
 
 
 def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[str]:
-    """The differences between a map, the recipe of its atlas and its item."""
     info = manifest.sheets[0]
     represent = manifest.recipe.get("represent")
     pairs = [
@@ -265,7 +253,6 @@ def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[
 
 
 def _same(own: object, other: object) -> bool:
-    """Whether values are equal, numbers but for rounding."""
     if isinstance(own, int | float) and isinstance(other, int | float):
         return math.isclose(own, other, rel_tol=1e-6)
     return own == other

@@ -24,19 +24,14 @@ from orthonav.ground.planning.area import Extent
 SCHEMA = 1
 STAC_VERSION = "1.0.0"
 COLLECTION = "orthonav-atlas"
-MAX_ITEM_BYTES = 2**20
-"""A guard for memory: items have some 2 kB, 60 bytes more for each further orthophoto."""
-MAX_REVISION = 9999
-"""What four digits of a file name hold."""
-MAX_DIGITS = 20
-"""Digits of an integer: 64 bits. Python needs quadratic time for longer ones."""
-MAX_TILES = 10**9
-"""A guard against impossible values: tiles 1.5 m apart on a sheet of 45 km."""
-FILES = {
+MAX_ITEM_BYTES = 2**20  # a guard for memory: 2 kB, 60 bytes more for each further orthophoto
+MAX_REVISION = 9999  # what four digits of a file name hold
+MAX_DIGITS = 20  # digits of an integer: 64 bits. Python needs quadratic time for longer ones.
+MAX_TILES = 10**9  # a guard against impossible values: tiles 1.5 m apart on a sheet of 45 km
+FILES = {  # folder, suffix and media type of the files that a sheet may have
     "map": ("sheets", ".onav", "application/octet-stream"),
     "coarse": ("coarse", ".safetensors", "application/octet-stream"),
 }
-"""Folder, suffix and media type of the files that a sheet may have."""
 _FILE_EXTENSION = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _SHA256_MULTIHASH = "1220"
 _SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
@@ -48,11 +43,6 @@ _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of an atlas: its name in the atlas, its size in bytes and its SHA-256 (hex).
-
-    Raises `AtlasError` for an impossible size or digest.
-    """
-
     name: str
     size_bytes: int
     sha256: str
@@ -67,53 +57,34 @@ class StoredFile:
 @dataclass(frozen=True)
 class Sheet:
     """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
-    building, so that the same sheet is the same bytes everywhere.
+    building, so that the same sheet is the same bytes everywhere. `imagery`: its orthophotos, as
+    the manifest of a map describes them. `files`: its files by kind: `map`, `coarse`."""
 
-    `id`: name in the lattice, as r001526c001392.
-    `bounds_deg`: its box in the lattice: west, south, east, north.
-    `gsd_m`: ground resolution of its map, metres per pixel.
-    `tiles`: tiles of its map, 1 or more.
-    `area_km2`: area of its tile centres.
-    `dates`: dates of its imagery, YYYY[-MM[-DD]].
-    `imagery`: its orthophotos, as the manifest of a map describes them.
-    `request`: digest of all that it was made from and how.
-    `made_by`: programs and versions that made it.
-    `revision`: from 1; 0 for a sheet that is not in an atlas yet.
-    `files`: its files by kind: `map`, `coarse`.
-    """
-
-    id: str
-    bounds_deg: Extent
-    gsd_m: float
-    tiles: int
-    area_km2: float
-    dates: tuple[str, ...]
+    id: str  # name in the lattice, as r001526c001392
+    bounds_deg: Extent  # its box in the lattice: west, south, east, north
+    gsd_m: float  # ground resolution of its map, metres per pixel
+    tiles: int  # tiles of its map, 1 or more
+    area_km2: float  # area of its tile centres
+    dates: tuple[str, ...]  # dates of its imagery, YYYY[-MM[-DD]]
     imagery: tuple[Mapping[str, Any], ...]
-    request: str
-    made_by: Mapping[str, str]
-    revision: int = 0
+    request: str  # digest of all that it was made from and how
+    made_by: Mapping[str, str]  # programs and versions that made it
+    revision: int = 0  # from 1; 0 for a sheet that is not in an atlas yet
     files: Mapping[str, StoredFile] = field(default_factory=dict)
 
     def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
-        """The sheet with its files, as it will be read back.
-
-        Raises `AtlasError` where it could not be.
-        """
         data = canonical(replace(self, revision=revision, files=files).to_item())
         return self.from_item(json.loads(data), data)
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of all its files."""
         return sum(file.size_bytes for file in self.files.values())
 
     @property
     def item_name(self) -> str:
-        """File name of its item in the folder `items`."""
         return item_name(self.id, self.revision, canonical(self.to_item()))
 
     def to_item(self) -> dict[str, Any]:
-        """The STAC item, as plain values."""
         west, south, east, north = map(float, self.bounds_deg)
         ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
         return {
@@ -156,11 +127,8 @@ class Sheet:
 
     @classmethod
     def from_item(cls, plain: Any, data: bytes) -> "Sheet":
-        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from.
-
-        Raises `AtlasError` unless every value is possible and writing the sheet gives `data`. That
-        also refuses values of another type, which are converted here.
-        """
+        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. That also
+        refuses values of another type, which are converted here."""
         try:
             properties = plain["properties"]
             own = properties["orthonav:sheet"]
@@ -202,14 +170,12 @@ class Sheet:
 
 
 def reason(error: Exception) -> str:
-    """What is wrong with plain values that could not be read, for people."""
     if isinstance(error, TypeError | AttributeError):
         return "a value is of another kind than expected"
     return described(error)
 
 
 def canonical(plain: Any) -> bytes:
-    """Plain values as canonical JSON. Raises `AtlasError` for values that JSON cannot hold."""
     try:
         return _ENCODER.encode(plain).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -217,11 +183,9 @@ def canonical(plain: Any) -> bytes:
 
 
 def parsed(data: bytes, what: str) -> Any:
-    """Plain values of JSON; raises `AtlasError` naming `what` where it is not JSON.
-
-    The caller must compare the bytes with the canonical ones, which also excludes repeated keys
-    and numbers that are not finite.
-    """
+    """Plain values of JSON; raises `AtlasError` naming `what` where it is not JSON. The caller must
+    compare the bytes with the canonical ones, which also excludes repeated keys and numbers that
+    are not finite."""
     try:
         return json.loads(data.decode(), parse_int=_integer)
     except (ValueError, RecursionError) as error:
@@ -229,21 +193,15 @@ def parsed(data: bytes, what: str) -> Any:
 
 
 def item_name(sheet_id: str, revision: int, data: bytes) -> str:
-    """File name of an item: sheet, revision, and the first digits of the digest of its bytes."""
     return f"{sheet_id}.{revision:04d}.{hashlib.sha256(data).hexdigest()[:12]}.json"
 
 
 def split_name(name: str) -> tuple[str, int] | None:
-    """Sheet and revision in the file name of an item; None for any other file."""
     match = _ITEM_NAME.fullmatch(name)
     return (match.group(1), int(match.group(2))) if match else None
 
 
 def read_item(name: str, data: bytes, plain: Any = None) -> Sheet:
-    """The sheet in the item file `name`; `plain` are its values if already parsed.
-
-    Raises `AtlasError` where the file is damaged or does not agree with its name.
-    """
     if len(data) > MAX_ITEM_BYTES:
         raise AtlasError(f"{len(data)} bytes, at most {MAX_ITEM_BYTES} are allowed: items/{name}")
     plain = parsed(data, f"items/{name}") if plain is None else plain
@@ -257,13 +215,11 @@ def read_item(name: str, data: bytes, plain: Any = None) -> Sheet:
 
 
 def file_name(key: str, sheet_id: str, sha256: str) -> str:
-    """Name in the atlas of a file of a sheet with that content."""
     folder, suffix, _ = FILES[key]
     return f"{folder}/{sheet_id}.{sha256[:12]}{suffix}"
 
 
 def sheet_of_file(name: str) -> str | None:
-    """The sheet that a file name in any folder of the atlas begins with; None for other names."""
     sheet = name.rpartition("/")[2].partition(".")[0]
     return sheet if _SHEET.fullmatch(sheet) else None
 
@@ -282,11 +238,8 @@ def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
 
 
 def _times(dates: tuple[str, ...]) -> dict[str, Any]:
-    """`datetime` and related properties, one of which STAC requires.
-
-    A single day is a date; a year, a month or several dates are a range; unknown dates are the
-    epoch, marked as unknown.
-    """
+    """`datetime` and related properties, one of which STAC requires. A single day is a date; a
+    year, a month or several dates are a range; unknown dates are the epoch, marked as unknown."""
     spans = [span for span in map(_span, dates) if span is not None]
     if not spans:
         return {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}
@@ -301,7 +254,6 @@ def _times(dates: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _span(text: str) -> tuple[date, date] | None:
-    """First and last day of YYYY[-MM[-DD]], None for an invalid date."""
     if not _DATE.fullmatch(text):
         return None
     try:
@@ -322,20 +274,15 @@ def _integer(text: str) -> int:
 log = logging.getLogger(__name__)
 
 ITEMS, SNAPSHOT = "items", "items.geojson"
-MAX_SNAPSHOT_BYTES = 2**30
-"""A guard for memory: 500,000 items of 2 kB."""
-MAX_ITEMS = 10**6
-"""A guard for memory: seven times the sheets of a country at 20 cm (docs/country.md)."""
-_READ_AT_ONCE = 1000
-"""One page of a listing of S3."""
+MAX_SNAPSHOT_BYTES = 2**30  # a guard for memory: 500,000 items of 2 kB
+MAX_ITEMS = 10**6  # a guard for memory: seven times a country at 20 cm (docs/country.md)
+_READ_AT_ONCE = 1000  # one page of a listing of S3
 
 
 def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
-    """All items by file name, and the errors of damaged items by file name.
-
-    Where a sheet has several items, the last in the order of names is current. Items of a remote
-    atlas that are in the snapshot are not read one by one; they are checked in the same way.
-    """
+    """All items by file name, and the errors of damaged items by file name. Where a sheet has
+    several items, the last in the order of names is current. Items of a remote atlas that are in
+    the snapshot are not read one by one; they are checked in the same way."""
     names = {name: size for name, size in store.names(ITEMS).items() if split_name(name)}
     if len(names) > MAX_ITEMS:
         raise AtlasError(f"more than {MAX_ITEMS} items: {store}")
@@ -345,13 +292,11 @@ def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
 
 
 def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
-    """A STAC item collection, with references relative to the root of the atlas."""
     items = [_moved(sheet.to_item(), "../", "./") for sheet in sheets]
     return canonical({"type": "FeatureCollection", "features": items})
 
 
 def _read_snapshot(store: Store, names: Mapping[str, int]) -> dict[str, Sheet]:
-    """The sheets of the snapshot whose items exist; none where it is missing or damaged."""
     wanted = len(names) > 1 and not store.is_local  # items of a folder are read as fast
     size = store.size(SNAPSHOT) if wanted else None
     if size is None or size > MAX_SNAPSHOT_BYTES:
@@ -372,7 +317,6 @@ def _read_snapshot(store: Store, names: Mapping[str, int]) -> dict[str, Sheet]:
 
 
 def read_some(store: Store, names: Mapping[str, int]) -> tuple[dict[str, Sheet], dict[str, str]]:
-    """As `read_items`, for items of these file names (and sizes) only."""
     found: dict[str, Sheet] = {}
     broken = {
         name: f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{name}"
@@ -404,8 +348,6 @@ def _contents(store: Store, paths: list[str]) -> dict[str, bytes]:
 
 
 def _moved(item: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
-    """The item with its references relative to another folder."""
-
     def moved(entry: Mapping[str, Any]) -> dict[str, Any]:
         return {**entry, "href": new + entry["href"].removeprefix(old)}
 

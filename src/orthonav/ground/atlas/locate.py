@@ -46,42 +46,28 @@ from orthonav.ground.atlas.search import (
 from orthonav.ground.planning.area import Area
 
 # Values without another source: `benchmarks.atlas_lost` at d63ac91.
-CANDIDATES = 40
-"""Places of the whole atlas that are judged, 4 ms each."""
+CANDIDATES = 40  # places of the whole atlas that are judged, 4 ms each
 TURN_STEP_DEG = 8.0
 LOG_SCALES = (-0.06, 0.06)
 """Headings and log scales under which coarse tiles are searched: each
 view has a pose that is off by 4 deg and 6 % at most, for scales within 12 %."""
-KNOWN_SIGMAS = 2.0
-"""Standard deviations of a reported heading that are searched to either side."""
-REACH_STRIDES = 0.8
-"""Strides of the coarse tiles around a candidate that are searched: more than half a diagonal."""
-TURN_STD_RAD = math.radians(4.0)
-"""Of the heading of a candidate: half of `TURN_STEP_DEG`."""
-VIEW_TILES = (0.6, 2.5)
-"""Least and greatest side of a view, in coarse tiles."""
-FOLLOWED, FOLLOWED_NATS = 4, 4.0
-"""Chains whose expected places are searched: at most so many, and not less likely than the best by
-more nats."""
-START_PX = 5.0
-"""Standard deviation of a found place, in pixels of the sheets: half of the radius within which
-their confidence counts a place as right."""
-REPLAYED = 4
-"""Latest views of a place that a track begins with."""
+KNOWN_SIGMAS = 2.0  # standard deviations of a reported heading that are searched to either side
+REACH_STRIDES = 0.8  # of coarse tiles, searched around a candidate: over half a diagonal
+TURN_STD_RAD = math.radians(4.0)  # of the heading of a candidate: half of `TURN_STEP_DEG`
+VIEW_TILES = (0.6, 2.5)  # least and greatest side of a view, in coarse tiles
+FOLLOWED, FOLLOWED_NATS = 4, 4.0  # chains whose expected places are searched
+START_PX = 5.0  # of a found place: half of the radius within which confidence counts it right
+REPLAYED = 4  # latest views of a place that a track begins with
 
 
 @dataclass(frozen=True, eq=False)
 class FoundPlace:
-    """A place on which several views agree.
-
-    `seen`: the latest of these views, each with the place of its camera, the last one that of the
-    view found. `std_m`: standard deviation of such a place, per axis. `confidence`: probability
-    that the places are right, against all others of the atlas.
-    """
+    """A place on which several views agree. `seen`: the latest of these views, each with the place
+    of its camera, the last one that of the view found."""
 
     seen: tuple[tuple[View, Placement], ...]
-    std_m: float
-    confidence: float
+    std_m: float  # standard deviation of such a place, per axis
+    confidence: float  # probability that the places are right, against all others of the atlas
 
 
 class PlaceFinder:
@@ -98,16 +84,10 @@ class PlaceFinder:
         self._number = 0
 
     def restart(self) -> None:
-        """Forget all views."""
         self._agreement = Agreement()
         self._views = {}
 
     def find(self, view: View) -> FoundPlace | NoFix:
-        """The place on which this view and earlier ones agree; until then the reason why not.
-
-        Raises `CameraError` where the image is not of the camera's size, `StorageError` where
-        sheets cannot be fetched.
-        """
         recipe = self._search.recipe
         refused = check_view(view, recipe.gsd_m, self._heading_known)
         if refused is not None:
@@ -150,7 +130,6 @@ class PlaceFinder:
         return self._outcome()
 
     def _expected(self, view: View, coarse: RectifiedView, time_ns: int) -> list[SearchRegion]:
-        """Where the most likely one chains expect the view."""
         found = []
         chains = self._agreement.chains[:FOLLOWED]
         for each in chains:
@@ -169,7 +148,6 @@ class PlaceFinder:
         return found
 
     def _candidates(self, view: View, coarse: RectifiedView) -> list[SearchRegion]:
-        """The places of the whole atlas that are most similar to the view."""
         headings = np.arange(0.0, 360.0, TURN_STEP_DEG)
         if self._heading_known:
             reach = KNOWN_SIGMAS * math.degrees(pose_prior(view.telemetry, True).turn_std_rad)
@@ -201,7 +179,6 @@ class PlaceFinder:
 
 
 def rectified(view: View, gsd_m: float) -> RectifiedView:
-    """The view rectified to `gsd_m` metres per pixel, its own heading up."""
     return rectify_footprint(downsampled(view, gsd_m), gsd_m=gsd_m, multiple_px=1)
 
 
@@ -222,12 +199,9 @@ def _moved(
 
 log = logging.getLogger(__name__)
 
-SIGMAS = 3.0
-"""Standard deviations of a position within which the aircraft is."""
-AHEAD_M = 1000.0
-"""A map reaches so much farther than the next view can: fewer maps are cut."""
-LIKELY = 0.5
-"""Least confidence of a fix."""
+SIGMAS = 3.0  # standard deviations of a position within which the aircraft is
+AHEAD_M = 1000.0  # a map reaches so much farther than the next view can: fewer maps are cut
+LIKELY = 0.5  # least confidence of a fix
 MODEL = Model(wide_m=MAX_REACH_M / SIGMAS, most_agreement=1.0)
 """Views of a flight without a prior may be far apart in time: their positions are never predicted
 well. So each must show the map by itself, however well it agrees with the prediction, and a wide
@@ -236,12 +210,9 @@ prediction is no reason to confirm the track again (docs/decisions/atlas.md)."""
 
 class LocalTrack:
     """The track of one aircraft from a found place on. Mutable; not to be shared between threads.
-
-    `fix`: the position at the last view, None where that view does not show the map there.
-    """
+    `fix`: the position at the last view, None where that view does not show the map there."""
 
     def __init__(self, atlas: Atlas, found: FoundPlace, *, heading_known: bool) -> None:
-        """Begin with the views on which the place was found. Raises as `cut_in_memory`."""
         self._atlas = atlas
         views = [view for view, _ in found.seen]
         places = [place.latlon_deg for _, place in found.seen]
@@ -270,7 +241,6 @@ class LocalTrack:
 
     @property
     def state(self) -> State:
-        """State after the last view."""
         return self._tracker.state
 
     def locate(self, view: View) -> bool:
@@ -283,7 +253,6 @@ class LocalTrack:
         return not (was_lost and self.state is State.LOST)
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> bool:
-        """The same for a view whose picture cannot be used for `reason`."""
         if not self._can_follow(telemetry, 0.0):
             return False
         self._take(self._tracker.passed(telemetry, reason), telemetry)
@@ -298,10 +267,8 @@ class LocalTrack:
         self.fix = replace(seen, confidence=confidence) if confidence >= LIKELY else None
 
     def _can_follow(self, telemetry: Telemetry, half_view_m: float) -> bool:
-        """Whether the aircraft is near enough to the expected place to be sought there.
-
-        A view that may reach beyond the map gets another one.
-        """
+        """Whether the aircraft is near enough to the expected place to be sought there. A view that
+        may reach beyond the map gets another one."""
         fix = self._last
         seconds = max(0.0, (telemetry.time_ns - self._time_ns) / 1e9)
         velocity = np.array([fix.evidence["vel_east_mps"], fix.evidence["vel_north_mps"]])
@@ -322,7 +289,6 @@ class LocalTrack:
         return True
 
     def _cut(self, middle: LocalFrame, reach_m: float) -> tuple[Area, Localizer]:
-        """A map around a place that shows all within reach, and its area."""
         half_m = reach_m + AHEAD_M
         area = Area(middle, (-half_m, -half_m, half_m, half_m))
         localizer = Localizer(cut_in_memory(self._atlas, area))
@@ -337,7 +303,6 @@ class AtlasLocator:
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
-        """Raises `AtlasError` where no maps can be cut out of the atlas."""
         self._atlas = registrar.atlas
         recipe = self._atlas.recipe
         if recipe.method.partition(":")[0] != "gradient" or not recipe.registration:
@@ -356,16 +321,10 @@ class AtlasLocator:
         return self._state.value
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        """The outcome of a view that cannot be used: `reason`."""
         self._follow(lambda track: track.passed(telemetry, reason))
         return self._outcome(reason)
 
     def locate(self, view: View) -> Fix | NoFix:
-        """Where a view was taken, once views agree; until then the reason why not.
-
-        Raises `CameraError` where the image is not of the camera's size, `StorageError` where
-        sheets cannot be fetched.
-        """
         self._follow(lambda track: track.locate(view))
         if self._track is not None and self._track.fix is not None:
             self._finder.restart()
@@ -377,7 +336,6 @@ class AtlasLocator:
         return self._outcome()
 
     def _follow(self, take_in: Callable[[LocalTrack], bool]) -> None:
-        """Let the track, if there is one, take in a view; forget a track that has ended."""
         if self._track is None:
             return
         try:
@@ -388,7 +346,6 @@ class AtlasLocator:
             self._track = None
 
     def _begin(self, found: FoundPlace) -> None:
-        """Begin another track at a place, where its views agree on it on a map cut there too."""
         try:
             begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
         except (AreaError, AtlasError) as error:
@@ -398,7 +355,6 @@ class AtlasLocator:
             self._track = begun
 
     def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:
-        """The fix of the track, or why there is none."""
         if self._track is not None:
             self._state = self._track.state
         elif self._state is not State.SEARCHING:
@@ -409,5 +365,4 @@ class AtlasLocator:
 
 
 def _half_diagonal_m(view: View) -> float:
-    """Half of the diagonal of the ground that a view shows from straight above."""
     return view.telemetry.agl_m * math.hypot(*view.camera.extent) / 2

@@ -51,27 +51,21 @@ from orthonav.ground.atlas.index import (
 )
 from orthonav.ground.atlas.vectors import ShardedIndex
 
-PER_POSE = 60
-"""Tiles found for each pose; several neighbouring tiles are one place."""
+PER_POSE = 60  # tiles found for each pose; several neighbouring tiles are one place
 EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
 MOST_EFFORT = 0.085, 1500
 """Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
 finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
 (`benchmarks.atlas_search` at d63ac91)."""
-APART_STRIDES = 1.5
-"""Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
-MAX_LAT_DEG = 89.8
-"""Nearer to a pole a view has no meaningful heading."""
+APART_STRIDES = 1.5  # tiles nearer to each other are one place: the eight neighbours of a tile
+MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
 
 
 class TileSearch:
-    """The index of an atlas with its shards mapped. Not to be shared between threads.
-
-    `unknown` names the sheets that are not in the index, which are not found.
-    """
+    """The index of an atlas with its shards mapped. Not to be shared between threads. `unknown`
+    names the sheets that are not in the index, which are not found."""
 
     def __init__(self, atlas: Atlas) -> None:
-        """Raises `AtlasError` where the atlas has no coarse tiles, or no valid index of them."""
         if atlas.recipe.coarse is None:
             raise AtlasError(
                 f"the atlas has no coarse tiles, so views need a prior there: {atlas.url}"
@@ -99,18 +93,11 @@ class TileSearch:
         self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
     ) -> list[Placement]:
         """The tiles most similar to a view under any of the poses, best first, apart from each
-        other: their centres, which are the middle of the ground that the view shows.
-
-        `view`: rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log
-        scale of each.
-        """
+        other: their centres, which are the middle of the ground that the view shows. `view`:
+        rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log scale of
+        each."""
         embedded = embed_poses(
-            self._embedder,
-            self._representation,
-            view.grey,
-            view.valid,
-            poses,
-            self.recipe.tile_px,
+            self._embedder, self._representation, view.grey, view.valid, poses, self.recipe.tile_px
         )
         queries = half_whitened(self._embedder, embedded)
         per_pose = min(PER_POSE, len(self._index))
@@ -134,43 +121,27 @@ class TileSearch:
 
 log = logging.getLogger(__name__)
 
-MAX_OPEN = 16
-"""Sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all."""
-BORDER_SHARE = 0.25
-"""Sheets reach half a tile beyond their box: a sheet is
-searched where the middle of a view may lie up to this share of its side outside the box."""
-WIDEST = 1.25
-"""On level ground all of a view of up to this scale lies on the part of a sheet where it is
-registered."""
+MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
+BORDER_SHARE = 0.25  # of its side that the middle of a view may lie outside the box of a sheet
+WIDEST = 1.25  # greatest scale at which all of a view lies on the part of a sheet, on level ground
 
 
 @dataclass(frozen=True)
 class SearchRegion(Placement):
-    """A placement around which a view is registered.
-
-    `middle_latlon_deg`: middle of the ground that the view shows.
-    `reach_m`: how far from the place is searched.
-    `turn_std_rad`: standard deviation of the heading.
-    """
-
-    middle_latlon_deg: tuple[float, float]
-    reach_m: float
-    turn_std_rad: float
+    middle_latlon_deg: tuple[float, float]  # middle of the ground that the view shows
+    reach_m: float  # how far from the place is searched
+    turn_std_rad: float  # standard deviation of the heading
 
     def contains(self, place: Placement) -> bool:
-        """Whether a place is within reach."""
         return nearest_m(self.latlon_deg, [place.latlon_deg]) <= self.reach_m
 
 
 @dataclass(frozen=True, eq=False)
 class SheetMatch(Placement):
-    """The placement of a view registered on a sheet.
+    """The placement of a view registered on a sheet. `confidence`: what the sheet makes of the
+    evidence, None where it has learnt nothing."""
 
-    `evidence`: scores of the match and of its rivals.
-    `confidence`: what the sheet makes of the evidence, None where it has learnt nothing.
-    """
-
-    evidence: Mapping[str, float]
+    evidence: Mapping[str, float]  # scores of the match and of its rivals
     confidence: RegisteredConfidence | None
 
 
@@ -187,13 +158,11 @@ class PyramidPart:
     width: int
 
     def shape(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
         return level_shape(self.height, self.width, level)
 
     def read(
         self, level: int, row: int, col: int, height: int, width: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of a window."""
         first = (self.row >> level) + row, (self.col >> level) + col
         return self.whole.read(level, *first, height, width)
 
@@ -208,8 +177,6 @@ class SheetRegistrar:
         self._sheet = functools.lru_cache(maxsize=MAX_OPEN)(self._opened)
 
     def near(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
-        """The usable sheets within reach of the middle of a view. Raises `StorageError` where a
-        sheet cannot be fetched."""
         frame = LocalFrame(*region.middle_latlon_deg)
         reach_m = region.reach_m + BORDER_SHARE * side_m
         lats, lons = frame.latlon_from_en(np.array([[-reach_m, -reach_m], [reach_m, reach_m]]))
@@ -236,8 +203,6 @@ class SheetRegistrar:
 
 
 class ViewRegistrar:
-    """Registers one view, which is prepared once for all sheets that are alike."""
-
     def __init__(self, sheets: SheetRegistrar, view: View, side_m: float) -> None:
         self._sheets, self._side_m = sheets, side_m
         self._prepared = functools.cache(functools.partial(prepare, view, heading_known=False))
@@ -313,8 +278,6 @@ def part_of(
 
 @dataclass(frozen=True, eq=False)
 class JudgedRegion:
-    """A view on the part of a sheet around a region."""
-
     sheet: RegistrationLocalizer
     view: PreparedView
     region: SearchRegion
@@ -322,7 +285,6 @@ class JudgedRegion:
 
     @functools.cached_property
     def search(self) -> Search:
-        """The search for the view in the region."""
         return Search(self.sheet, self.view, self.prior)
 
     @functools.cached_property
@@ -339,16 +301,13 @@ class JudgedRegion:
 
     @property
     def look(self) -> float:
-        """Score of the best of them, less the cost of its prior."""
         return self.search.placer.standing(self.judged)[0]
 
     @property
     def latlon_deg(self) -> tuple[float, float]:
-        """Latitude and longitude of the camera there."""
         return self._latlon_deg(self.judged[0].pose)
 
     def finished(self) -> SheetMatch:
-        """The match at the best of them."""
         placer = self.search.placer
         places = placer.on_terrain(self.judged, 1)
         return self._match(placer.below_camera(placer.finished(places, len(places))))
@@ -369,24 +328,17 @@ class JudgedRegion:
         return SheetMatch(*place, found.scores, self.sheet.confidence)
 
 
-SEARCHED = 4
-"""At most so many candidates are searched: the right one and the best rivals are among them
-(docs/decisions/atlas.md)."""
+SEARCHED = 4  # candidates: the right one and the best rivals (docs/decisions/atlas.md)
 PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""
-RIVAL_SHARE = 0.25
-"""Matches farther apart than this share of the view's side are different places."""
-LEAST = 1e-5
-"""Least and greatest (1 - LEAST) probability of a match, for finite odds."""
+RIVAL_SHARE = 0.25  # matches farther apart than this share of the view's side are different places
+LEAST = 1e-5  # least and greatest (1 - LEAST) probability of a match, for finite odds
 
 
 class ViewMatches:
-    """The matches of a view `side_m` wide.
-
-    `found`: the strongest of each place, strongest first. `compared`: the regions of candidates
-    that were finished, or searched.
-    """
+    """The matches of a view `side_m` wide. `found`: the strongest of each place, strongest first.
+    `compared`: the regions of candidates that were finished, or searched."""
 
     def __init__(self, side_m: float) -> None:
         self._apart_m = RIVAL_SHARE * side_m
@@ -395,7 +347,6 @@ class ViewMatches:
         self.found: list[SheetMatch] = []
 
     def add_candidates(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
-        """Judge candidates, finish those with hope, search the strongest until one is proven."""
         judged = [each for each in map(registrar.judged, regions) if each is not None]
         judged.sort(key=lambda each: -each.look)
         hopeful = sum(each.look >= HOPE * judged[0].look for each in judged)
@@ -431,15 +382,12 @@ class ViewMatches:
 
     @property
     def _proven(self) -> bool:
-        """Whether the strongest match is proven."""
         return bool(self.found) and self.log_odds(0) >= PROVEN
 
     def _proven_in(self, region: SearchRegion) -> bool:
-        """Whether it is, and lies in a region."""
         return self._proven and region.contains(self.found[0])
 
     def log_odds(self, number: int) -> float:
-        """Log odds of one of the matches against all others."""
         one = self.found[number]
         rivals = [each.evidence for at, each in enumerate(self.found) if at != number]
         looks = [
@@ -451,7 +399,6 @@ class ViewMatches:
         return logit(confidence(against(one.evidence, rivals, looks)), LEAST)
 
     def _distinct(self, matches: Sequence[SheetMatch]) -> list[SheetMatch]:
-        """The strongest match of each place, strongest first."""
         distinct: list[SheetMatch] = []
         for each in sorted(matches, key=lambda one: -one.evidence["strength"]):
             others = [one.latlon_deg for one in distinct]
@@ -465,11 +412,9 @@ def against(
     rivals: Sequence[Mapping[str, float]],
     looks: Sequence[float] = (),
 ) -> dict[str, float]:
-    """The evidence of a match with the best other match of the whole atlas as its rival.
-
-    `looks`: scores, at the level where views are judged, of places that were not finished. The
-    finest level counts only where the strongest rival was compared there too.
-    """
+    """The evidence of a match with the best other match of the whole atlas as its rival. `looks`:
+    scores, at the level where views are judged, of places that were not finished. The finest level
+    counts only where the strongest rival was compared there too."""
     made = dict(evidence)
     for rival, value in (("rival", "strength"), ("look_rival", "look")):
         made[rival] = max([made[rival], *(each[value] for each in rivals)])

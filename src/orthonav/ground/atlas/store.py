@@ -29,17 +29,13 @@ from orthonav.core.files import replacing
 
 log = logging.getLogger(__name__)
 
-MAX_READ_BYTES = 64 * 2**20
-"""A guard for memory: catalogue and index manifest are smaller."""
-LIMIT_BYTES = 20 * 10**9
-"""Some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)."""
-GRACE_S = 600.0
-"""Files used within this time are not removed: a process may be about to open them."""
+MAX_READ_BYTES = 64 * 2**20  # a guard for memory: catalogue and index manifest are smaller
+LIMIT_BYTES = 20 * 10**9  # some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)
+GRACE_S = 600.0  # files used within this time are not removed: a process may be about to open them
 _OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
 """There a file appears when it is complete; elsewhere it is moved to its name."""
 _FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
-_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}
-"""Protocols that refuse to replace a file unless `overwrite` is passed."""
+_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}  # refuse to replace a file unless told
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
 _PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 _PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
@@ -48,22 +44,18 @@ _CREDENTIALS = re.compile(
     "|TokenRetrieval|UnauthorizedSSOToken"
 )
 """In the names of exceptions of boto, Google and Azure: there are no valid credentials."""
-_UNREACHABLE = re.compile(
+_UNREACHABLE = re.compile(  # in the names of exceptions: the storage cannot be reached
     "Connect(or|ion)|Timeout|HTTPClientError|SSLError|ServiceRe(quest|sponse)Error|gaierror"
 )
-"""In the names of exceptions: the storage cannot be reached."""
 _MAX_TEXT = 300
 
 
 class Store:
     """The files of one atlas by name (`folder/file`). Can be pickled and used by several threads.
-
     Every failure is a `StorageError` with its cause, or `MissingExtraError` where the package of a
-    protocol is not installed. `str()` gives the address without a password.
-    """
+    protocol is not installed. `str()` gives the address without a password."""
 
     def __init__(self, url: str) -> None:
-        """The store at a folder or URL, which need not exist yet."""
         match = _PROTOCOL.match(url)
         self._protocol = match.group(1).lower() if match else "file"
         self.is_local = self._protocol in ("file", "local")
@@ -85,9 +77,7 @@ class Store:
 
     def names(self, folder: str = "", prefix: str = "") -> dict[str, int]:
         """Names of the files of a folder that begin with `prefix`, sorted, and their sizes.
-
-        Subfolders are left out. Empty where there is no such folder.
-        """
+        Subfolders are left out. Empty where there is no such folder."""
         found: dict[str, int] = {}
         with storage_errors(self.shown(folder), "list the files of the atlas"):
             folder = checked_name(folder) if folder else ""
@@ -99,7 +89,6 @@ class Store:
         return dict(sorted(found.items()))
 
     def size(self, name: str) -> int | None:
-        """Bytes of a file, None where it does not exist."""
         with storage_errors(self.shown(name), "access the atlas"):
             if self.is_local:
                 path = self._path(checked_name(name))
@@ -113,7 +102,6 @@ class Store:
             return int(info["size"]) if info["type"] == "file" else None
 
     def age_s(self, name: str) -> float | None:
-        """Seconds since a file was written, None where the store does not report it."""
         with storage_errors(self.shown(name), "access the atlas"):
             if self.is_local:
                 return time.time() - self._path(checked_name(name), follow=False).lstat().st_mtime
@@ -127,7 +115,6 @@ class Store:
         return time.time() - when if isinstance(when, int | float) else None
 
     def read(self, name: str, limit_bytes: int = MAX_READ_BYTES) -> bytes:
-        """Content of a file of at most `limit_bytes`."""
         size = self.size(name)
         if size is None:
             raise StorageError(f"the atlas has no such file: {self.shown(name)}")
@@ -138,7 +125,6 @@ class Store:
         return self.read_many([name])[name]
 
     def read_many(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Contents of small files, in one request where the store supports it."""
         with storage_errors(str(self), "read files of the atlas"):
             names = [checked_name(name) for name in names]
             if self.is_local:
@@ -151,10 +137,8 @@ class Store:
             return {name: found[path] for name, path in zip(names, paths, strict=True)}
 
     def fetch(self, name: str, size: int, sha256: str) -> Path:
-        """A local file with that content, verified once: the file itself or a cached copy.
-
-        Several processes may use the cache at the same time.
-        """
+        """A local file with that content, verified once: the file itself or a cached copy. Several
+        processes may use the cache at the same time."""
         if self.is_local:
             return self._verified_path(name, size, sha256)
         folder, limit_bytes = cache_folder(), cache_limit_bytes()
@@ -170,13 +154,11 @@ class Store:
         return path
 
     def download(self, name: str, path: Path) -> None:
-        """Copy a file of a remote atlas to `path`, not verified."""
         with storage_errors(self.shown(name), f"copy from the atlas to {path.parent}"):
             fs, remote_path = self._remote(checked_name(name))
             fs.get_file(remote_path, str(path))
 
     def write(self, name: str, content: Path | bytes) -> None:
-        """Write a file, a copy of a local one or these bytes, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
             name = checked_name(name)
             if not self.is_local:
@@ -189,7 +171,6 @@ class Store:
                     temporary.write_bytes(content)
 
     def remove(self, name: str) -> None:
-        """Remove a file if it exists."""
         with (
             storage_errors(self.shown(name), "remove a file of the atlas"),
             contextlib.suppress(FileNotFoundError),
@@ -201,7 +182,6 @@ class Store:
                 fs.rm_file(remote_path)
 
     def shown(self, name: str) -> str:
-        """The address of a file, without a password."""
         return f"{self}/{name:.200}" if name else str(self)
 
     def _path(self, name: str, follow: bool = True) -> Path:
@@ -289,7 +269,6 @@ def _folder_of(name: str) -> str:
 
 
 def _listed(folder: Path, prefix: str) -> dict[str, int]:
-    """Names and sizes of the files in a local folder."""
     found = {}
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -300,7 +279,6 @@ def _listed(folder: Path, prefix: str) -> dict[str, int]:
 
 
 def checked_name(name: str) -> str:
-    """`name` if it is a valid name of a file inside an atlas. Raises `StorageError`."""
     parts = name.split("/")
     if not all(_PART.fullmatch(part) and part not in (".", "..") for part in parts):
         raise StorageError(f"invalid name of a file in an atlas: {name!r:.120}")
@@ -308,13 +286,11 @@ def checked_name(name: str) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file, as hex."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _require(path: Path, size: int, sha256: str, shown: str) -> None:
-    """Raise `StorageError` where a file has not the size and digest of the catalogue."""
     found = path.stat().st_size
     if found != size:
         wrong = f"incomplete or altered: {found} bytes, the catalogue has {size}"
@@ -326,7 +302,6 @@ def _require(path: Path, size: int, sha256: str, shown: str) -> None:
 
 
 def cache_folder() -> Path:
-    """The folder of the cache: `ORTHONAV_CACHE`, otherwise the cache folder of the user."""
     own = os.environ.get("ORTHONAV_CACHE")
     if own:
         return Path(own).expanduser()
@@ -335,7 +310,6 @@ def cache_folder() -> Path:
 
 
 def cache_limit_bytes() -> int:
-    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB. Raises `StorageError`."""
     gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
     try:
         return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
@@ -344,7 +318,6 @@ def cache_limit_bytes() -> int:
 
 
 def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
-    """Remove the least recently used files until the limit holds."""
     files = []
     for path in folder.glob("??/*"):
         with contextlib.suppress(FileNotFoundError):  # removed by another process
@@ -362,11 +335,9 @@ def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
 
 @contextmanager
 def storage_errors(place: str, action: str) -> Iterator[None]:
-    """Turn errors raised inside into `StorageError` with the cause.
-
-    `place`: address to show to people, without a password. `action`: what was attempted, a verb and
-    its object. Every exception is converted: the libraries behind fsspec raise many kinds.
-    """
+    """Turn errors raised inside into `StorageError` with the cause. `place`: address to show to
+    people, without a password. `action`: what was attempted, a verb and its object. Every exception
+    is converted: the libraries behind fsspec raise many kinds."""
     try:
         yield
     except OrthonavError as error:
@@ -406,7 +377,6 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _status(error: BaseException) -> int | None:
-    """The HTTP status that an error of boto, Google or Azure carries."""
     response = getattr(error, "response", None)
     if isinstance(response, dict):
         status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")

@@ -34,22 +34,17 @@ from orthonav.core.extras import needed
 Array = NDArray[np.float32]
 
 QUANTIZERS_NAME = "quantizers.safetensors"
-MAX_TRAINING_VECTORS = 200_000
-"""Vectors that quantizers are trained on, as in `benchmarks.atlas_search` at d63ac91."""
+MAX_TRAINING_VECTORS = 200_000  # as in `benchmarks.atlas_search` at d63ac91
 POINTS_PER_CENTRE = 4096
 """Training vectors per centre, if there are as many. FAISS's default, 256, loses 2 to 4 points of
 recall where lists or codes have few centres (2e5 of `benchmarks.atlas_fields` at d63ac91)."""
-ROUNDS = 12
-"""Iterations of k-means, as in `benchmarks.atlas_search` at d63ac91."""
-CODE_BITS = 4
-"""Bits per quantizer: what the fast scan of FAISS supports."""
-BLOCK = 32
-"""Codes that FAISS scans together; the room of a list is a multiple of it."""
+ROUNDS = 12  # iterations of k-means, as in `benchmarks.atlas_search` at d63ac91
+CODE_BITS = 4  # bits per quantizer: what the fast scan of FAISS supports
+BLOCK = 32  # codes that FAISS scans together; the room of a list is a multiple of it
 FORMAT = "orthonav-vectors"
 
 
 def faiss() -> Any:
-    """The module FAISS; raises `MissingExtraError` where it is not installed."""
     return needed("faiss", "atlas", "searching an atlas")
 
 
@@ -67,19 +62,13 @@ def one_thread() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class VectorRecipe:
-    """How vectors are assigned to lists and coded.
+    """How vectors are assigned to lists and coded. `list_bits`: there are 2 ** `list_bits` lists,
+    half of the bits from either half of a vector; even, 2 to 20."""
 
-    `dims`: components per vector, even.
-    `list_bits`: there are 2 ** `list_bits` lists, half of the bits from either half of a vector;
-    even, 2 to 20.
-    `quantizers`: codes of 4 bits per vector; even, divides `dims`.
-    `seed`: seed of k-means.
-    """
-
-    dims: int
+    dims: int  # components per vector, even
     list_bits: int = 14
-    quantizers: int = 32
-    seed: int = 0
+    quantizers: int = 32  # codes of 4 bits per vector; even, divides `dims`
+    seed: int = 0  # seed of k-means
 
     def __post_init__(self) -> None:
         if self.dims < 2 or self.dims % 2:
@@ -102,42 +91,33 @@ class VectorRecipe:
 
     @property
     def lists(self) -> int:
-        """Number of lists."""
         return int(2**self.list_bits)
 
     @property
     def code_bytes(self) -> int:
-        """Bytes of a code."""
         return self.quantizers // 2
 
 
 @dataclass(frozen=True, eq=False)
 class Quantizers:
-    """The trained quantizers that all shards of an index share.
+    """The trained quantizers that all shards of an index share. `rotation` (D, D): rotates vectors
+    so that variance is spread evenly over the quantizers. `halves` (2, sqrt(lists), D / 2): list
+    centres of each half of a rotated vector."""
 
-    `recipe`: how they were made.
-    `rotation` (D, D): rotates vectors so that variance is spread evenly over the quantizers.
-    `halves` (2, sqrt(lists), D / 2): list centres of each half of a rotated vector.
-    `codebook` (quantizers, 16, D / quantizers): codes of the residual.
-    """
-
-    recipe: VectorRecipe
+    recipe: VectorRecipe  # how they were made
     rotation: Array
     halves: Array
-    codebook: Array
+    codebook: Array  # (quantizers, 16, D / quantizers), codes of the residual
 
     @cached_property
     def digest(self) -> str:
-        """Short digest of all arrays."""
         return sha256(self._bytes()).hexdigest()[:16]
 
     def save(self, path: Path) -> None:
-        """Write to `path` (safetensors)."""
         path.write_bytes(self._bytes())
 
     @classmethod
     def load(cls, path: Path) -> "Quantizers":
-        """Read what `save` wrote; raises `AtlasError`."""
         try:
             with safe_open(path, framework="numpy") as stored:
                 recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
@@ -174,7 +154,6 @@ class Quantizers:
         return lists, products
 
     def empty_index(self) -> Any:
-        """An empty FAISS index (IndexIVFPQFastScan) with these quantizers."""
         module = faiss()
         index, coarse = _untrained(self.recipe)
         module.copy_array_to_vector(self.halves.reshape(-1), coarse.pq.centroids)
@@ -184,7 +163,6 @@ class Quantizers:
 
 
 def _untrained(recipe: VectorRecipe) -> tuple[Any, Any]:
-    """An index of FAISS to be trained, and its quantizer of lists."""
     module = faiss()
     coarse = module.MultiIndexQuantizer(recipe.dims, 2, recipe.list_bits // 2)
     index = module.IndexIVFPQFastScan(
@@ -202,7 +180,6 @@ def _untrained(recipe: VectorRecipe) -> tuple[Any, Any]:
 
 
 def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of `Quantizers` by name."""
     dims, quantizers = recipe.dims, recipe.quantizers
     return {
         "rotation": (dims, dims),
@@ -212,10 +189,8 @@ def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
 
 
 def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers:
-    """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes.
-
-    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used.
-    """
+    """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes. At
+    most `MAX_TRAINING_VECTORS` evenly spaced vectors are used."""
     step = max(1, -(-len(sample) // MAX_TRAINING_VECTORS))
     taken = np.asarray(sample[::step], dtype=np.float32)
     rotation = _rotation(taken, recipe.quantizers)
@@ -229,19 +204,14 @@ def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers
     halves, codebook = (faiss().vector_to_array(each.pq.centroids) for each in (coarse, index))
     shapes = _shapes(recipe)
     return Quantizers(
-        recipe,
-        rotation,
-        halves.reshape(shapes["halves"]),
-        codebook.reshape(shapes["codebook"]),
+        recipe, rotation, halves.reshape(shapes["halves"]), codebook.reshape(shapes["codebook"])
     )
 
 
 def _rotation(vectors: Array, groups: int) -> Array:
-    """Rotation (D, D) to principal axes, assigned so that the products of the groups' variances
-    are similar (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3).
-
-    The PCAMatrix of FAISS, which balances sums of variances, finds 1 to 4 % fewer vectors.
-    """
+    """Rotation (D, D) to principal axes, assigned so that the products of the groups' variances are
+    similar (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3). The PCAMatrix of
+    FAISS, which balances sums of variances, finds 1 to 4 % fewer vectors."""
     wide = vectors.astype(np.float64)
     variances, axes = np.linalg.eigh(wide.T @ wide / len(wide))
     variances, axes = variances[::-1], axes[:, ::-1]
@@ -263,11 +233,9 @@ def _rotation(vectors: Array, groups: int) -> Array:
     return np.ascontiguousarray(axes[:, order], dtype=np.float32)
 
 
-SCAN_ONE = 10
-"""FAISS's implementation of the scan that is fastest for one query at a time."""
+SCAN_ONE = 10  # FAISS's implementation of the scan that is fastest for one query at a time
 ADD_ROWS = 32_768
-NONE = -1
-"""Id where fewer than k vectors were found."""
+NONE = -1  # id where fewer than k vectors were found
 
 Ids = NDArray[np.int64]
 Places = NDArray[np.float64]
@@ -275,36 +243,24 @@ Places = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of one sheet in a shard, in the order of its coarse tiles.
-
-    `sheet`: name of the sheet.
-    `sha256`: digest of its coarse tiles (hex).
-    `rows`: how many.
-    `retired`: the sheet has changed or gone, and its rows are not found any more.
-    """
-
-    sheet: str
-    sha256: str
-    rows: int
-    retired: bool = False
+    sheet: str  # name of the sheet
+    sha256: str  # digest of its coarse tiles (hex)
+    rows: int  # how many
+    retired: bool = False  # the sheet has changed or gone, and its rows are not found any more
 
 
 @dataclass(frozen=True)
 class ShardInfo:
-    """A shard: its name, the id of its first row, and the sheets in it, row after row."""
-
     name: str
     base: int
     parts: tuple[Part, ...]
 
     @property
     def rows(self) -> int:
-        """Number of rows, retired ones included."""
         return sum(part.rows for part in self.parts)
 
     @property
     def retired_rows(self) -> NDArray[np.int64]:
-        """Rows (N,) of retired parts, in order."""
         ends = np.cumsum([part.rows for part in self.parts]).tolist()
         retired = [
             np.arange(end - part.rows, end, dtype=np.int64)
@@ -317,12 +273,9 @@ class ShardInfo:
 def write_shard(
     folder: Path, name: str, quantizers: Quantizers, batches: Iterable[tuple[Places, Array]]
 ) -> int:
-    """Write a shard of unit vectors and return its number of rows.
-
-    `batches`: latitudes and longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory
-    grows by codes and places, some 40 bytes a vector. Raises `AtlasError` where the vectors are not
-    finite.
-    """
+    """Write a shard of unit vectors and return its number of rows. `batches`: latitudes and
+    longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory grows by codes and places,
+    some 40 bytes a vector."""
     folder.mkdir(parents=True, exist_ok=True)
     dims, index = quantizers.recipe.dims, quantizers.empty_index()
     places_deg = [np.empty((0, 2))]
@@ -345,7 +298,6 @@ def write_shard(
 
 
 def _write_header(out: IO[bytes], rows: int, dims: int) -> None:
-    """Header of an array of NumPy, which reserves room for any number of rows."""
     header = {"descr": "<f2", "fortran_order": False, "shape": (rows, dims)}
     np.lib.format.write_array_header_1_0(out, header)
 
@@ -364,7 +316,6 @@ def _write_lists(folder: Path, name: str, index: Any, quantizers: Quantizers) ->
 
 
 def _lists(index: Any, quantizers: Quantizers) -> Iterator[tuple[int, NDArray[np.uint8], Ids]]:
-    """Number, codes in blocks, and rows of each list that is not empty."""
     module, lists = faiss(), index.invlists
     for number in range(quantizers.recipe.lists):
         size = lists.list_size(number)
@@ -383,7 +334,6 @@ class OpenShard:
     def __init__(
         self, file: Callable[[str], Path], info: ShardInfo, quantizers: Quantizers
     ) -> None:
-        """Raises `AtlasError` where a file cannot be read or does not fit `info`."""
         self.info = info
         ends = ("vectors.npy", "codes", "lists.npy", "places.npy")
         path, codes, lists, places = (file(f"{info.name}.{end}") for end in ends)
@@ -413,7 +363,6 @@ class OpenShard:
     def _map_lists(
         self, path: Path, size: int, table: NDArray[np.uint64], quantizers: Quantizers
     ) -> None:
-        """Let FAISS scan the lists in the mapped file."""
         module, recipe = faiss(), quantizers.recipe
         _check_table(table, recipe.lists, recipe.code_bytes, size, path)
         if int(table[:, 0].sum()) != self.info.rows:
@@ -463,7 +412,6 @@ class OpenShard:
 def _check_table(
     table: NDArray[np.uint64], lists: int, code_bytes: int, size: int, path: Path
 ) -> None:
-    """Raise `AtlasError` unless every list lies within the file."""
     fits = table.shape == (lists, 3) and table.dtype == np.uint64
     if fits:
         count, room, offset = table.astype(np.float64).T
@@ -474,16 +422,10 @@ def _check_table(
 
 
 class ShardedIndex:
-    """The shards of an index, mapped and searched on one core.
-
-    The id of a vector is the base of its shard plus its row. Not for several threads at once.
-    """
+    """The shards of an index, mapped and searched on one core. The id of a vector is the base of
+    its shard plus its row. Not for several threads at once."""
 
     def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
-        """Open shards and quantizers; `file` gives the path of each of their files.
-
-        Raises `AtlasError` where a file is damaged.
-        """
         self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
         self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
 
@@ -493,11 +435,9 @@ class ShardedIndex:
     def search(
         self, queries: NDArray[np.float32], k: int, probes: int, rerank: int
     ) -> tuple[Array, Ids]:
-        """Highest scalar products (Q, k) and ids (Q, k) of queries (Q, D), best first.
-
-        `probes` lists of every shard are scanned. The `rerank` best by code, over all shards, are
-        compared by their stored vectors. Where fewer are found: id -1 and product -inf.
-        """
+        """Highest scalar products (Q, k) and ids (Q, k) of queries (Q, D), best first. `probes`
+        lists of every shard are scanned. The `rerank` best by code, over all shards, are compared
+        by their stored vectors. Where fewer are found: id -1 and product -inf."""
         queries = np.ascontiguousarray(queries, dtype=np.float32)
         rotated = self.quantizers.rotated(queries)
         lists, centre_scores = self.quantizers.nearest_lists(rotated, probes)
@@ -527,7 +467,6 @@ class ShardedIndex:
         return out
 
     def place_deg(self, number: int) -> tuple[float, float] | None:
-        """Latitude and longitude of an id; None where it is in no shard."""
         for shard in self._shards:
             if shard.info.base <= number < shard.info.base + shard.info.rows:
                 lat, lon = shard.places_deg[number - shard.info.base].tolist()
@@ -549,7 +488,6 @@ class ShardedIndex:
 
 
 def _highest(scores: Array, ids: Ids, count: int) -> tuple[Array, Ids]:
-    """The `count` highest of each row, in no order."""
     if scores.shape[1] <= count:
         return scores, ids
     chosen = np.argpartition(scores, -count, axis=1)[:, -count:]

@@ -29,17 +29,11 @@ from orthonav.ground.build.layer import StoredCells
 from orthonav.ground.build.sheet import Block
 from orthonav.ground.planning.area import Extent
 
-KERNEL_PX = 3
-"""Margin of cubic interpolation, 2 pixels, and one more for rounding."""
-EDGE_POINTS = 16
-"""Points along an edge of a box, which is not straight in another plane."""
-FILL_PX = 5
-"""Pixels by which imagery is extended beyond its edge: the kernel of cubic interpolation."""
-OWN_BONUS = 0.01
-"""A cell is taken from the sheet that shows most of it; this advantage decides ties for the sheet
-whose box holds it."""
-_SHIFT = 6
-"""Fractional bits of polygon corners in OpenCV."""
+KERNEL_PX = 3  # margin of cubic interpolation, 2 pixels, and one more for rounding
+EDGE_POINTS = 16  # points along an edge of a box, which is not straight in another plane
+FILL_PX = 5  # kernel of cubic interpolation: imagery is extended beyond its edge
+OWN_BONUS = 0.01  # decides ties between sheets for the one whose box holds the cell
+_SHIFT = 6  # fractional bits of polygon corners in OpenCV
 Array = NDArray[np.float64]
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 Cells = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -59,12 +53,10 @@ class SheetSource:
 
     @property
     def frame(self) -> LocalFrame:
-        """Its local plane."""
         return self.manifest.sheets[0].frame
 
     @property
     def grid(self) -> TileGrid:
-        """Its tile grid."""
         return self.manifest.sheets[0].grid
 
     def covers(self, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
@@ -75,16 +67,12 @@ class SheetSource:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """The transformation of one sheet to the raster of another grid."""
-
     source: SheetSource
     frame: LocalFrame
     grid: TileGrid
-    turns: bool
-    """Whether cells are harmonics of a direction, which rotate with the plane."""
+    turns: bool  # whether cells are harmonics of a direction, which rotate with the plane
 
     def reaches(self, block: Block) -> bool:
-        """Whether a block may overlap the raster of the sheet."""
         left, top, right, bottom = self._box_px
         return (
             block.col < right
@@ -105,7 +93,6 @@ class Warp:
         return np.asarray(solved)
 
     def owned(self, block: Block, layout: CellLayout | None = None) -> NDArray[np.bool_]:
-        """Which pixels of a block, or cells that begin in it, lie in the box of the sheet."""
         spacing, middle = (1, 0.5) if layout is None else (layout.spacing_px, layout.micro_px / 2)
         shape = -(-block.height // spacing), -(-block.width // spacing)
         # OpenCV's coordinates 0, 0 are the middle of pixel or cell 0, 0.
@@ -167,13 +154,11 @@ class Warp:
 
     @cached_property
     def _outline_px(self) -> Array:
-        """The box of the sheet in pixels of the grid."""
         lon, lat = outline(self.source.sheet.bounds_deg, EDGE_POINTS).T
         return _px_from_latlon(self.frame, self.grid, lat, lon)
 
     @cached_property
     def _box_px(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom of the raster of the sheet in pixels of the grid."""
         grid = self.source.grid
         corners = _corners(Block(0, 0, grid.height_px, grid.width_px))
         places = _latlon_from_px(self.source.frame, grid, corners)
@@ -191,13 +176,11 @@ def outline(box: Extent, points: int) -> Array:
 
 
 def _px_from_latlon(frame: LocalFrame, grid: TileGrid, lat_deg: Array, lon_deg: Array) -> Array:
-    """Column and row (N, 2) of places on the raster of a grid."""
     points = frame.en_from_latlon(lat_deg, lon_deg)
     return np.asarray((points - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m])
 
 
 def _latlon_from_px(frame: LocalFrame, grid: TileGrid, px: Array) -> tuple[Array, Array]:
-    """Inverse of `_px_from_latlon`."""
     places = [grid.west_m, grid.north_m] + px * [grid.gsd_m, -grid.gsd_m]
     return frame.latlon_from_en(places)
 
@@ -223,7 +206,6 @@ def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
 
 
 def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest box around the true pixels of a mask (H, W), or None."""
     rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return None
@@ -249,7 +231,6 @@ def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cel
 
 
 def _turn(means: NDArray[np.float32], angle_rad: float) -> None:
-    """Rotate harmonics of directions in place, by the angle between sheet and grid."""
     for k in range(1, HARMONICS + 1):
         cos, sin = np.float32(math.cos(2 * k * angle_rad)), np.float32(math.sin(2 * k * angle_rad))
         real, imaginary = means[..., 2 * k - 1].copy(), means[..., 2 * k].copy()
@@ -266,16 +247,13 @@ def _corners(block: Block) -> Array:
 
 def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
     """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
-
-    Index 0, 0 is the first of the block, and the first of the raster of the sheet.
-    """
+    Index 0, 0 is the first of the block, and the first of the raster of the sheet."""
     linear = affine[:, :2]
     first = linear @ [block.col + middle, block.row + middle] + affine[:, 2] - middle
     return np.column_stack([linear, first / spacing])
 
 
 def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the part of the sheet that `size` (w, h) pixels need."""
     cols, rows = size
     corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
     there = corners @ matrix[:, :2].T + matrix[:, 2]

@@ -42,7 +42,6 @@ from orthonav.ground.build.calibrate import (
 )
 from orthonav.ground.build.encoders import (
     EncoderRecipe,
-    Learning,
     check_device,
     check_positives,
     learn_encoder,
@@ -285,8 +284,17 @@ def build_map(
     progress = progress or (lambda stage, share: None)
     inputs = BuildInputs.open(request)
     announce(inputs.estimate_text())
-    sheet = _sheet_reader(inputs)
-    with sheet.block_cache(*_cache_folders(request)) as cache:
+    grid, representation = inputs.grid, inputs.representation
+    sheet = SheetReader(
+        inputs.mosaic,
+        inputs.area,
+        grid,
+        representation,
+        CropSampler(grid.tile_px, request.seed, min(grid.height_px, grid.width_px)),
+        registration=request.registration,
+        pictures=SheetPictures(grid, representation) if inputs.learns_network else None,
+    )
+    with sheet.block_cache(request.out, request.work) as cache:
         sheet.read(progress, request.workers, cache)
         embedding = learn_embedding(inputs, sheet, progress)
         calibration = calibrate_tiles(sheet, embedding, progress)
@@ -296,24 +304,6 @@ def build_map(
             manifest = replace(manifest, registration=registration)
         written = write_map(request.out, manifest, arrays)
     return BuildResult(written, request.out.stat().st_size)
-
-
-def _sheet_reader(inputs: BuildInputs) -> SheetReader:
-    grid, representation = inputs.grid, inputs.representation
-    return SheetReader(
-        inputs.mosaic,
-        inputs.area,
-        grid,
-        representation,
-        CropSampler(grid.tile_px, inputs.request.seed, min(grid.height_px, grid.width_px)),
-        registration=inputs.request.registration,
-        pictures=SheetPictures(grid, representation) if inputs.learns_network else None,
-    )
-
-
-def _cache_folders(request: BuildRequest) -> tuple[Path, Path | None]:
-    default = request.out.with_name(f"{request.out.name}.work")
-    return default, None if request.work is None else request.work / f"blocks-{request.out.name}"
 
 
 def learn_embedding(
@@ -340,7 +330,7 @@ def learn_embedding(
             dates,
             tiles_px,
             inputs.representation,
-            Learning(request.seed, request.work, request.device, request.workers),
+            request,
             progress,
         )
     progress("learn", 1.0)

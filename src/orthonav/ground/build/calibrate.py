@@ -33,19 +33,14 @@ from orthonav.core.register.pose import rotation
 from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.ground.build.fit import fit_few, fit_logistic, fit_registered
 
-MAX_REPLACED = 0.75
-"""Largest replaced share of a view."""
-MAX_MIXED = 0.85
-"""Largest share of detail mixed in from the other image."""
-
 
 def changed(
     rng: np.random.Generator,
     grey: NDArray[np.uint8],
     other: NDArray[np.uint8],
     *,
-    most_replaced: float = MAX_REPLACED,
-    most_mixed: float = MAX_MIXED,
+    most_replaced: float = 0.75,
+    most_mixed: float = 0.85,
 ) -> NDArray[np.uint8]:
     """`grey` (S, S) uint8 with the changes of years.
 

@@ -3,10 +3,8 @@
 import importlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +23,9 @@ from orthonav.ground.build.sheet import SheetPictures
 from orthonav.research.caevl_recipe import CaevlRecipe
 from orthonav.research.tiles import SheetTiles
 from orthonav.research.words import learn_words
+
+if TYPE_CHECKING:
+    from orthonav.ground.build.build import BuildRequest
 
 log = logging.getLogger(__name__)
 
@@ -107,23 +108,13 @@ MOST_REPLACED, MOST_MIXED = 0.35, 0.4
 network learned a third as much in its first 300 batches."""
 
 
-@dataclass(frozen=True)
-class Learning:
-    """How to learn: seed of all draws, and of networks what `BuildRequest` says of each."""
-
-    seed: int = 0
-    work: Path | None = None
-    device: str = "auto"
-    workers: int | None = None
-
-
 def learn_encoder(
     recipe: EncoderRecipe,
     pictures: SheetPictures,
     other_dates: Sequence[SheetPictures],
     tiles_px: NDArray[np.intp],
     representation: Any,
-    learning: Learning,
+    request: "BuildRequest",
     progress: Progress,
 ) -> tuple[Encoder, NDArray[np.float16]]:
     """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
@@ -135,18 +126,18 @@ def learn_encoder(
     if isinstance(recipe, WordsRecipe):
         chosen = _word_tiles(tiles)
         encoder = learn_words(
-            recipe, chosen, learning.seed, lambda share: progress("learn words", share)
+            recipe, chosen, request.seed, lambda share: progress("learn words", share)
         )
         return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
     needed("torch", "train", "learning a network")
     training = importlib.import_module("orthonav.research.training")
-    device = None if learning.device == "auto" else learning.device
+    device = None if request.device == "auto" else request.device
     how: dict[str, Any] = {
         "binary": not pictures.is_grey,
-        "seed": learning.seed,
-        "work": learning.work,
+        "seed": request.seed,
+        "work": request.work,
         "report": lambda text, share: _log_progress(progress, text, share),
-        "means": training.Means(device=device, workers=learning.workers),
+        "means": training.Means(device=device, workers=request.workers),
     }
     if isinstance(recipe, CaevlRecipe):
         caevl = importlib.import_module("orthonav.research.caevl")

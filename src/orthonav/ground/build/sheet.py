@@ -8,6 +8,7 @@ everything that determines it.
 
 import contextlib
 import hashlib
+import itertools
 import json
 import logging
 import math
@@ -20,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -66,55 +67,52 @@ def in_order(
     finish their current items and start no new ones.
     """
     workers = min(workers, len(items))
-    if workers > 1:
-        yield from _Crew(items, opened).results(workers)
+    if workers <= 1:
+        with opened() as work:
+            yield from map(work, items)
         return
-    with opened() as work:
-        for item in items:
-            yield work(item)
+    todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+    done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
+    stop = threading.Event()
+    shared = items, opened, todo, done, stop
+    threads = [threading.Thread(target=_serve, args=shared, daemon=True) for _ in range(workers)]
+    waiting = iter(range(len(items)))
+    try:
+        for thread in threads:
+            thread.start()
+        for index in itertools.islice(waiting, workers + AHEAD):
+            todo.put(index)
+        for place in done:
+            made = place.get()
+            if isinstance(made, _Failed):
+                raise made.error
+            for index in itertools.islice(waiting, 1):
+                todo.put(index)
+            yield made
+    finally:
+        stop.set()
+        for _ in threads:
+            todo.put(None)
+        for thread in threads:
+            thread.join()
 
 
-class _Crew(Generic[Item, Made]):
-    def __init__(self, items: Sequence[Item], opened: Callable[[], Worker[Item, Made]]) -> None:
-        self._items, self._opened = items, opened
-        self._todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-        self._done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
-        self._stop = threading.Event()
-
-    def results(self, workers: int) -> Iterator[Made]:
-        threads = [threading.Thread(target=self._serve, daemon=True) for _ in range(workers)]
-        try:
-            for thread in threads:
-                thread.start()
-            for index in range(workers + AHEAD):
-                self._begin(index)
-            for index, place in enumerate(self._done):
-                made = place.get()
-                if isinstance(made, _Failed):
-                    raise made.error
-                self._begin(index + workers + AHEAD)
-                yield made
-        finally:
-            self._stop.set()
-            for _ in threads:
-                self._todo.put(None)
-            for thread in threads:
-                thread.join()
-
-    def _begin(self, index: int) -> None:
-        if index < len(self._items):
-            self._todo.put(index)
-
-    def _serve(self) -> None:
-        at = slice(None)  # all waiting items, until one is started
-        try:
-            with self._opened() as work:
-                while (index := self._todo.get()) is not None and not self._stop.is_set():
-                    at = slice(index, index + 1)
-                    self._done[index].put(work(self._items[index]))
-        except BaseException as error:
-            for place in self._done[at]:
-                place.put(_Failed(error))
+def _serve(
+    items: Sequence[Item],
+    opened: Callable[[], Worker[Item, Made]],
+    todo: "queue.SimpleQueue[int | None]",
+    done: "list[queue.SimpleQueue[Made | _Failed]]",
+    stop: threading.Event,
+) -> None:
+    at = slice(None)  # all waiting items, until one is started
+    try:
+        with opened() as work:
+            while (index := todo.get()) is not None and not stop.is_set():
+                at = slice(index, index + 1)
+                done[index].put(work(items[index]))
+    except BaseException as error:
+        for place in done[at]:
+            place.put(_Failed(error))
 
 
 @dataclass(frozen=True)
@@ -135,10 +133,10 @@ class Block:
         reach_px = np.hypot(self.height, self.width) / 2 + grid.tile_px + grid.stride_px
         return bool(area.contains(np.array([[east_m, north_m]]), reach_px * grid.gsd_m)[0])
 
-    def within(self, other: "Block") -> tuple[slice, slice]:
-        """Rows and columns of the block in the pixels of another block that contains it."""
+    def within(self, other: "Block", beyond_px: int = 0) -> tuple[slice, slice]:
+        """Rows and columns in the pixels of another block, with more to the south and east."""
         row, col = self.row - other.row, self.col - other.col
-        return slice(row, row + self.height), slice(col, col + self.width)
+        return slice(row, row + self.height + beyond_px), slice(col, col + self.width + beyond_px)
 
     def cut(self, side_px: int) -> Iterator["Block"]:
         """Parts, divided at multiples of `side_px` of the raster."""
@@ -149,45 +147,22 @@ class Block:
                 height, width = min(row + side_px, bottom) - top, min(col + side_px, right) - left
                 yield Block(top, left, height, width)
 
-
-@dataclass(frozen=True, eq=False)
-class BlockPixels:
-    """Pixels of a block with a margin; the block begins at row `top`, column `left`."""
-
-    block: Block
-    pixels: GreyPixels
-    top: int
-    left: int
-
-    def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
-        return (
-            slice(self.top, self.top + self.block.height + beyond_px),
-            slice(self.left, self.left + self.block.width + beyond_px),
-        )
+    def with_margin(self, grid: TileGrid, margin_px: int) -> "Block":
+        """The block with `margin_px` on each side, less at the raster border."""
+        top, left = max(0, self.row - margin_px), max(0, self.col - margin_px)
+        bottom = min(grid.height_px, self.row + self.height + margin_px)
+        right = min(grid.width_px, self.col + self.width + margin_px)
+        return Block(top, left, bottom - top, right - left)
 
 
-def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
-    for row in range(0, grid.height_px, side_px):
-        for col in range(0, grid.width_px, side_px):
-            height, width = min(side_px, grid.height_px - row), min(side_px, grid.width_px - col)
-            yield Block(row, col, height, width)
+def read_block(raster: SheetRaster, outer: Block) -> GreyPixels:
+    return raster.read_grey(outer.col, outer.row, outer.width, outer.height)
 
 
-def margins(grid: TileGrid, block: Block, margin_px: int) -> tuple[int, int, int, int]:
-    """Top, left, bottom, right: `margin_px`, less at the raster border."""
-    return (
-        min(margin_px, block.row),
-        min(margin_px, block.col),
-        min(margin_px, grid.height_px - block.row - block.height),
-        min(margin_px, grid.width_px - block.col - block.width),
-    )
-
-
-def read_block(raster: SheetRaster, grid: TileGrid, block: Block, margin_px: int) -> BlockPixels:
-    top, left, bottom, right = margins(grid, block, margin_px)
-    width, height = left + block.width + right, top + block.height + bottom
-    pixels = raster.read_grey(block.col - left, block.row - top, width, height)
-    return BlockPixels(block, pixels, top, left)
+def blocks_of(area: Area, grid: TileGrid, side_px: int) -> list[Block]:
+    """Blocks of at most `side_px` that tiles of an area may need."""
+    whole = Block(0, 0, grid.height_px, grid.width_px)
+    return [block for block in whole.cut(side_px) if block.may_matter(area, grid)]
 
 
 class Preview:
@@ -319,15 +294,16 @@ class SheetPictures:
         self._valid = np.zeros(shape, np.bool_)
         self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
 
-    def parts(self, read: BlockPixels, maps: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
-        """The pixels of a block; `maps` (1, H, W) is its representation with the margin."""
-        part = read.part()
+    def parts(
+        self, pixels: GreyPixels, maps: NDArray[np.float32], part: tuple[slice, slice]
+    ) -> dict[str, NDArray[Any]]:
+        """`pixels` and their representation `maps` (1, H, W) of a block that is a part of them."""
         parts: dict[str, NDArray[Any]] = {
             "pixels": np.rint(maps[0][part] * self._scale).astype(np.uint8),
-            "pixels_valid": read.pixels.valid[part],
+            "pixels_valid": pixels.valid[part],
         }
         if self._grey is not None:
-            parts["pixels_grey"] = read.pixels.grey[part]
+            parts["pixels_grey"] = pixels.grey[part]
         return parts
 
     def put(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
@@ -364,13 +340,14 @@ def read_pictures(
     mosaic: Mosaic, area: Area, grid: TileGrid, representation: Any, progress: Progress
 ) -> SheetPictures:
     pictures = SheetPictures(grid, representation)
-    blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
+    blocks = blocks_of(area, grid, BLOCK_PX)
     with mosaic.grid_sheet(area.frame, grid) as raster:
         for done, block in enumerate(blocks):
-            read = read_block(raster, grid, block, representation.margin_px)
-            if read.pixels.valid.any():
-                maps = sheet_maps(representation, read.pixels.grey, read.pixels.valid)
-                pictures.put(block, pictures.parts(read, maps))
+            outer = block.with_margin(grid, representation.margin_px)
+            pixels = read_block(raster, outer)
+            if pixels.valid.any():
+                maps = sheet_maps(representation, pixels.grey, pixels.valid)
+                pictures.put(block, pictures.parts(pixels, maps, block.within(outer)))
             progress("other date", (done + 1) / len(blocks))
     return pictures
 
@@ -523,10 +500,6 @@ class SheetReader:
         self._margin_px = layout.micro_px + representation.margin_px
         self._jobs = self._drawn_jobs()
 
-    @property
-    def blocks(self) -> int:
-        return len(self._jobs)
-
     def read(
         self, progress: Progress, workers: int | None = None, cache: BlockCache | None = None
     ) -> None:
@@ -550,13 +523,14 @@ class SheetReader:
             )
 
     def block_cache(
-        self, default: Path, folder: Path | None
+        self, out: Path, work: Path | None
     ) -> AbstractContextManager[BlockCache | None]:
-        """Cache in `folder`, or, if there are many blocks, in `default`; else None."""
+        """Cache in `work`, or, if there are many blocks, beside the map; else None."""
         pixels = sum(job.block.height * job.block.width for job in self._jobs)
-        worthwhile = folder is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
+        worthwhile = work is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
         needed_bytes = round(CACHED_BYTES_PER_PX * pixels) if worthwhile else 0
-        cache = BlockCache(folder or default, self._request(), needed_bytes)
+        beside, name = out.with_name(f"{out.name}.work"), f"blocks-{out.name}"
+        cache = BlockCache(work / name if work else beside, self._request(), needed_bytes)
         if not worthwhile:
             cache.discard()  # left by an earlier request for the same map
             return nullcontext()
@@ -569,14 +543,16 @@ class SheetReader:
     def _recipe(self) -> dict[str, Any]:
         return variant_recipe(represent.TABLE, self.representation)
 
+    def _outer(self, block: Block) -> Block:
+        return block.with_margin(self.grid, self._margin_px)
+
     def _drawn_jobs(self) -> list[Job]:
         blocks = blocks_of_area(self.area, self.grid, self._layout)
         total_px = sum(block.height * block.width for block in blocks)
         jobs = []
         for block in blocks:
-            top, left, bottom, right = margins(self.grid, block, self._margin_px)
-            size = top + block.height + bottom, left + block.width + right
-            places = self.sampler.places(*size, block.height * block.width / total_px)
+            outer, share = self._outer(block), block.height * block.width / total_px
+            places = self.sampler.places(outer.height, outer.width, share)
             jobs.append(Job(block, tuple((int(row), int(col)) for row, col in places)))
         return jobs
 
@@ -590,24 +566,24 @@ class SheetReader:
 
     def _read_block(self, raster: SheetRaster, job: Job) -> Parts:
         """The result of a block; does not change the state of the reader."""
-        read = read_block(raster, self.grid, job.block, self._margin_px)
-        grey, valid = read.pixels.grey, read.pixels.valid
+        outer = self._outer(job.block)
+        pixels, part = read_block(raster, outer), job.block.within(outer)
+        grey, valid = pixels.grey, pixels.valid
         if not valid.any():
             return {}
         maps = sheet_maps(self.representation, grey, valid)
-        part = read.part(self._beyond_px)
-        means, share = cell_means(maps[:, part[0], part[1]], valid[part], self._layout)
+        more = job.block.within(outer, self._beyond_px)
+        means, share = cell_means(maps[:, more[0], more[1]], valid[more], self._layout)
         parts: Parts = {
             "means": means,
             "share": share,
-            "preview": self.preview.small(job.block, grey[read.part()]),
+            "preview": self.preview.small(job.block, grey[part]),
         }
         if self.pictures is not None:
-            parts |= self.pictures.parts(read, maps)
+            parts |= self.pictures.parts(pixels, maps, part)
         places = np.array(job.places, np.intp).reshape(-1, 2)
         parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
         if self.layer is not None:
-            part = read.part()
             parts |= layer_parts(self.area, self.grid, job.block, grey[part], valid[part])
         return parts
 
@@ -619,8 +595,8 @@ class SheetReader:
         self.preview.put(block, parts["preview"])
         if self.pictures is not None:
             self.pictures.put(block, parts)
-        top, left = margins(self.grid, block, self._margin_px)[:2]
-        self.sampler.take(parts["crops"], parts["crop_places"], block.row - top, block.col - left)
+        outer = self._outer(block)
+        self.sampler.take(parts["crops"], parts["crop_places"], outer.row, outer.col)
         if self.layer is not None:
             put_layer_parts(self.layer, block, parts)
 
@@ -647,11 +623,9 @@ class SheetReader:
         found: list[tuple[Block, Any]] = []
         with self.mosaic.grid_sheet(self.area.frame, self.grid) as raster:
             for job in self._jobs:
-                block = job.block
+                block, outer = job.block, self._outer(job.block)
                 far = [not chunk.may_matter(self.area, self.grid) for chunk in block.cut(CHUNK_PX)]
-                top, left, bottom, right = margins(self.grid, block, self._margin_px)
-                height, width = top + block.height + bottom, left + block.width + right
-                stamps = raster.stamps(block.col - left, block.row - top, width, height)
+                stamps = raster.stamps(outer.col, outer.row, outer.width, outer.height)
                 found.append((block, [block.height, block.width, job.places, far, stamps]))
         return found
 
@@ -668,8 +642,7 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block]:
-    side_px = _block_side_px(grid.tile_px, layout.micro_px)
-    return [block for block in blocks_of(grid, side_px) if block.may_matter(area, grid)]
+    return blocks_of(area, grid, _block_side_px(grid.tile_px, layout.micro_px))
 
 
 def layer_parts(

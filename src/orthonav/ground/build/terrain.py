@@ -97,16 +97,10 @@ def terrain_parts(
     info = TerrainInfo(
         west_m, north_m, posting_m, rows, cols, CHUNK_PX, low_m, high_m, unit_m, known, name, datum
     )
-    return TerrainParts(info, _arrays(table, found, info))
-
-
-def _arrays(
-    table: ChunkTable, found: dict[int, NDArray[np.float32]], info: TerrainInfo
-) -> dict[str, NDArray[Any]]:
     blobs = [
         encode_terrain(found[number], info) if number in found else b""
         for number in range(table.count)
     ]
     data, offsets = terrain_part_names(0)
     ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
-    return {data: np.frombuffer(b"".join(blobs), np.uint8), offsets: ends}
+    return TerrainParts(info, {data: np.frombuffer(b"".join(blobs), np.uint8), offsets: ends})

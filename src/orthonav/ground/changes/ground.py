@@ -38,7 +38,6 @@ TILT_DEG = 5.0
 AGL_STD, YAW_STD_DEG = 0.03, 2.0
 """Standard deviations of the height (a share of it) and heading of a fix."""
 _GREY, _VALID = 2, 3
-"""Channels of the evidence."""
 
 Array = NDArray[np.float64]
 
@@ -206,7 +205,6 @@ def _cell_numbers(
 TONE_WEIGHT, STRUCTURE_WEIGHT, BIAS = 2.0, 2.0, 3.0
 """Logit of a score: weights of the logarithm of 1 + the tone's deviation and of the correlation."""
 CHANGED_SCORE = 0.5
-"""Cells count as changed from this score on."""
 SEVERAL_VIEWS = 2
 """With fewer views both kinds of evidence must say that a cell changed."""
 LONE_STRUCTURE, LONE_TONE = 0.15, 3.0

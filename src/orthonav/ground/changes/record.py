@@ -20,11 +20,9 @@ from orthonav.core.mapfile.manifest import SheetInfo
 
 FORMAT, VERSION = "orthonav-changes", 1
 MAX_CELLS = 1_000_000
-"""Limit of the cells of a grid, and of the features of a file."""
 MAX_BYTES = 400_000_000
 """Limit of a file: about 350 bytes for each of so many cells."""
 _CORNERS = np.array([(0, 0), (0, 1), (1, 1), (1, 0), (0, 0)])
-"""Ring of a cell as (column, row), counter-clockwise."""
 
 Array = NDArray[np.float64]
 

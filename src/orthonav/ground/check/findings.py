@@ -81,7 +81,6 @@ def right_share(trials: Sequence[Trial]) -> float:
 
 
 SIMILAR = 0.8
-"""A rival place is ambiguous if it reaches this fraction of the best score."""
 MAX_PAIRS = 40
 _WRONG_CONFIDENCE = 0.5
 """One wrong trial of this confidence is enough; otherwise a second trial must agree."""
@@ -161,7 +160,6 @@ MAX_POINTS = 4000
 _REACHED = 1e-6
 """A shorter rest of the route, as a fraction of the distance between points, is none."""
 ACROSS = 5
-"""Points across the band at every point along it."""
 NEGLIGIBLE = 1e-9
 """Chances below this no longer change the expected drift."""
 

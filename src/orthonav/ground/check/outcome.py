@@ -30,6 +30,12 @@ class Word(Enum):
         return {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}[self]
 
 
+OF_REQUEST = (
+    *("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "tilt_std_deg"),
+    "other_sensor",
+)
+
+
 @dataclass(frozen=True)
 class Conditions:
     """What a check assumes; fields that are not listed are those of `CheckRequest`.

@@ -22,7 +22,6 @@ MIN_TRIALS, MAX_TRIALS = 240, 1500
 TRIALS_PER_VIEW = 4.0
 """Trials per area of a view, within those limits."""
 FEWEST_TRIALS = 40
-"""Lower limit at any effort."""
 MASK_PX = 2048
 """The coverage of the map is read at the finest level no larger than this."""
 _REDRAWS = 6

@@ -30,6 +30,7 @@ from orthonav.ground.check.findings import (
     verdict_of,
 )
 from orthonav.ground.check.outcome import (
+    OF_REQUEST,
     Along,
     Alternative,
     Cells,
@@ -37,12 +38,7 @@ from orthonav.ground.check.outcome import (
     Conditions,
     Envelope,
 )
-from orthonav.ground.check.places import (
-    MapCoverage,
-    cell_side_m,
-    checked_m2,
-    trial_places,
-)
+from orthonav.ground.check.places import MapCoverage, cell_side_m, checked_m2, trial_places
 from orthonav.ground.check.request import CheckRequest
 from orthonav.ground.check.trials import (
     MIN_VALID,
@@ -60,13 +56,9 @@ Array = NDArray[np.float64]
 ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
 """Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
-"""Narrower bands that are compared, as parts of the planned one."""
 MIN_VIEWS = 20
-"""A check of fewer trial views is refused."""
 MAX_ASPECT = 8.0
-"""Largest ratio of the sides of a view."""
 MIN_COVERED = 0.25
-"""A cell of which the map covers less than this fraction counts as outside the map."""
 MAX_CELLS_AROUND = 250_000
 """Limit of cells in the box around a band, most of them empty."""
 
@@ -110,15 +102,8 @@ class _Check:
             self.plan.width_m,
             self.plan.height_m,
             self.plan.agl_m,
-            request.yaw_std_deg,
-            request.agl_std,
-            request.prior_std_m,
-            request.accept,
-            self.radius_m,
-            request.speed_mps,
-            request.drift,
-            request.tilt_std_deg,
-            request.other_sensor,
+            radius_m=self.radius_m,
+            **{name: getattr(request, name) for name in OF_REQUEST},
         )
         self.bands_m = self._leg_bands_m()
         self.area = self._area()
@@ -146,15 +131,11 @@ class _Check:
         return plan
 
     def _leg_bands_m(self) -> tuple[float, ...]:
-        route, band_m, prior_std_m = (
-            self.request.route,
-            self.request.band_m,
-            self.request.prior_std_m,
-        )
+        route, band_m = self.request.route, self.request.band_m
         if route is None:
             return ()
         if band_m is None:
-            band_m = default_band_m(self.plan.side_m, prior_std_m)
+            band_m = default_band_m(self.plan.side_m, self.request.prior_std_m)
         Area.from_route(route, band_m)
         return route.bands_m(band_m) or ()
 

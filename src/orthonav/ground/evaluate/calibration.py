@@ -18,7 +18,6 @@ from scipy.special import gammaincinv
 from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, share_of, wilson
 
 N_BINS = 10
-"""Of the reliability diagram, as usual for a few hundred fixes."""
 NEES_LEVELS = (0.5, 0.9, 0.99)
 _LEAST_INDEPENDENCE = 1e-12  # of east and north, 1 - rho^2: below it a covariance is singular
 _ASYMMETRY = 1e-6  # share of the largest element that two mirrored ones may differ by

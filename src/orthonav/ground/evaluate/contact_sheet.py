@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
 N_ROWS = 6
 SIDE_PX = 260
-"""Width of each image in pixels."""
 UNKNOWN = GroundWindow(200.0, SIDE_PX, (0.0, 0.0))
-"""The window of the map images where the footprint of the view is unknown."""
 _NOTHING = "#F0E6D2"
 _GREY_LEVELS = 40
 

@@ -2,7 +2,7 @@
 
 Names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
 criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined. Confidence and
-covariance are checked in `calibration`, standard figures of the field are in `standard`.
+covariance are checked in `calibration`, standard figures of the field are in `figures`.
 """
 
 import logging
@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight import read_truth
-from orthonav.core.flight.fixes import read_results
+from orthonav.core.flight import FlightFolder, read_truth
+from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
+from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.calibration import (
     ConfidenceCalibration,
@@ -30,9 +31,11 @@ from orthonav.ground.evaluate.calibration import (
     check_covariance,
 )
 from orthonav.ground.evaluate.figures import (
+    RPE_DISTANCE_M,
     BoolArray,
     FloatArray,
     Longest,
+    StandardFigures,
     frozen,
     longest,
     path_so_far_m,
@@ -40,10 +43,10 @@ from orthonav.ground.evaluate.figures import (
     seconds_since_first,
     share,
     share_of,
+    standard_figures,
     upper_bound,
     wilson,
 )
-from orthonav.ground.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 
 Positions = Mapping[str, tuple[float, float]]
 """Frame name -> (latitude, longitude) in degrees."""
@@ -51,7 +54,6 @@ Positions = Mapping[str, tuple[float, float]]
 FAR_M = 35.0
 """A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
 NO_RESULT = "no_result"
-"""Reason of true positions that no result belongs to."""
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
@@ -242,6 +244,18 @@ def check_truth(
         raise FlightError(f"{far}; {HINT}: {path}")
     if far_m > _OTHER_FLIGHT_M:
         log.warning("%s; are these of the same flight?: %s", far, path)
+
+
+def warn_of_another_run(fixes: Path, opened: MapFile | None, flight: FlightFolder | None) -> None:
+    """Log a warning where fixes were computed from another map or flight than the given ones."""
+    given = Identity(
+        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
+    )
+    other = read_identity(fixes).differences(
+        given, opened.path if opened else None, flight.path if flight else None
+    )
+    if other:
+        log.warning("fixes are of %s: %s", other, fixes)
 
 
 def compare(

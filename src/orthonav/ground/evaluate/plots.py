@@ -22,6 +22,7 @@ from orthonav.ground.evaluate.calibration import (
 from orthonav.ground.evaluate.figures import BoolArray, FloatArray, runs, seconds_since_first
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics
 from orthonav.ground.evaluate.tables import (
+    LABELS,
     percentiles_text,
     spread_text,
     track_consistency_text,
@@ -58,16 +59,13 @@ CURVE_STYLES: dict[str, tuple[str, Any, str, float]] = {
     "peak_ratio": ("#009E73", (0, (5, 3)), "s", 2.1),
     "lowe_ratio": ("#B8558F", (0, (1.5, 1.5)), "^", 2.2),
 }
-LABELS = {"confidence": "confidence", "peak_ratio": "peak ratio", "lowe_ratio": "Lowe's ratio"}
 MAIN = ("confidence", 0.9)
-"""The criterion and threshold that is highlighted."""
 STATE_STYLES = {
     "searching": ("#E69F00", "^"),
     "tracking": (RIGHT, "o"),
     "coasting": ("#56B4E9", "s"),
     "lost": ("#B8558F", "X"),
 }
-"""State -> colour and mark."""
 MOST_ELLIPSES = 40
 _DASHED: dict[str, Any] = {"color": GREY, "linestyle": (0, (4, 3))}
 _SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}

@@ -1,15 +1,16 @@
 """The evaluation of flights as one self-contained page, and its figures as files."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from orthonav.ground.evaluate import plots
 from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
 from orthonav.ground.evaluate.figures import share
 from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
 from orthonav.ground.evaluate.tables import (
+    STANDARD_HEADER,
     FlightReport,
     bins_rows,
     confidence_text,
@@ -43,8 +44,7 @@ class MadeFrom:
     version: str = ""
 
 
-@dataclass(frozen=True)
-class _Drawn:
+class _Drawn(NamedTuple):
     general: tuple[Figure, ...]
     track: tuple[Figure, ...] = ()
     worst: tuple[Figure, ...] = ()
@@ -53,14 +53,12 @@ class _Drawn:
         """With the flight's name in texts and, if given, in file names, set off by two dashes,
         which neither `file_names` nor the names of figures contain."""
         start = f"{file_name}--" if file_name else ""
-
-        def named(figures: Iterable[Figure]) -> tuple[Figure, ...]:
-            return tuple(
-                replace(each, name=f"{start}{each.name}", alt=f"{name}: {each.alt}")
-                for each in figures
+        return _Drawn(
+            *(
+                tuple(replace(f, name=f"{start}{f.name}", alt=f"{name}: {f.alt}") for f in figures)
+                for figures in self
             )
-
-        return _Drawn(named(self.general), named(self.track), named(self.worst))
+        )
 
 
 def write_report(
@@ -106,7 +104,7 @@ def write_report(
         figures = {"name": "all flights", "figures": drawn[-1].general}
         values["total_section"] = {**figures, **_trust(whole)}
     page = render("orthonav.ground.evaluate", "report.html", values)
-    shown = [figure for d in drawn for figure in (*d.general, *d.track, *d.worst)]
+    shown = [figure for each in drawn for figures in each for figure in figures]
     return write_page(out_dir, page, shown)
 
 
@@ -191,6 +189,7 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
 
 def _trust(metrics: Metrics) -> dict[str, Any]:
     return {
+        "standard_header": STANDARD_HEADER,
         "standard": standard_rows(metrics),
         "standard_more": [
             ("ECE", plain_text(metrics.calibration.ece)),
@@ -198,7 +197,7 @@ def _trust(metrics: Metrics) -> dict[str, Any]:
             ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
         ],
         "criteria_header": criteria_header(metrics),
-        "criteria": criteria_rows(metrics, plots.LABELS),
+        "criteria": criteria_rows(metrics),
         "confidence": confidence_text(metrics),
         "bins": bins_rows(metrics),
         "covariance": covariance_text(metrics.consistency),
@@ -247,18 +246,15 @@ def _drawn(flight: FlightReport) -> _Drawn:
     )
     of_track = plots.track_figures(comparison, track, radius_m, background) if track else []
     of_gnss = [plots.gnss_figure(flight.gnss)] if flight.gnss else []
-    return _Drawn(general, (*of_track, *of_gnss), _contact_sheet(flight))
-
-
-def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:
     if not flight.worst:
-        return ()
+        return _Drawn(general, (*of_track, *of_gnss))
     caption = (
         "The worst fixes, those in state tracking first: the view rectified with heading and "
         "height of its fix, north up, beside the map at the same scale; + fix, ○ true position."
     )
     alt = "The worst views. " + "; ".join(map(row_text, flight.worst))
-    return (Figure("worst-views", alt, caption, sheet_picture(flight.worst)),)
+    sheet = Figure("worst-views", alt, caption, sheet_picture(flight.worst))
+    return _Drawn(general, (*of_track, *of_gnss), (sheet,))
 
 
 def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:

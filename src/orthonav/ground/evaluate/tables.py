@@ -14,7 +14,7 @@ from orthonav.ground.evaluate.calibration import (
     nees_mean_bounds,
 )
 from orthonav.ground.evaluate.contact_sheet import Row
-from orthonav.ground.evaluate.figures import FloatArray, Longest, percentile
+from orthonav.ground.evaluate.figures import RPE_FRAMES, FloatArray, StandardFigures, percentile
 from orthonav.ground.evaluate.metrics import (
     Comparison,
     CriterionRow,
@@ -24,23 +24,23 @@ from orthonav.ground.evaluate.metrics import (
     radius_key,
     wrong_key,
 )
-from orthonav.ground.evaluate.standard import RPE_FRAMES, ErrorStatistics, StandardFigures
 from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
 from orthonav.ground.report.drawing import Background
-from orthonav.ground.report.numbers import measure_text, percent_text, plain_text, to_plain
+from orthonav.ground.report.numbers import aligned, measure_text, percent_text, plain_text, to_plain
 
 Plain = dict[str, Any]
 _COLUMNS = (
     *("flight", "views", "confident", "wrong", "low confidence", "coverage", "right", "of fixes"),
     *("median m", "95 % m", "max m", "latency ms"),
 )
+STANDARD_HEADER = ("", "fixes", "RMSE m", "mean m", "median m", "std m", "max m", "number")
+LABELS = {"confidence": "confidence", "peak_ratio": "peak ratio", "lowe_ratio": "Lowe's ratio"}
 _EAST, _NORTH, _PITCH, _ROLL, _LATENCY = GNSS_BIASES
 _LEARNT = {
     "learnt displacement of the map": ((_EAST, 1, "m east"), (_NORTH, 1, "m north")),
     "learnt error of the mount": ((_PITCH, 2, "deg pitch"), (_ROLL, 2, "deg roll")),
     "learnt latency": ((_LATENCY, 0, "ms"),),
 }
-"""Learnt biases as they are shown: keys, digits and units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,37 +250,24 @@ def wrong_bound_text(metrics: Metrics) -> str:
 
 
 def table(flights: Sequence[FlightReport], whole: Metrics) -> str:
-    rows = [table_header(whole), *table_rows(flights, whole)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        first, *others = zip(row, widths, strict=True)
-        cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]
-        lines.append("  ".join(cells).rstrip())
+    lines = aligned([table_header(whole), *table_rows(flights, whole)])
     if len(flights) > 1:
         lines.insert(-1, "-" * max(map(len, lines)))
     return "\n".join(lines)
 
 
 def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
-    standard, of_confident = whole.standard, whole.of_confident
     low, high = map(percent_text, whole.availability_95)
+    gap = f"{measure_text(whole.gap.seconds_s, ' s')}, {measure_text(whole.gap.path_m, ' m')}"
     lines = [
         f"availability: {percent_text(whole.availability)} of views have a confident fix (95 % "
-        f"interval {low} to {high}); longest gap {_longest_text(whole.gap)}",
-        *(
-            f"{name}: {measure_text(confident, ' m')} of confident fixes, "
-            f"{measure_text(of_all, ' m')} of all"
-            for name, confident, of_all in (
-                ("CEP50", of_confident.cep50_m, standard.cep50_m),
-                ("CEP95", of_confident.cep95_m, standard.cep95_m),
-            )
-        ),
-        f"APE: {_statistics_text(standard.ape)}",
-        f"RPE over {RPE_FRAMES} frame: {_statistics_text(standard.rpe_frames)}",
-        f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
+        f"interval {low} to {high}); longest gap {gap}",
+        "",
+        *aligned([STANDARD_HEADER, *standard_rows(whole)]),
+        "",
+        *aligned([criteria_header(whole), *criteria_rows(whole)]),
+        "",
         f"confidence: {confidence_text(whole)}",
-        *(_criterion_line(row, whole.radius_m) for row in _stated(whole)),
         f"covariance: {covariance_text(whole.consistency)}",
     ]
     for flight in flights:
@@ -293,30 +280,6 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
             rows += gnss_rows(flight.gnss)
         lines += [f"  {name}: {text}" for name, text in rows]
     return "\n".join(lines)
-
-
-def _stated(metrics: Metrics) -> list[CriterionRow]:
-    found = [row for row in metrics.criteria if row.name == "confidence"]
-    return found if metrics.calibration.n_fixes else []
-
-
-def _criterion_line(row: CriterionRow, radius_m: float) -> str:
-    return (
-        f"  >= {row.threshold:g}: {percent_text(row.share_accepted)} of views accepted, precision "
-        f"within {radius_m:g} m {percent_text(row.accuracy)}, recall {percent_text(row.recall)}; "
-        f"{row.n_far} of {row.n_accepted} wrong by more than {row.far_m:g} m "
-        f"({percent_text(row.share_far)})"
-    )
-
-
-def _statistics_text(found: ErrorStatistics) -> str:
-    if not found.n:
-        return "not defined"
-    return (
-        f"RMSE {measure_text(found.rmse_m)}, mean {measure_text(found.mean_m)}, "
-        f"median {measure_text(found.median_m)}, std {measure_text(found.std_m)}, "
-        f"max {measure_text(found.max_m)} m ({found.n} values)"
-    )
 
 
 def confidence_text(metrics: Metrics) -> str:
@@ -426,10 +389,10 @@ def criteria_header(metrics: Metrics) -> tuple[str, ...]:
     return (*names, within, "recall", f"wrong by > {far}")
 
 
-def criteria_rows(metrics: Metrics, labels: dict[str, str]) -> list[tuple[str, ...]]:
+def criteria_rows(metrics: Metrics) -> list[tuple[str, ...]]:
     return [
         (
-            labels[row.name],
+            LABELS[row.name],
             f"{row.threshold:g}",
             str(row.n_accepted),
             percent_text(row.share_accepted),
@@ -542,10 +505,6 @@ def gnss_rows(found: GnssMetrics) -> list[tuple[str, str]]:
 def percentiles_text(values: FloatArray) -> str:
     median, p95, most = (measure_text(percentile(values, q), " m") for q in (50, 95, 100))
     return f"median {median}, 95 % {p95}, largest {most}"
-
-
-def _longest_text(longest: Longest) -> str:
-    return f"{measure_text(longest.seconds_s, ' s')}, {measure_text(longest.path_m, ' m')}"
 
 
 def _unit(value: float, unit: str) -> str:

@@ -42,13 +42,11 @@ if TYPE_CHECKING:
     pass
 
 RADII_M = (25.0, 60.0)
-"""Radii of accuracy: a usual and a large error of a track."""
 COURSE_M = 5.0
 """Minimum distance over which a course is measured, in the median."""
 STILL_M = 1.0
 """Below this distance the aircraft is stationary and has no course."""
 BIASES = ("heading_bias_deg", "log_scale_bias", "pitch_bias_deg", "roll_bias_deg")
-"""Evidence of a track: estimated biases of the telemetry."""
 
 
 @dataclass(frozen=True)

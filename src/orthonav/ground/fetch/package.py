@@ -8,6 +8,7 @@ They are split 7z archives, which 7-Zip unpacks (`7z x NAME.7z.001`).
 import hashlib
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -27,11 +28,10 @@ _ASKED = re.compile(r"^(D?\d{2,3}|D?\d[AB]|D?0\d[AB]):(\d{4})(?::(RVB|IRC))?$", 
 
 
 class Package(NamedTuple):
-    """A package: its name, address, zone such as D003, and date of edition."""
+    """A package: its name, address, and date of edition."""
 
     name: str
     url: str
-    zone: str
     date: str
 
 
@@ -64,13 +64,17 @@ def find_package(
         term = place.get("term") if place is not None else None
         if term == zone and f"_{kind}-" in name and link is not None:
             date = entry.findtext("editionDate", "").strip()
-            here.append(Package(name.strip(), linked(url, link.get("href", "")), zone, date))
+            here.append(Package(name.strip(), linked(url, link.get("href", "")), date))
     dated = [package for package in here if package.date.startswith(year)]
     if not dated:
         years = sorted({package.date[:4] for package in here})
         raise FetchError(f"no {kind} package of {zone} of {year}; available: {listed(years)}")
-    newest_first = sorted(dated, reverse=True)
-    return min(newest_first, key=_centimetres)
+
+    def centimetres(package: Package) -> int:  # 0M20 is 20 cm
+        found = re.search(r"-(\d+)M(\d+)_", package.name)
+        return int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6
+
+    return min(sorted(dated, reverse=True), key=centimetres)
 
 
 def package_files(web: Web, package: Package) -> list[PackageFile]:
@@ -120,7 +124,14 @@ def download_package(
             try:
                 with part.open("wb") as stream:
                     web.download(file.url, stream, max_bytes=file.size_bytes, received=received)
-                _check(file, part)
+                with part.open("rb") as written:
+                    md5 = hashlib.file_digest(written, partial(hashlib.md5, usedforsecurity=False))
+                    size = written.tell()
+                if file.size_bytes not in (None, size) or file.md5 not in (None, md5.hexdigest()):
+                    raise FetchError(
+                        f"file has {size} bytes instead of {file.size_bytes}, or another MD5 than "
+                        f"the service states; it was removed, run the command again: {file.url}"
+                    )
                 part.replace(folder / file.name)
             except OSError as error:
                 part.unlink(missing_ok=True)
@@ -129,23 +140,6 @@ def download_package(
                 raise OutputError(f"cannot write ({error.strerror or error}): {part}") from error
         progress("package", (number + 1) / len(files))
     return [folder / file.name for file in files]
-
-
-def _check(file: PackageFile, part: Path) -> None:
-    size = part.stat().st_size
-    if file.size_bytes not in (None, size):
-        problem = f"has {size} bytes instead of {file.size_bytes}"
-    elif file.md5 not in (None, _md5(part)):
-        problem = "has another MD5 than the service states"
-    else:
-        return
-    raise FetchError(f"file {problem}; it was removed, run the command again: {file.url}")
-
-
-def _md5(path: Path) -> str:
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, lambda: hashlib.md5(usedforsecurity=False))
-    return digest.hexdigest()
 
 
 def _entries(web: Web, url: str, parameters: dict[str, str]) -> list[Element]:
@@ -157,9 +151,3 @@ def _entries(web: Web, url: str, parameters: dict[str, str]) -> list[Element]:
         if not pages.isdecimal() or number >= int(pages):
             return found
     raise FetchError(f"feed has more pages than are read: {url}")
-
-
-def _centimetres(package: Package) -> int:
-    """Pixel width in a name: 0M20 is 20 cm."""
-    found = re.search(r"-(\d+)M(\d+)_", package.name)
-    return int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6

@@ -113,14 +113,10 @@ def _nothing(folder: Path, skipped: dict[str, int]) -> ImageryError:
             f"folder holds archives ({len(archives)} files) but no orthophotos; unpack them first: "
             f"{how}"
         )
-    seen = _summary(skipped) or _suffixes(folder)
-    return ImageryError(f"folder holds no usable orthophotos; seen: {seen}: {folder}")
-
-
-def _suffixes(folder: Path) -> str:
     counted = Counter(path.suffix.lower() or path.name for path in _files(folder))
     named = [f"{count} {suffix}" for suffix, count in counted.most_common(NAMED)]
-    return ", ".join(named) or "nothing, it is empty"
+    seen = _summary(skipped) or ", ".join(named) or "nothing, it is empty"
+    return ImageryError(f"folder holds no usable orthophotos; seen: {seen}: {folder}")
 
 
 def _preference(source: Source) -> tuple[object, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -126,14 +127,10 @@ class Mosaic:
         if not paths:
             raise ImageryError("no orthophoto was given")
         sources: list[Source] = []
-        files: list[Path] = []
-        for path in map(Path, paths):
-            if path.is_dir():
-                sources += open_sources(files)[0] + sources_in(path)
-                files = []
-            else:
-                files.append(path)
-        sources += open_sources(files)[0]
+        for are_folders, group in groupby(map(Path, paths), Path.is_dir):
+            some = list(group)
+            found = map(sources_in, some) if are_folders else [open_sources(some)[0]]
+            sources += chain.from_iterable(found)
         if epoch is not None:
             sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):

@@ -112,10 +112,6 @@ class UnfitError(ImageryError):
     """A raster that is not an orthophoto: a small image, heights, or not georeferenced."""
 
 
-def open_source(path: Path) -> Source:
-    return open_sources([path])[0][0]
-
-
 def open_sources(
     paths: Sequence[Path], folder: Path | None = None
 ) -> tuple[list[Source], list[str]]:
@@ -438,26 +434,18 @@ def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
     From IGN's names only the year: the day in them is that of the edition, and kilometres follow
     the year of a tile.
     """
-    for tag in _TAGS:
-        found = _DATE.search(str(tags[tag]).replace(":", "-")) if tag in tags else None
-        if found:
-            return "-".join(part for part in found.groups() if part)
-    for name in names:
-        years = _IGN_TILE.search(name) or _IGN_PACKAGE.search(name)
-        if years:
+    tagged = [str(tags[tag]).replace(":", "-") for tag in _TAGS if tag in tags]
+    for text in (*tagged, *names):
+        if years := _IGN_TILE.search(text) or _IGN_PACKAGE.search(text):
             return years.group(1)
-        found = _DATE.search(name)
-        if found:
+        if found := _DATE.search(text):
             return "-".join(part for part in found.groups() if part)
     return None
 
 
 def system_of(names: Iterable[str]) -> str | None:
-    for name in names:
-        found = _IGN_SYSTEM.search(name)
-        if found:
-            return _IGN_SYSTEMS[found.group(1)]
-    return None
+    found = next(filter(None, map(_IGN_SYSTEM.search, names)), None)
+    return None if found is None else _IGN_SYSTEMS[found.group(1)]
 
 
 def tab_transform(path: Path) -> tuple[float, ...] | None:

@@ -52,8 +52,6 @@ ELLIPSOID = "ellipsoid"
 OPTION = f"--dem-datum {'|'.join((*NAMED, ELLIPSOID))}|EPSG:NUMBER"
 GEOIDS = ("us_nga_egm08_25.tif", "egm08_25.gtx", "us_nga_egm96_15.tif", "egm96_15.gtx")
 """In the order of preference; the second names are those of older PROJ."""
-_DEGREES = "+proj=unitconvert +xy_in=deg +xy_out=rad"
-_RADIANS = "+proj=unitconvert +xy_in=rad +xy_out=deg"
 log = logging.getLogger(__name__)
 
 
@@ -135,8 +133,9 @@ def geoid() -> Undulation:
     for name in GEOIDS:
         try:
             found = pyproj.Transformer.from_pipeline(
-                f"+proj=pipeline +step {_DEGREES} +step +proj=vgridshift +grids={name} "
-                f"+multiplier=1 +step {_RADIANS}"
+                "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+                f"+step +proj=vgridshift +grids={name} +multiplier=1 "
+                "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
             )
         except ProjError:
             continue
@@ -170,11 +169,10 @@ class Dem:
     _data: Any = field(repr=False)
     _horizontal: pyproj.CRS = field(repr=False)
     _void: float | None = field(repr=False)
-    _system_from_world: pyproj.Transformer = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        turned = pyproj.Transformer.from_crs("EPSG:4326", self._horizontal, always_xy=True)
-        object.__setattr__(self, "_system_from_world", turned)
+    @functools.cached_property
+    def _system_from_world(self) -> pyproj.Transformer:
+        return pyproj.Transformer.from_crs("EPSG:4326", self._horizontal, always_xy=True)
 
     def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
         """Bilinear; NaN for no data and outside the file."""
@@ -285,7 +283,9 @@ class Dem:
             raw = self._data.read(1, window=window, masked=True)
         except (RasterioError, CPLE_BaseError) as error:
             raise _unreadable(self.path, error) from error
-        return self._metres(_without(raw, self._void))
+        if self._void is not None and not math.isnan(self._void):
+            raw = np.ma.masked_equal(raw, self._void)
+        return self._metres(raw)
 
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
@@ -351,10 +351,6 @@ def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
         log.warning("terrain: %g is treated as no data: %s", odd[0], path)
         return float(odd[0])
     return stated
-
-
-def _without(raw: Any, void: float | None) -> Any:
-    return raw if void is None or math.isnan(void) else np.ma.masked_equal(raw, void)
 
 
 def _gsd_m(data: Any, horizontal: pyproj.CRS) -> float:

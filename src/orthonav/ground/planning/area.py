@@ -9,19 +9,16 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.core.geo.swapped import swapped_bounds_hint
-from orthonav.ground.planning.route import Route, within_bands
+from orthonav.ground.planning.route import Array, Route, within_bands
 
 Extent = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Area:
-    """A reference area in its own local plane.
-
-    `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` the area is the
-    search band around it: the width of each leg, or `band_m` metres for legs without one.
-    Without a route it is the whole extent.
-    """
+    """A reference area in its own local plane. `extent_en_m` is (west, south, east, north) in
+    metres of `frame`. With `route` the area is the search band around it: the width of each leg, or
+    `band_m` metres for legs without one. Without a route it is the whole extent."""
 
     frame: LocalFrame
     extent_en_m: Extent
@@ -30,10 +27,6 @@ class Area:
 
     @classmethod
     def from_bounds(cls, bounds_deg: Extent) -> "Area":
-        """Area of a latitude/longitude box (west, south, east, north in degrees).
-
-        Raises `AreaError` for an invalid box; names swapped latitude and longitude.
-        """
         west, south, east, north = unwrapped(bounds_deg)
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
             hint = swapped_bounds_hint((west, south, east, north))
@@ -49,11 +42,9 @@ class Area:
         return cls.from_outline(edge_lat, edge_lon)
 
     @classmethod
-    def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
-        """Smallest north-up box around outline points, in a plane centred on that box.
-
-        Longitudes are unwrapped near the first point, so the outline may cross the antimeridian.
-        """
+    def from_outline(cls, lat_deg: Array, lon_deg: Array) -> "Area":
+        """Smallest north-up box around outline points, in a plane centred on that box. Longitudes
+        are unwrapped near the first point, so the outline may cross the antimeridian."""
         lon_deg = lon_deg - 360 * np.round((lon_deg - lon_deg[0]) / 360)
         frame = LocalFrame(
             round(float(lat_deg.min() + lat_deg.max()) / 2, 7),
@@ -66,10 +57,8 @@ class Area:
 
     @classmethod
     def from_route(cls, route: Route, band_m: float | None = None) -> "Area":
-        """Search band around `route`, `band_m` metres wide for legs without a width of their own.
-
-        Raises `AreaError` if a leg has no band, or if the area does not fit into one sheet.
-        """
+        """Search band around `route`, `band_m` metres wide for legs without a width of their
+        own."""
         if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
             raise AreaError(f"search band must be wider than 0 m, got {band_m}")
         bands_m = route.bands_m(band_m)
@@ -85,9 +74,7 @@ class Area:
         extent = _checked((float(west), float(south), float(east), float(north)))
         return cls(box.frame, extent, route, band_m or 0.0)
 
-    def contains(
-        self, points_en_m: NDArray[np.float64], margin_m: float = 0.0
-    ) -> NDArray[np.bool_]:
+    def contains(self, points_en_m: Array, margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Mask `(N,)` of the local points `(N, 2)` inside, or at most `margin_m` outside."""
         if self.route is not None:
             return within_bands(points_en_m, *self._bands, margin_m)
@@ -97,7 +84,7 @@ class Area:
         return np.asarray(((points_en_m >= low) & (points_en_m <= high)).all(axis=1))
 
     @cached_property
-    def _bands(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _bands(self) -> tuple[Array, Array]:
         """Vertices of the route (M, 2) in the plane, and the band width of each leg."""
         assert self.route is not None
         bands_m = self.route.bands_m(self.band_m or None)
@@ -106,10 +93,6 @@ class Area:
 
 
 def unwrapped(bounds_deg: Extent) -> Extent:
-    """West, south, east, north with west below east, which is above 180 across the antimeridian.
-
-    Raises `AreaError` for a box that is empty, inverted or not finite.
-    """
     west, south, east, north = bounds_deg
     if west > east + 180:  # as in GeoJSON (RFC 7946, 5.2)
         east += 360
@@ -122,7 +105,6 @@ def unwrapped(bounds_deg: Extent) -> Extent:
 
 
 def require_one_area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> None:
-    """Raise `AreaError` where both a route and bounds are given, or a band without a route."""
     if route is not None and bounds_deg is not None:
         raise AreaError("give either a route with a search band or bounds, not both")
     if route is None and band_m is not None:

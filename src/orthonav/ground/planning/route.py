@@ -28,6 +28,7 @@ from orthonav.ground.planning.routes.markup import read_gpx, read_kml, read_kmz,
 from orthonav.ground.planning.routes.mission import is_plan, is_wpl, plan_route, read_plan, read_wpl
 from orthonav.ground.planning.routes.record import Height, Route, json_object, left_out_text
 
+Array = NDArray[np.float64]
 PREFIX = "paper:"
 EAST_DEG = 90.0
 _FORM = f"{PREFIX}A@LAT,LON[,BEARING]"
@@ -35,8 +36,6 @@ _FORM = f"{PREFIX}A@LAT,LON[,BEARING]"
 
 @dataclass(frozen=True)
 class PaperTrajectory:
-    """A column of Table 1, and the ground resolution taken for it."""
-
     name: str
     agl_m: float
     length_m: float
@@ -54,12 +53,9 @@ TABLE_1 = {
 
 
 def preset(text: str) -> Route:
-    """The route that `paper:A@46.6,1.9` or `paper:A@46.6,1.9,30` names.
-
-    A straight line of the trajectory's length about that centre, flown at its height, with its
-    search band; the bearing is in degrees clockwise from north, 90 where it is not given. Raises
-    `RouteError`.
-    """
+    """The route that `paper:A@46.6,1.9` or `paper:A@46.6,1.9,30` names. A straight line of the
+    trajectory's length about that centre, flown at its height, with its search band; the bearing is
+    in degrees clockwise from north, 90 where it is not given."""
     name, _, where = text.removeprefix(PREFIX).partition("@")
     shape = TABLE_1.get(name.upper())
     if shape is None:
@@ -99,8 +95,7 @@ __all__ = [
     "within_bands",
 ]
 
-MAX_ROUTE_BYTES = 20_000_000
-"""Twice as much as 100,000 waypoints take; JSON and XML take some 20 times their size in memory."""
+MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
 MAX_LISTED = 20
 _PAIRS_AT_ONCE = 2**18
 _FEW_POINTS = 64
@@ -134,12 +129,9 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 
 
 def read_route(path: Path) -> Route:
-    """Read a route from a file of one of the formats in `docs/routes.md`.
-
-    `FILE#NAME` selects a line by its name, or else its number from 1, if a file holds several;
-    `paper:B@46.6,1.9,30` is a preset. Raises `MissingFileError` or `RouteError` (naming found and
-    expected content).
-    """
+    """Read a route from a file of one of the formats in `docs/routes.md`. `FILE#NAME` selects a
+    line by its name, or else its number from 1, if a file holds several; `paper:B@46.6,1.9,30` is a
+    preset. Raises `MissingFileError` or `RouteError` (naming found and expected content)."""
     if str(path).startswith(PREFIX):
         return preset(str(path))
     path, name = _name_apart(Path(path))
@@ -174,7 +166,6 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _name_apart(path: Path) -> tuple[Path, str | None]:
-    """The file and the line name after `#`; an existing file may have `#` in its name."""
     text = str(path)
     if path.exists():
         return path, None
@@ -185,11 +176,8 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
 
 
 def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
-    """The line of that name, else of that number, from 1; without a name the only one.
-
-    With `first`, the first of several unnamed lines, with a warning. Raises `RouteError`, which
-    lists numbers and names.
-    """
+    """The line of that name, else of that number, from 1; without a name the only one. With
+    `first`, the first of several unnamed lines, with a warning."""
     if name is not None:
         named = [route for route in found if route.name == name]
         number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
@@ -211,7 +199,6 @@ def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
 
 
 def _listed(found: list[Route]) -> str:
-    """Number and name of each line."""
     shown = [
         f"{number} {route.name!r:.60}" if route.name else f"{number} (no name)"
         for number, route in enumerate(found[:MAX_LISTED], 1)
@@ -219,29 +206,21 @@ def _listed(found: list[Route]) -> str:
     return ", ".join(shown) + (", .." if len(found) > MAX_LISTED else "")
 
 
-def leg_lengths_m(route: Route) -> NDArray[np.float64]:
+def leg_lengths_m(route: Route) -> Array:
     """Length in metres of each leg of a route, along the ellipsoid; `[0]` for one waypoint."""
     places = np.array(route.waypoints)
     return distances_m(places[:-1], places[1:]) if len(places) > 1 else np.zeros(1)
 
 
-def distance_to_polyline_m(
-    points_en_m: NDArray[np.float64], line_en_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def distance_to_polyline_m(points_en_m: Array, line_en_m: Array) -> Array:
     """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
     return beyond_bands_m(points_en_m, line_en_m, np.zeros(max(1, len(line_en_m) - 1)))
 
 
-def beyond_bands_m(
-    points_en_m: NDArray[np.float64],
-    line_en_m: NDArray[np.float64],
-    bands_m: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def beyond_bands_m(points_en_m: Array, line_en_m: Array, bands_m: Array) -> Array:
     """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
-
     `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)
-    legs. The result is the minimum over the legs of the distance to the leg minus half its band.
-    """
+    legs. The result is the minimum over the legs of the distance to the leg minus half its band."""
     starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
     legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
     length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)
@@ -260,15 +239,10 @@ def beyond_bands_m(
 
 
 def within_bands(
-    points_en_m: NDArray[np.float64],
-    line_en_m: NDArray[np.float64],
-    bands_m: NDArray[np.float64],
-    margin_m: float,
+    points_en_m: Array, line_en_m: Array, bands_m: Array, margin_m: float
 ) -> NDArray[np.bool_]:
     """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
-
-    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs.
-    """
+    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs."""
     if len(points_en_m) <= _FEW_POINTS:
         return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
     order = np.argsort(points_en_m[:, 0], kind="stable")
@@ -293,13 +267,9 @@ def within_bands(
     return found
 
 
-def along_polyline_en_m(
-    line_en_m: NDArray[np.float64], spacing_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees.
-
-    The first position is the first vertex; a route of one vertex gives one position, course 0.
-    """
+def along_polyline_en_m(line_en_m: Array, spacing_m: float) -> tuple[Array, Array]:
+    """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees. The
+    first position is the first vertex; a route of one vertex gives one position, course 0."""
     legs = np.diff(line_en_m, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
     keep = lengths > 0

@@ -21,27 +21,19 @@ from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M, WGS84_A_M
 from orthonav.core.geo.swapped import swapped_bounds_hint, swapped_hint
 from orthonav.ground.planning.area import Area, Extent, unwrapped
-from orthonav.ground.planning.route import Height, Route, leg_lengths_m
+from orthonav.ground.planning.route import Array, Height, Route, leg_lengths_m
 
-MAX_SHEETS = 10_000
-"""Limit of the program; 2500 km2 each, so 25 million km2."""
-MAX_ROUTE_SHEETS = 500
-"""Limit for a route: more than once around the Earth with bands of less than 10 km."""
-_DEGREE_M = 110_574.0
-"""Shortest degree of latitude, at the equator (WGS84)."""
-_LON_DEGREE_M = 111_320.0
-"""Degree of longitude at the equator (WGS84)."""
-_TRIES = 4
-"""Numbers of columns tried for one row before rows are made lower."""
+MAX_SHEETS = 10_000  # limit of the program; 2500 km2 each, so 25 million km2
+MAX_ROUTE_SHEETS = 500  # more than once around the Earth with bands of less than 10 km
+_DEGREE_M = 110_574.0  # shortest degree of latitude, at the equator (WGS84)
+_LON_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
+_TRIES = 4  # numbers of columns tried for one row before rows are made lower
 
 
 def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
     """Boxes (west, south, east, north in degrees) that each fit a sheet and together fill the box.
-
     Rows of equal height, from south to north; each row is divided into the number of equal boxes
-    its width requires, from west to east. Raises `AreaError` for an invalid box, or for more than
-    `MAX_SHEETS` boxes; names swapped latitude and longitude.
-    """
+    its width requires, from west to east."""
     west, south, east, north = unwrapped(bounds_deg)
     if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
         hint = swapped_bounds_hint((west, south, east, north))
@@ -67,7 +59,6 @@ def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
 
 
 def _row(west: float, south: float, east: float, north: float) -> list[Extent]:
-    """Boxes of a row; empty if the row is too high for boxes of any width."""
     widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
     width_m = (east - west) * _LON_DEGREE_M * math.cos(math.radians(widest))
     least = max(1, int(width_m / MAX_SHEET_M))
@@ -91,18 +82,14 @@ def _box_fits(bounds_deg: Extent) -> bool:
 
 
 def _wrapped(lon_deg: float) -> float:
-    """A longitude in -180..180; values inside are returned unchanged."""
     return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
 
 
 def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
-    """Parts of a route, in order, whose search bands each fit a sheet.
-
-    The route is divided at waypoints, each part as long as possible. A leg too long for a sheet is
-    divided into equal pieces on the great circle. Each part begins at the end of the previous one.
-    Parts are named sheet-1, sheet-2 and so on. Raises `AreaError`, also for more than
-    `MAX_ROUTE_SHEETS` parts.
-    """
+    """Parts of a route, in order, whose search bands each fit a sheet. The route is divided at
+    waypoints, each part as long as possible. A leg too long for a sheet is divided into equal
+    pieces on the great circle. Each part begins at the end of the previous one. Parts are named
+    sheet-1, sheet-2 and so on."""
     bands_m = route.bands_m(band_m)
     if bands_m is None or _route_fits(route, band_m):
         Area.from_route(route, band_m)  # raises if a band is missing
@@ -149,7 +136,6 @@ def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
 
 
 def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
-    """The same route with more waypoints, so that each leg fits a sheet."""
     waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
     leg_bands: list[float | None] = []
     lengths_m = leg_lengths_m(route)
@@ -191,7 +177,7 @@ def _on_great_circle(
         yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
 
 
-def _direction(place: tuple[float, float]) -> NDArray[np.float64]:
+def _direction(place: tuple[float, float]) -> Array:
     lat, lon = (math.radians(value) for value in place)
     return np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
@@ -207,20 +193,15 @@ def _too_many(count: int) -> AreaError:
     return AreaError(f"area needs {count:,} sheets, more than the limit of {MAX_SHEETS:,}")
 
 
-LARGEST_SIDE_M = 0.9 * MAX_SHEET_M
-"""The box around a sheet is wider than the sheet, because meridians converge."""
+LARGEST_SIDE_M = 0.9 * MAX_SHEET_M  # boxes are wider than sheets: meridians converge
 SMALLEST_SIDE_M = 200.0
-_MERIDIAN_DEGREE_M = 111_695.0
-"""Longest degree of latitude, at a pole (WGS84)."""
-_PARALLEL_DEGREE_M = 111_320.0
-"""Degree of longitude at the equator (WGS84)."""
+_MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
+_PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 _NAME = re.compile(r"r([0-9]{6})c([0-9]{6})")
 
 
 @dataclass(frozen=True)
 class WorldSheets:
-    """Sheets at most `side_m` wide and high. Raises `AreaError` for an impossible size."""
-
     side_m: float
 
     def __post_init__(self) -> None:
@@ -232,18 +213,15 @@ class WorldSheets:
 
     @property
     def rows(self) -> int:
-        """Rows from pole to pole."""
         return math.ceil(180 * _MERIDIAN_DEGREE_M / self.side_m)
 
     def cols(self, row: int) -> int:
-        """Columns of a row."""
         south, north = self._parallels(row)
         widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
         around_m = 360 * _PARALLEL_DEGREE_M * math.cos(math.radians(widest))
         return max(1, math.ceil(around_m / self.side_m))
 
     def name_at(self, lat_deg: float, lon_deg: float) -> str:
-        """Name of the sheet that contains a position. Raises `AreaError` if it is invalid."""
         if not (abs(lat_deg) <= 90 and math.isfinite(lon_deg)):
             hint = swapped_hint(lat_deg, lon_deg)
             raise AreaError(f"not a latitude and longitude in degrees: {lat_deg}, {lon_deg}{hint}")
@@ -253,7 +231,6 @@ class WorldSheets:
         return _named(row, min(cols - 1, int(turned / 360 * cols)))
 
     def bounds_deg(self, name: str) -> Extent:
-        """West, south, east, north of a sheet. Raises `AreaError` if there is no such sheet."""
         match = _NAME.fullmatch(name)
         row, col = (int(part) for part in match.groups()) if match else (-1, -1)
         if not (0 <= row < self.rows and 0 <= col < self.cols(row)):
@@ -263,10 +240,8 @@ class WorldSheets:
         return -180 + col * step, south, -180 + (col + 1) * step, north
 
     def over(self, bounds_deg: Extent) -> Iterator[str]:
-        """Names of the sheets that intersect a box, from south to north and west to east.
-
-        A box with west > east crosses the antimeridian.
-        """
+        """Names of the sheets that intersect a box, from south to north and west to east. A box
+        with west > east crosses the antimeridian."""
         west, south, east, north = bounds_deg
         if west > east:
             east += 360
@@ -287,9 +262,7 @@ class WorldSheets:
         return -90 + row * 180 / self.rows, -90 + (row + 1) * 180 / self.rows
 
 
-def in_box(
-    bounds_deg: Extent, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def in_box(bounds_deg: Extent, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
     """Which places lie in a box, its southern and western border included; of any shape."""
     west, south, east, north = bounds_deg
     turned = (lon_deg - west) % 360

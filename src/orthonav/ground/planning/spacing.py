@@ -19,67 +19,46 @@ from orthonav.core.geo.ground import TerrainHeights
 from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.route import Route, leg_lengths_m
 
-TILE_SIZES_PX = (256, 128, 64)
-"""Tile widths to choose from, widest first; 256 px is the default of `build`."""
-GOOD_VIEW_PX = 144.0
-"""Size of a view, in map pixels, at which registration ends; smaller views register less well."""
+TILE_SIZES_PX = (256, 128, 64)  # to choose from; 256 is the default of `build`
+GOOD_VIEW_PX = 144.0  # size of a view in map pixels at which registration ends
 LEAST_VIEW_PX = 24.0
 LEAST_TILE_SHARE = 0.4
-MOST_COARSER = 4.0
-"""The localizer refuses views beyond these three limits: too_small, too_coarse."""
-FINEST_IMAGERY_M = 0.2
-"""Open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)."""
-LOW_VIEW_M = 100.0
-"""Below this a single field or wood can fill the view."""
-MOST_RELIEF = 0.05
-"""Relief within a view, as a share of the height, above which the flat-ground model fails: equal to
-the standard deviation of the reported height in all benchmarks."""
-VIEW_OVERLAP = 0.6
-"""Usual forward overlap of aerial photography."""
-TRACKED_PER_S = 10.0
-"""Views per second while tracking on one desktop core: docs/benchmarks.md."""
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 by 51 degrees, usual for small drones."""
-DEFAULT_PRIOR_STD_M = 150.0
-"""About 5 km of dead reckoning with an error of 3 %."""
-BAND_PRIORS = 4.0
-"""Width of a band that is not given, in standard deviations of the prior: two to each side."""
-MIN_BAND_VIEWS = 0.5
-"""A band is checked at least so many sides of a view wide."""
-_NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
-"""Mantissas of round ground resolutions."""
+MOST_COARSER = 4.0  # the localizer refuses views beyond these three limits: too_small, too_coarse
+FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)
+LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
+MOST_RELIEF = 0.05  # within a view, as a share of the height: the std of reported heights
+VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
+TRACKED_PER_S = 10.0  # views per second while tracking on one desktop core: docs/benchmarks.md
+DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)  # 65 by 51 deg
+DEFAULT_PRIOR_STD_M = 150.0  # about 5 km of dead reckoning with an error of 3 %
+BAND_PRIORS = 4.0  # width of a band that is not given: two deviations of the prior to each side
+MIN_BAND_VIEWS = 0.5  # a band is checked at least so many sides of a view wide
+_NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)  # mantissas of round ground resolutions
 
 
 def default_band_m(view_m: float, prior_std_m: float | None = DEFAULT_PRIOR_STD_M) -> float:
-    """Width of the search band of a route, for views of `view_m` and a prior position, if any."""
     priors = BAND_PRIORS * (view_m if prior_std_m is None else prior_std_m)
     return max(priors, MIN_BAND_VIEWS * view_m)
 
 
 @dataclass(frozen=True)
 class Caution:
-    """A warning about a plan: `code` for programs, `text` for people."""
-
     code: str
     text: str
 
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """Footprint of a vertical view of flat ground.
+    """Footprint of a vertical view of flat ground. `width_m`, `height_m`: sides of the
+    footprint."""
 
-    `agl_m`: height above ground. `width_m`, `height_m`: sides of the footprint. `gsd_m`: ground
-    resolution, metres per pixel.
-    """
-
-    agl_m: float
+    agl_m: float  # height above ground
     width_m: float
     height_m: float
-    gsd_m: float
+    gsd_m: float  # ground resolution, metres per pixel
 
     @classmethod
     def of(cls, camera: Camera, agl_m: float) -> "ViewPlan":
-        """The view from a height above ground. Raises `CameraError` on an impossible height."""
         if not 1 <= agl_m <= 50_000:
             raise CameraError(f"height above ground must be 1 to 50,000 m, got {agl_m}")
         return cls(
@@ -91,21 +70,17 @@ class ViewPlan:
 
     @property
     def short_m(self) -> float:
-        """The shorter side in metres."""
         return min(self.width_m, self.height_m)
 
     @property
     def side_m(self) -> float:
-        """Root of the area in metres."""
         return math.sqrt(self.width_m * self.height_m)
 
     @property
     def spacing_m(self) -> float:
-        """Largest distance between views that overlap by `VIEW_OVERLAP` along the shorter side."""
         return (1 - VIEW_OVERLAP) * self.short_m
 
     def tile_share(self, tile_m: float) -> float:
-        """Share of a tile of width `tile_m` covered by the view at the same heading."""
         return min(self.width_m, tile_m) * min(self.height_m, tile_m) / tile_m**2
 
     def across_px(self, gsd_m: float) -> float:
@@ -114,11 +89,9 @@ class ViewPlan:
 
 
 def suited_map(view: ViewPlan) -> tuple[float, int]:
-    """Suitable ground resolution (m) and tile width (px) of a map for a view.
-
-    The coarsest round resolution at which the view covers a whole tile, with the widest tile for
-    which this is neither finer than the view itself nor than `FINEST_IMAGERY_M`.
-    """
+    """Suitable ground resolution (m) and tile width (px) of a map for a view. The coarsest round
+    resolution at which the view covers a whole tile, with the widest tile for which this is neither
+    finer than the view itself nor than `FINEST_IMAGERY_M`."""
     finest_m = max(FINEST_IMAGERY_M, view.gsd_m)
     for tile_px in TILE_SIZES_PX:
         gsd_m = _nice_below(view.short_m / tile_px)
@@ -128,57 +101,60 @@ def suited_map(view: ViewPlan) -> tuple[float, int]:
 
 
 def suited_tile_px(view: ViewPlan, gsd_m: float) -> int:
-    """The widest tile that the view covers at a given ground resolution, else the smallest."""
     return next(
         (px for px in TILE_SIZES_PX if px * gsd_m <= view.short_m * 1.001), TILE_SIZES_PX[-1]
     )
 
 
 def _nice_below(value: float) -> float:
-    """The largest round number not above a value."""
     power = 10.0 ** math.floor(math.log10(value) + 1e-9)
     nice = max(each for each in _NICE if each * power <= value * (1 + 1e-9))
     return float(f"{nice * power:.3g}")
 
 
 def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
-    """Cautions about views on a map of this ground resolution and tile width."""
-    found = []
-    tile_m = gsd_m * tile_px
+    tile_m, coarser = gsd_m * tile_px, view.gsd_m / gsd_m
     share, across_px = view.tile_share(tile_m), view.across_px(gsd_m)
-    coarser = view.gsd_m / gsd_m
-    if view.short_m < LOW_VIEW_M:
-        found.append(
-            Caution(
-                "low",
-                f"a view is only {view.short_m:.0f} m across: over forest or one large field it "
-                "shows no lasting structure, and relief displacement of trees and houses is large; "
-                "fly higher",
-            )
-        )
-    if coarser > MOST_COARSER:
-        text = f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse)"
-        found.append(Caution("too_coarse", f"{text}; build coarser, or fly lower"))
-    if across_px < LEAST_VIEW_PX:
-        text = f"a view is {across_px:.0f} map pixels across: refused below {LEAST_VIEW_PX:.0f}"
-        found.append(Caution("too_small", f"{text}; build finer, or fly higher"))
-    elif across_px < GOOD_VIEW_PX * 0.999:
-        text = f"a view is {across_px:.0f} map pixels across, fewer than {GOOD_VIEW_PX:.0f}"
-        found.append(Caution("few_pixels", f"{text}; build finer, or fly higher"))
-    if share < LEAST_TILE_SHARE:
-        text = f"a view covers {share:.0%} of a tile: tile search refuses below "
-        found.append(Caution("tile_too_large", f"{text}{LEAST_TILE_SHARE:.0%}; use smaller tiles"))
-    elif share < 0.999:
-        text = f"a view covers {share:.0%} of a tile of {tile_m:.0f} m; best is a whole tile"
-        found.append(Caution("part_of_tile", text))
-    if gsd_m < FINEST_IMAGERY_M * 0.999:
-        text = f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)"
-        found.append(Caution("fine_imagery", text))
-    return found
+    across = f"a view is {across_px:.0f} map pixels across"
+    covers = f"a view covers {share:.0%} of a tile"
+    little, part = across_px < LEAST_VIEW_PX, share < LEAST_TILE_SHARE
+    cautions = {
+        "low": (
+            view.short_m < LOW_VIEW_M,
+            f"a view is only {view.short_m:.0f} m across: over forest or one large field it shows "
+            "no lasting structure, and relief displacement of trees and houses is large; fly "
+            "higher",
+        ),
+        "too_coarse": (
+            coarser > MOST_COARSER,
+            f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse); "
+            "build coarser, or fly lower",
+        ),
+        "too_small": (
+            little,
+            f"{across}: refused below {LEAST_VIEW_PX:.0f}; build finer, or fly higher",
+        ),
+        "few_pixels": (
+            not little and across_px < GOOD_VIEW_PX * 0.999,
+            f"{across}, fewer than {GOOD_VIEW_PX:.0f}; build finer, or fly higher",
+        ),
+        "tile_too_large": (
+            part,
+            f"{covers}: tile search refuses below {LEAST_TILE_SHARE:.0%}; use smaller tiles",
+        ),
+        "part_of_tile": (
+            not part and share < 0.999,
+            f"{covers} of {tile_m:.0f} m; best is a whole tile",
+        ),
+        "fine_imagery": (
+            gsd_m < FINEST_IMAGERY_M * 0.999,
+            f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)",
+        ),
+    }
+    return [Caution(code, text) for code, (applies, text) in cautions.items() if applies]
 
 
 def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
-    """Cautions about a ground speed."""
     needed = speed_mps / view.spacing_m
     if needed <= TRACKED_PER_S:
         return []
@@ -189,36 +165,27 @@ def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
     return [Caution("fast", text)]
 
 
-TILE_BYTES = 273.0
-"""Embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles."""
-LAYER_BYTES_PER_PX = 0.15, 0.35
-"""Registration layer, all levels: minimum and maximum of real imagery, docs/map-format.md."""
+TILE_BYTES = 273.0  # embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles
+LAYER_BYTES_PER_PX = 0.15, 0.35  # of real imagery, docs/map-format.md
 BUILD_FIXED_S = 40.0
 BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
 for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s for 4 million on a
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
-_PAIRS = 1_000_000_000
-"""Limit on pairs of points and legs, which bounds the time of an estimate."""
+_PAIRS = 1_000_000_000  # limit on pairs of points and legs, which bounds the time of an estimate
 _MOST_POINTS = 200_000
-_LEAST_POINTS = 2_500
-"""Points sampled at most and at least: a standard error of the share of 0.1 % to 1 %."""
+_LEAST_POINTS = 2_500  # points sampled: a standard error of the share of 0.1 % to 1 %
 
 
 @dataclass(frozen=True)
 class MapEstimate:
-    """Estimate for a map of one sheet.
+    """Estimate for a map of one sheet. `build_s`: time of the default build on one desktop core,
+    with registration; training a network takes hours more."""
 
-    `area_km2`: area covered by tile centres. `imagery_km2`: area of the pixels under the tiles.
-    `tiles`: number of reference tiles. `map_mb`: smallest and largest expected file size.
-    `build_s`: time of the default build on one desktop core, with registration; training a network
-    takes hours more.
-    """
-
-    area_km2: float
-    imagery_km2: float
-    tiles: int
-    map_mb: tuple[float, float]
+    area_km2: float  # area covered by tile centres
+    imagery_km2: float  # area of the pixels under the tiles
+    tiles: int  # number of reference tiles
+    map_mb: tuple[float, float]  # smallest and largest expected file size
     build_s: float
 
 
@@ -231,12 +198,9 @@ def estimate_map(
     registration: bool = True,
     maps: int = 1,
 ) -> MapEstimate:
-    """Estimate for the map that `orthonav build` makes of an area.
-
-    Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is smaller
-    where this is one of many `maps`. Imagery is assumed everywhere. Raises `AreaError` as
-    `TileGrid.covering` does.
-    """
+    """Estimate for the map that `orthonav build` makes of an area. Tiles are counted if that is
+    cheap, else estimated from a sample (within 2 %), which is smaller where this is one of many
+    `maps`. Imagery is assumed everywhere."""
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
     raster = (
@@ -264,17 +228,11 @@ def estimate_map(
 
 
 def _share(
-    area: Area,
-    box_en_m: Extent,
-    margin_m: float,
-    room: int,
-    cells: tuple[int, int] | None = None,
+    area: Area, box_en_m: Extent, margin_m: float, room: int, cells: tuple[int, int] | None = None
 ) -> float:
     """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
-
     Computed from the centres of its `cells` (rows, columns), or of at most about `room` if those
-    are more.
-    """
+    are more."""
     if area.route is None:
         return 1.0
     room = min(room, max(_LEAST_POINTS, _PAIRS // area.route.legs))
@@ -290,30 +248,23 @@ def _share(
 
 
 Array = NDArray[np.float64]
-MAX_POSITIONS = 2000
-"""Sampled positions along a route at most."""
-LANDING_M = 30.0
-"""Height above ground below which the aircraft takes off or lands; views there are not judged."""
-_BELOW_GROUND_M = 2.0
-"""Tolerance for errors of the terrain model."""
+MAX_POSITIONS = 2000  # sampled positions along a route at most
+LANDING_M = 30.0  # above ground, below which the aircraft takes off or lands
+_BELOW_GROUND_M = 2.0  # tolerance for errors of the terrain model
 _ACROSS = (0.0, -0.5, 0.5)
 _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 
 
 @dataclass(frozen=True)
 class LegProfile:
-    """A leg over terrain.
+    """A leg over terrain. `ground_m`: minimum and maximum terrain height above mean sea level along
+    it. `relief`: largest difference of terrain height within a view centred on the leg or on an
+    edge of its search band, as a share of the height above ground; 0 below `LANDING_M`."""
 
-    `leg`: number, from 1. `length_m`: its length. `ground_m`: minimum and maximum terrain height
-    above mean sea level along it. `agl_m`: minimum and maximum height above ground. `relief`:
-    largest difference of terrain height within a view centred on the leg or on an edge of its
-    search band, as a share of the height above ground; 0 below `LANDING_M`.
-    """
-
-    leg: int
-    length_m: float
+    leg: int  # number, from 1
+    length_m: float  # its length
     ground_m: tuple[float, float]
-    agl_m: tuple[float, float]
+    agl_m: tuple[float, float]  # minimum and maximum height above ground
     relief: float
 
 
@@ -324,12 +275,8 @@ def profile(
     view_m: float,
     terrain: TerrainHeights,
 ) -> list[LegProfile]:
-    """Height above ground and relief of each leg.
-
-    `bands_m`: search bands of the legs. `agl_m`: constant height above ground for legs without
-    known heights. `view_m`: width of a view. Raises `RouteError` if a height is unknown, or if the
-    terrain does not cover the route.
-    """
+    """Height above ground and relief of each leg. `bands_m`: search bands of the legs. `agl_m`:
+    constant height above ground for legs without known heights. `view_m`: width of a view."""
     spacing_m = max(view_m / 2, float(leg_lengths_m(route).sum()) / MAX_POSITIONS, 1.0)
     home_m = route.home_amsl_m
     if home_m is None:
@@ -342,7 +289,6 @@ def profile(
 
 
 def _leg_m(route: Route, leg: int) -> tuple[LocalFrame, float, Array]:
-    """A local plane at a leg, its length, and both ends in the plane (2, 2)."""
     ends = route.part(leg, min(leg + 1, len(route.waypoints) - 1))
     frame = LocalFrame(*ends.waypoints[0])
     points = ends.points_en_m(frame)
@@ -408,7 +354,6 @@ def _flown_amsl_m(
 
 
 def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
-    """Cautions about a route over this terrain."""
     found = []
     low = [leg.leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
     steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg.leg not in low]

@@ -42,7 +42,6 @@ ROUNDS = 10  # views are left out, and the mean is taken again, at most so many 
 LEAST_SHARE = 0.1
 """A view counts for pitch and roll if it shows at least this share of what is known of them; the
 rest is the reported value."""
-_AXES = ("heading_deg", "log_scale", "pitch_deg", "roll_deg")
 _UNKNOWN_HEADING = Bias(0.0, DEFAULT_YAW_STD_DEG, DEFAULT_YAW_STD_DEG)
 
 
@@ -74,10 +73,13 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
             f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
             f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
         )
-    values = {name: _column(confident, key) for name, key in _EVIDENCE.items()}
-    spreads = {
-        name: _column(confident, key.replace("bias", "bias_std")) for name, key in _EVIDENCE.items()
-    }
+    values, spreads = (
+        {
+            name: np.array([each.outcome.evidence[key.replace("bias", bias)] for each in confident])
+            for name, key in _EVIDENCE.items()
+        }
+        for bias in ("bias", "bias_std")
+    )
     begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
     begin = min(begin, len(confident) - MIN_VIEWS)
     used = slice(begin, None)
@@ -91,16 +93,13 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
 
 def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
     """Confident views of a track that state their biases."""
-    return [each for each in results if _is_confident(each)]
-
-
-def _is_confident(result: ViewResult) -> bool:
-    fix = result.outcome
-    return isinstance(fix, Fix) and fix.confidence >= CONFIDENT and "pitch_bias_deg" in fix.evidence
-
-
-def _column(confident: Sequence[ViewResult], key: str) -> Array:
-    return np.array([each.outcome.evidence[key] for each in confident])
+    return [
+        each
+        for each in results
+        if isinstance(each.outcome, Fix)
+        and each.outcome.confidence >= CONFIDENT
+        and "pitch_bias_deg" in each.outcome.evidence
+    ]
 
 
 def _still_from(values: Array, spreads: Array) -> int:
@@ -170,7 +169,7 @@ def calibrate_mount_by_views(
     biases = np.array([each for _, each in seen])
     heading, log_scale, pitch, roll = (
         robust_mean(biases[:, number, 0], biases[:, number, 1], STD_FLOOR[name])
-        for number, name in enumerate(_AXES)
+        for number, name in enumerate(_EVIDENCE)
     )
     assert log_scale is not None and pitch is not None and roll is not None
     mount = Mount(heading or _UNKNOWN_HEADING, log_scale, pitch, roll, len(seen))

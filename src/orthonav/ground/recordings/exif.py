@@ -342,7 +342,8 @@ def _exposed_ns(text: str) -> int | None:
     if found is None:
         return None
     try:
-        whole = datetime(*map(int, found.groups()[:6]), tzinfo=UTC)  # type: ignore[misc, arg-type]
+        whole = datetime.strptime(" ".join(found.groups()[:6]), "%Y %m %d %H %M %S")
     except ValueError:
         return None
+    whole = whole.replace(tzinfo=UTC)
     return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))

@@ -207,9 +207,10 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
 
 def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is given."""
+    folder = path if path.is_dir() else path.parent
+    files = sorted(file for file in folder.glob("*.mcap") if profile_of(file) == PROFILE)
+    found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
     if path.is_dir():
-        files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
-        found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
         runs = {run: file for file, run in reversed(found.items())}
         if len(runs) > 1:
             names = ", ".join(sorted(file.name for file in runs.values())[:5])
@@ -217,17 +218,11 @@ def files_of_run(path: Path) -> list[Path]:
                 f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
             )
         return list(found)
-    match = _NUMBERED.fullmatch(path.name)
-    run = run_of(path)
-    if match is None or run is None:
+    name, number = _order(path)
+    if _NUMBERED.fullmatch(path.name) is None or path not in found:
         return [path]
-    name, number = match[1], int(match[2])
-    later = []
-    for file in path.parent.glob("*.mcap"):
-        other = _NUMBERED.fullmatch(file.name)
-        if other and other[1] == name and int(other[2]) > number and profile_of(file) == PROFILE:
-            later.append(file)
-    return [path, *(file for file in sorted(later, key=_order) if run_of(file) == run)]
+    numbered = [each for each in found if found[each] == found[path] and _order(each)[0] == name]
+    return [each for each in numbered if _order(each)[1] >= number]
 
 
 def _order(path: Path) -> tuple[str, int]:

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.folder import number_of
+from orthonav.core.flight.folder import check_latlon, number_of
 from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.attitude import (
     AUTOPILOT_TILT_STD_DEG,
@@ -23,7 +23,6 @@ from orthonav.core.geo.attitude import (
     enu_from_gimbal_camera,
 )
 from orthonav.core.geo.camera import attitude_of
-from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 
 MAX_BYTES = 100_000_000
@@ -201,9 +200,8 @@ def _numbers(
             raise FlightError(f"line {line}: {name} is not a number, got {text!r:.40}: {path}")
         values[field] = measured(metres * value) if field in _HEIGHTS else value
     lat, lon = values.get("lat", math.nan), values.get("lon", math.nan)
-    if abs(lat) > 90 or abs(lon) > 360:
-        hint = swapped_hint(lat, lon)
-        raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
+    if not math.isnan(lat + lon):
+        check_latlon(lat, lon, line, path)
     return values
 
 

@@ -54,10 +54,9 @@ def open_source(path: Path | Sequence[Path], options: SourceOptions | None = Non
     if len(paths) > 1:
         return open_photos(paths, options)
     kind = options.kind or source_kind(path)
-    if kind == "flight" and not path.is_dir():
-        raise FlightError(f"expected a folder for kind {kind}, got a file: {path}")
-    if kind == "video" and not path.is_file():
-        raise FlightError(f"expected a file for kind video, got a folder: {path}")
+    wanted = {"flight": "folder", "video": "file"}.get(kind)
+    if wanted and path.is_dir() != (wanted == "folder"):
+        raise FlightError(f"expected a {wanted} for kind {kind}: {path}")
     if kind == "flight":
         return _flight(open_flight(path, images_needed=not options.skip_bad_images), options)
     if kind == "photos":

@@ -240,7 +240,18 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
                 f"pitch and roll of {level} of {len(photos)} photographs are not known: a camera "
                 "that looks straight down is assumed"
             )
-        warnings += _height_warnings(photos, options)
+        known = {
+            name: any(math.isfinite(getattr(photo, name)) for photo in photos)
+            for name in ("home_m", "amsl_m", "hae_m", "alt_m")
+        }
+        if any(math.isnan(photo.agl_m) for photo in photos):
+            warnings += height_warnings(
+                options,
+                above_ground=False,
+                above_home=known["home_m"],
+                above_sea=known["amsl_m"] or known["hae_m"],
+                altitudes=known["alt_m"],
+            )
         warnings += jump_warnings([(_time_ns(photo), photo.latlon_deg) for photo in photos])
     doubted = [photo for photo in photos if photo.doubts]
     if doubted:
@@ -381,18 +392,6 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _height_warnings(photos: Sequence[Photo], options: SourceOptions) -> list[str]:
-    if all(math.isfinite(photo.agl_m) for photo in photos):
-        return []
-    above_home, above_sea, altitudes = (
-        any(math.isfinite(getattr(photo, name)) for photo in photos for name in names)
-        for names in (("home_m",), ("amsl_m", "hae_m"), ("alt_m",))
-    )
-    if options.over_terrain and (above_home or above_sea):
-        return []
-    return height_warnings(above_home, not above_home and altitudes, options)
-
-
 def _of_one_focal_length(
     photos: list[Photo], options: SourceOptions
 ) -> tuple[list[Photo], list[str]]:
@@ -408,7 +407,7 @@ def _of_one_focal_length(
         except CameraError:
             focal_px.append(math.nan)
         else:
-            focal_px.append(found.px if found else None)
+            focal_px.append(None if found is None else found.px)
             known.update([found] if found else [])
     if not known:
         return photos, []

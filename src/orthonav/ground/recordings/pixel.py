@@ -10,6 +10,7 @@ middle of their view is known (`middle_std_m`), are positions of the camera: all
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,8 +74,9 @@ def locate_pixel(
         below_m = float(terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
         if not math.isfinite(below_m):
             raise FlightError("the terrain does not reach to the ground under the camera")
-        relief = _relief(terrain, frame, below_m)
-    values = _camera(telemetry, fix)
+        relief = partial(_relief, terrain, frame, below_m)
+    # Metres east, north and up of the fix, heading, pitch and roll in degrees.
+    values = np.array([0.0, 0.0, fix.agl_m, fix.heading_deg, *fix.tilt_deg(telemetry)])
     middle = (camera.width_px / 2, camera.height_px / 2)
     here = _ground(camera, px, values, relief)
     if not np.isfinite(here).all():
@@ -98,11 +100,6 @@ def locate_pixel(
     return GroundPoint(float(lat), float(lon), height_m, covariance, range_m)
 
 
-def _camera(telemetry: Telemetry, fix: Fix) -> Array:
-    """The camera (6,): metres east, north and up of its fix, heading, pitch and roll in degrees."""
-    return np.array([0.0, 0.0, fix.agl_m, fix.heading_deg, *fix.tilt_deg(telemetry)])
-
-
 def _stds(telemetry: Telemetry, fix: Fix) -> Array:
     """Standard deviations (4,) of height (m), heading, pitch and roll (deg), taken as
     independent."""
@@ -111,20 +108,19 @@ def _stds(telemetry: Telemetry, fix: Fix) -> Array:
     scale = evidence.get("log_scale_std", evidence.get("log_scale_bias_std"))
     stated = telemetry.tilt_std_deg
     tilt = DEFAULT_TILT_STD_DEG if stated is None else stated
-    stds = [
-        fix.agl_m * (DEFAULT_AGL_STD if scale is None else scale),
-        DEFAULT_YAW_STD_DEG if heading is None else heading,
-        *(evidence.get(f"{axis}_bias_std_deg", tilt) for axis in ("pitch", "roll")),
-    ]
-    return np.array(stds)
+    return np.array(
+        [
+            fix.agl_m * (DEFAULT_AGL_STD if scale is None else scale),
+            DEFAULT_YAW_STD_DEG if heading is None else heading,
+            *(evidence.get(f"{axis}_bias_std_deg", tilt) for axis in ("pitch", "roll")),
+        ]
+    )
 
 
-def _relief(terrain: TerrainHeights, frame: LocalFrame, below_m: float) -> Relief:
-    def heights(points_en_m: Array) -> Array:
-        lat, lon = frame.latlon_from_en(points_en_m)
-        return np.asarray(terrain(lat, lon) - below_m)
-
-    return heights
+def _relief(
+    terrain: TerrainHeights, frame: LocalFrame, below_m: float, points_en_m: Array
+) -> Array:
+    return np.asarray(terrain(*frame.latlon_from_en(points_en_m)) - below_m)
 
 
 def _ground(camera: Camera, px: tuple[float, float], values: Array, relief: Relief | None) -> Array:

@@ -221,31 +221,39 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
 
 def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
     """Warnings about a track for people: its own, what its heights are, and jumps."""
-    warnings, series = list(track.warnings), track.position
-    known = bool(track.heights) or track.home is not None
-    altitudes = track.altitude is not None
-    if options.over_terrain and (known or track.amsl is not None or track.hae is not None):
-        pass  # the terrain gives heights above ground
-    elif track.heights and track.home is not None and options.agl_m is None:
-        warnings.append(LEVEL_GROUND_IN_GAPS)
-    else:
-        warnings += height_warnings(track.home is not None, not known and altitudes, options)
+    home, series = track.home is not None, track.position
+    warnings = [
+        *track.warnings,
+        *height_warnings(
+            options,
+            above_ground=bool(track.heights),
+            above_home=home,
+            above_sea=track.amsl is not None or track.hae is not None,
+            altitudes=track.altitude is not None,
+        ),
+    ]
     if series is None:
         return warnings
-    places = [
-        (int(time_ns), (float(lat), float(lon)))
-        for time_ns, (lat, lon) in zip(series.time_ns, series.values[:, :2], strict=True)
-    ]
-    return [*warnings, *jump_warnings(places)]
+    places = [(float(lat), float(lon)) for lat, lon in series.values[:, :2]]
+    return [*warnings, *jump_warnings(list(zip(series.time_ns.tolist(), places, strict=True)))]
 
 
-def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
-    """Assumptions about heights: of those above take-off, or where only altitudes are known."""
+def height_warnings(
+    options: SourceOptions,
+    *,
+    above_ground: bool,
+    above_home: bool,
+    above_sea: bool,
+    altitudes: bool,
+) -> list[str]:
+    """What is assumed about heights above ground, where these references were recorded."""
     if options.agl_m is not None:
         return []
+    if options.over_terrain and (above_ground or above_home or above_sea):
+        return []  # the terrain gives heights above ground
     if above_home:
-        return [LEVEL_GROUND]
-    if not only_altitudes:
+        return [LEVEL_GROUND_IN_GAPS if above_ground else LEVEL_GROUND]
+    if above_ground or not altitudes:
         return []
     if options.ground_alt_m is None:
         return [

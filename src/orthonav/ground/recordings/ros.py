@@ -71,8 +71,7 @@ _HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
 class Topics:
     """The connection of each role that was found, and all candidates for attitude."""
 
-    image: Any
-    roles: Mapping[str, Any]
+    roles: Mapping[str, Any]  # "image" first
     attitudes: tuple[Any, ...]
     connections: tuple[Any, ...]
 
@@ -82,8 +81,7 @@ class Topics:
 
     def summary(self) -> str:
         """Role and topic of each connection, for people."""
-        named = {"image": self.image, **self.roles}
-        return ", ".join(f"{role} {one.topic}" for role, one in named.items())
+        return ", ".join(f"{role} {one.topic}" for role, one in self.roles.items())
 
 
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
@@ -103,7 +101,7 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
             found[role] = sorted(
                 of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
             )
-    images = found.pop("image")
+    images = found["image"]
     if len(images) != 1:
         found_names = ", ".join(sorted(one.topic for one in images))
         if not images:
@@ -116,7 +114,7 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
     near = [one for one in infos if images[0].topic.startswith(one.topic.rpartition("/")[0] + "/")]
     found["camera_info"] = near or (infos if len(infos) == 1 else [])
     roles = {role: ones[0] for role, ones in found.items() if ones}
-    return Topics(images[0], roles, tuple(found["attitude"]), connections)
+    return Topics(roles, tuple(found["attitude"]), connections)
 
 
 def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
@@ -145,6 +143,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
     """
     with opened(path) as (reader, doubts):
         topics = find_topics(reader, options.topics, path)
+        image = topics.roles["image"]
         size, first_ns, last_ns = _first_image(reader, topics, path)
         camera = given_camera(options, *size, str(path)) or fitted(
             _camera(reader, topics, path), *size, str(path)
@@ -157,16 +156,13 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         if track.span_ns() is not None or options.telemetry is not None:
             offset = options.time_offset_ns
             check_overlap(track, first_ns + offset, last_ns + offset, options.telemetry or path)
-        expected = topics.image.msgcount
     return Recording(
         kind="ros",
         path=path,
         camera=camera,
         note=f"{path.name}: {topics.summary()}",
-        expected=expected,
-        stream=lambda: with_mean_velocities(
-            _views(path, topics.image.topic, track, options), track
-        ),
+        expected=image.msgcount,
+        stream=lambda: with_mean_velocities(_views(path, image.topic, track, options), track),
         warnings=(*doubts, *warnings, *warnings_of(track, options)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
@@ -174,10 +170,10 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
 
 def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:
     """Width and height of the first image that can be read, and times of the first and the last."""
-    reason = "there is none"
-    for _, time_ns, raw in reader.messages(connections=topics.of(topics.image)):
+    reason, image = "there is none", topics.roles["image"]
+    for _, time_ns, raw in reader.messages(connections=topics.of(image)):
         try:
-            message = reader.deserialize(raw, topics.image.msgtype)
+            message = reader.deserialize(raw, image.msgtype)
             grey = grey_of_message(message, "the last")
         except Exception as error:  # reported when its turn comes
             reason = f"{type(error).__name__}: {error}"
@@ -185,7 +181,7 @@ def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, in
         stamp = stamp_ns(message, time_ns)
         late_ns = max(0, reader.end_time - time_ns)
         return (grey.shape[1], grey.shape[0]), stamp, stamp + late_ns
-    raise FlightError(f"no image of {topics.image.topic} can be read ({reason}): {path}")
+    raise FlightError(f"no image of {image.topic} can be read ({reason}): {path}")
 
 
 def _camera(reader: Any, topics: Topics, path: Path) -> Camera:

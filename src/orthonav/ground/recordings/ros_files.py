@@ -88,7 +88,13 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
     if path.is_file():
         require_file(path, "ROS recording")
         return _reader([_whole(_named(path, stack), path, warnings)], path, stack)
-    files, doubt = _files_of(path), None
+    doubt = None
+    try:
+        files = storage_files(path)
+    except FlightError:
+        if not (path / METADATA).is_file():
+            raise
+        files = []  # only the metadata can tell which they are
     if (path / METADATA).is_file() and not any(_is_cut(file) for file in files):
         try:
             return _reader([path], path, stack)
@@ -101,16 +107,6 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
     if doubt:
         warnings.append(f"{METADATA} is not used ({doubt}); the files beside it are read")
     return _reader([_whole(file, file, warnings) for file in files], path, stack)
-
-
-def _files_of(path: Path) -> list[Path]:
-    """The storage files, or none where only the metadata can tell which they are."""
-    try:
-        return storage_files(path)
-    except FlightError:
-        if (path / METADATA).is_file():
-            return []
-        raise
 
 
 def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> Any:

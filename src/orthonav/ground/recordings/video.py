@@ -42,7 +42,8 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
     `FlightError` or `CameraError`.
     """
     with _opened(path) as capture:
-        width, height = _sides(capture)
+        sides = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = map(int, sides)
         fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if width < 1 or height < 1 or not capture.grab():
             raise FlightError(f"video has no frame: {path}")
@@ -119,11 +120,6 @@ def _grey(frame: NDArray[Any] | None, where: str) -> NDArray[np.uint8]:
         raise FlightError(f"image of the flight cannot be decoded: {where}")
     grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
     return np.asarray(grey, dtype=np.uint8)
-
-
-def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
-    width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
-    return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
 
 
 @contextmanager

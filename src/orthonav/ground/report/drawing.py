@@ -31,7 +31,6 @@ DPI = 220
 MOST_POINTS = 20_000
 """Lines of more points are rasterized in the SVG, which would be too large to open."""
 OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
-"""Arguments of an annotation whose position is an offset in points."""
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
 """Box (`bbox`) that keeps text readable on any background."""
 LEGEND_ABOVE: dict[str, Any] = {
@@ -39,7 +38,6 @@ LEGEND_ABOVE: dict[str, Any] = {
     "bbox_to_anchor": (0.5, 1.0),
     "frameon": False,
 }
-"""Arguments of a legend above the axes."""
 _STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": GREY,
@@ -94,7 +92,9 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         canvas.draw()
         png = _png(np.asarray(canvas.buffer_rgba()))
         figure.set_layout_engine("none")  # PNG and SVG share one layout
-        _limit_points(figure)
+        for line in (line for axes in figure.axes for line in axes.lines):
+            if np.size(line.get_xdata()) > MOST_POINTS:
+                line.set_rasterized(True)
         # As `savefig`, which draws once more before, for a layout.
         page: Any = FigureCanvasSVG(figure)
         page.print_svg(svg, metadata=_NO_METADATA)
@@ -108,12 +108,6 @@ def _png(rgba: NDArray[np.uint8]) -> bytes:
     image = Image.fromarray(rgba).convert("RGB").quantize(colors=256)
     image.save(out, format="PNG", compress_level=6, dpi=(DPI, DPI))
     return out.getvalue()
-
-
-def _limit_points(figure: "Figure") -> None:
-    for line in (line for axes in figure.axes for line in axes.lines):
-        if np.size(line.get_xdata()) > MOST_POINTS:
-            line.set_rasterized(True)
 
 
 @contextmanager

@@ -30,7 +30,6 @@ from orthonav.core.records import Fix, Telemetry, View, ViewResult
 MIN_PX, MAX_PX = 256, 1024
 """Limits of the pixels across a window: what a screen shows."""
 MARGIN = 1.02
-"""Width of a window relative to the footprint."""
 MAX_READ_PX = 4096
 """Limit of a window of the map, about 16 MB."""
 Grey = NDArray[np.uint8]

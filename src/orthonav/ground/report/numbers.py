@@ -1,7 +1,7 @@
 """Numbers and records as text and as values for JSON; an undefined number is a dash, or None."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import Any
@@ -68,3 +68,15 @@ def measure_text(value: float, unit: str = "") -> str:
     if not math.isfinite(value):
         return "-"
     return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}") + unit
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows as lines of a terminal: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            text.rjust(width) if i else text.ljust(width)
+            for i, (text, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

@@ -48,13 +48,10 @@ from orthonav.ground.simulate.perspective import Raster
 from orthonav.ground.simulate.receiver import Good, samples_of, solutions
 from orthonav.ground.simulate.render import Clouds, ViewEffects, degraded, render_view
 
-MAX_VIEWS = 1_000_000
-"""Sanity limit."""
-TRIES_PER_VIEW = 400
-"""Random positions tried per view; suffices if 2 % of them are covered by imagery."""
+MAX_VIEWS = 1_000_000  # sanity limit
+TRIES_PER_VIEW = 400  # suffices if 2 % of random positions are covered by imagery
 MAX_PITCH_DEG = 65.0
-MARGIN_PX = 4
-"""Margin of the ground window: radius of the bicubic kernel, and rounding."""
+MARGIN_PX = 4  # margin of the ground window: radius of the bicubic kernel, and rounding
 Array = NDArray[np.float64]
 
 
@@ -64,39 +61,32 @@ class Errors:
 
     Standard deviations, drawn independently for every view; the telemetry reports them:
 
-    - `yaw_std_deg`: reported heading, degrees, 0..180.
-    - `agl_std`: reported height, as a share of it, 0..0.5.
-    - `tilt_std_deg`: reported pitch and roll, degrees, 0..20.
-    - `attitude_std_deg`: true pitch and roll (which are reported), degrees, 0..20.
-    - `prior_std_m`: reported prior position, metres per axis, 0..1e6; None reports no prior.
+    `prior_std_m`: reported prior position, metres per axis, 0..1e6; None reports no prior.
 
     Constant biases, which the reported standard deviations do not include:
 
-    - `yaw_bias_deg`: reported minus true heading, degrees, -180..180.
-    - `agl_bias`: reported minus true height, as a share of it, -0.5..0.5.
-    - `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
+    `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
 
     Standard deviations of unreported tilt, pitch and roll each, degrees, 0..20:
 
-    - `mount_std_deg`: of the camera mount, drawn once a flight and added to its bias.
-    - `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
-      (`attitude.HORIZON_TIME_S`), at random positions it is independent.
+    `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
+    (`attitude.HORIZON_TIME_S`), at random positions it is independent.
 
     `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
     velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
     """
 
-    yaw_std_deg: float = 0.0
-    agl_std: float = 0.0
-    tilt_std_deg: float = 0.0
-    attitude_std_deg: float = 0.0
+    yaw_std_deg: float = 0.0  # reported heading, degrees, 0..180
+    agl_std: float = 0.0  # reported height, as a share of it, 0..0.5
+    tilt_std_deg: float = 0.0  # reported pitch and roll, degrees, 0..20
+    attitude_std_deg: float = 0.0  # true pitch and roll (which are reported), degrees, 0..20
     prior_std_m: float | None = None
-    yaw_bias_deg: float = 0.0
-    agl_bias: float = 0.0
+    yaw_bias_deg: float = 0.0  # reported minus true heading, degrees, -180..180
+    agl_bias: float = 0.0  # reported minus true height, as a share of it, -0.5..0.5
     pitch_bias_deg: float = 0.0
     roll_bias_deg: float = 0.0
     velocity_drift: float | None = None
-    mount_std_deg: float = 0.0
+    mount_std_deg: float = 0.0  # of the camera mount, drawn once a flight and added to its bias
     horizon_std_deg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -132,29 +122,22 @@ USUAL_EFFECTS = ViewEffects()
 class SimulateRequest:
     """Parameters of a simulated flight.
 
-    - `orthos`: orthophotos to fly over; earlier ones take precedence.
-    - `out`: flight folder to write.
-    - `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
-    - `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256
-      pixels of the orthophoto. On a route over a terrain it is the height above the ground at the
-      first view, and the altitude is constant.
-    - `spacing_m`: distance between views on a route in still air; None: flown in one second.
-    - `airspeed_mps`: airspeed. In wind, views are `spacing_m / airspeed_mps` seconds apart too.
-    - `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
-    - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
-    - `wind`: None for still air; only on a route.
-    - `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot.
-    - `cloud_share`: share of the views with clouds, 0..1.
-    - `beyond`: whether the route may leave the imagery, which is then mirrored at its border.
-    - `terrain`: heights of the ground or surface above mean sea level. Views are then true
-      perspectives of it, and the telemetry reports heights above sea level and, on a route, above
-      the first view, and no measured one above ground. `terrain_posting_m`: its resolution.
-    - `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
-    - `gnss`: receiver whose solutions are written to `gnss.csv`; only on a route.
+    `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
+    `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256 pixels
+    of the orthophoto. On a route over a terrain it is the height above the ground at the first
+    view, and the altitude is constant. `spacing_m`: distance between views on a route in still air;
+    None: flown in one second. `airspeed_mps`: airspeed. In wind, views are `spacing_m /
+    airspeed_mps` seconds apart too. `camera`: intrinsics; `errors`: of the telemetry; `effects`:
+    image degradation. `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on
+    the spot. `beyond`: whether the route may leave the imagery, which is then mirrored at its
+    border. `terrain`: heights of the ground or surface above mean sea level. Views are then true
+    perspectives of it, and the telemetry reports heights above sea level and, on a route, above the
+    first view, and no measured one above ground. `camera_pitch_deg`: angle by which the camera
+    looks ahead of straight down, 0..65; reported.
     """
 
-    orthos: Sequence[Path]
-    out: Path
+    orthos: Sequence[Path]  # orthophotos to fly over; earlier ones take precedence
+    out: Path  # flight folder to write
     route: Route | None = None
     random: int | None = None
     agl_m: float | None = None
@@ -163,15 +146,15 @@ class SimulateRequest:
     camera: Camera = DEFAULT_CAMERA
     errors: Errors = NO_ERRORS
     effects: ViewEffects = USUAL_EFFECTS
-    seed: int = 0
-    wind: Wind | None = None
+    seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
+    wind: Wind | None = None  # none for still air; only on a route
     turn_radius_m: float = 0.0
-    cloud_share: float = 0.0
+    cloud_share: float = 0.0  # share of the views with clouds, 0..1
     beyond: bool = False
     terrain: TerrainHeights | None = None
-    terrain_posting_m: float = 5.0
+    terrain_posting_m: float = 5.0  # resolution of the terrain
     camera_pitch_deg: float = 0.0
-    gnss: Good | None = None
+    gnss: Good | None = None  # receiver whose solutions are written to `gnss.csv`; only on a route
 
     def __post_init__(self) -> None:
         if isinstance(self.orthos, str | Path):
@@ -186,12 +169,10 @@ class SimulateRequest:
 
 @dataclass(frozen=True)
 class _Pose:
-    """True pose of the camera at one view.
-
-    `reported_deg`: heading, pitch and roll as reported, but for noise and bias of the telemetry.
-    `reported_en_mps`: reported velocity over ground, None if not reported.
-    `home_m`, `amsl_m`: height above take-off and above sea level, None if not reported.
-    """
+    """True pose of the camera at one view. `reported_deg`: heading, pitch and roll as reported, but
+    for noise and bias of the telemetry. `reported_en_mps`: reported velocity over ground, None if
+    not reported. `home_m`, `amsl_m`: height above take-off and above sea level, None if not
+    reported."""
 
     position_en_m: Array
     yaw_deg: float
@@ -222,7 +203,7 @@ def simulate_flight(
     mosaic = Mosaic.open(request.orthos)
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
-    agl_m = _height_m(request, mosaic)
+    agl_m = request.agl_m or 256 * mosaic.gsd_m / min(request.camera.extent)
     west, south, east, north = area.extent_en_m
     gsd_m = max(mosaic.gsd_m, request.camera.gsd_m(agl_m) * 0.75)
     raster = mosaic.sheet(
@@ -267,26 +248,19 @@ def simulate_flight(
 
 
 def _check(request: SimulateRequest) -> None:
-    """Raise `FlightError` on parameters that are impossible for any imagery."""
     if (request.route is None) == (request.random is None):
         raise FlightError("give either a route or a number of random positions")
-    if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
-        raise FlightError(
-            f"number of random positions must be 1 to {MAX_VIEWS}, got {request.random}"
-        )
-    if request.seed < 0:
-        raise FlightError(f"seed must be 0 or more, got {request.seed}")
-    if not 0 <= request.turn_radius_m <= 100_000:
-        raise FlightError(f"turn radius must be 0 to 100,000 m, got {request.turn_radius_m}")
-    if not 0 <= request.cloud_share <= 1:
-        raise FlightError(
-            f"cloud_share must be 0 to 1 (a fraction of the views), got {request.cloud_share}"
-        )
-    if not 0 <= request.camera_pitch_deg <= MAX_PITCH_DEG:
-        raise FlightError(
-            f"the camera must look 0 to {MAX_PITCH_DEG:g} deg ahead of straight down, "
-            f"got {request.camera_pitch_deg}"
-        )
+    limits: dict[str, tuple[float | None, float, float]] = {
+        "number of random positions": (request.random, 1, MAX_VIEWS),
+        "height above ground": (request.agl_m, 1, 50_000),
+        "seed": (request.seed, 0, math.inf),
+        "turn radius": (request.turn_radius_m, 0, 100_000),
+        "cloud_share": (request.cloud_share, 0, 1),  # of the views
+        "camera pitch": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
+    }
+    for what, (value, least, most) in limits.items():
+        if value is not None and not least <= value <= most:
+            raise FlightError(f"{what} must be {least:,} to {most:,g}, got {value}")
     if request.cloud_share and request.camera_pitch_deg:
         raise FlightError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
@@ -301,23 +275,12 @@ def _check(request: SimulateRequest) -> None:
         raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
 
 
-def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
-    camera = request.camera
-    if request.agl_m is None:
-        side_m = 256 * mosaic.gsd_m
-        return side_m / min(camera.extent)
-    if not 1 <= request.agl_m <= 50_000:
-        raise FlightError(f"height above ground must be 1 to 50,000 m, got {request.agl_m}")
-    return request.agl_m
-
-
 def _ground(
     request: SimulateRequest,
     raster: SheetRaster,
     corner: tuple[float, float, float],
     coverage: Coverage,
 ) -> GroundImagery:
-    """The raster with `corner` (west, north, pixel size, metres), mirrored if requested."""
     west_m, north_m, gsd_m = corner
     if not (request.beyond or request.in_perspective):
         return GroundImagery(raster, west_m, north_m, gsd_m)
@@ -332,7 +295,6 @@ def _ground(
 
 
 def _sees_ground(coverage: Coverage, request: SimulateRequest, pose: _Pose) -> bool:
-    """Whether imagery covers the whole view, or all that it sees from near."""
     if request.camera_pitch_deg > 0:
         angles = pose.yaw_deg, pose.pitch_deg, pose.roll_deg
         outline = near_ground_en_m(request.camera, angles, pose.agl_m)
@@ -372,7 +334,6 @@ def _poses(
 
 
 def _above_sea(request: SimulateRequest, area: Area, pose: _Pose) -> _Pose:
-    """The pose with its height above sea level, where there is a terrain."""
     if request.terrain is None:
         return pose
     below_m = ground_below_m(request.terrain, area.frame, pose.position_en_m[None])
@@ -416,8 +377,6 @@ def _route_poses(
 
 
 def _swapped(area: Area, route: Route) -> str:
-    """A hint if a waypoint with latitude and longitude swapped lies within the imagery."""
-
     def within(lat: float, lon: float) -> bool:
         return bool(area.contains(area.frame.en_from_latlon([lat], [lon]))[0])
 
@@ -490,7 +449,6 @@ def _picture(
     pose: _Pose,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """The image of the camera (H, W, 3), rendered from the window of imagery under it."""
     camera, attitude = request.camera, pose.attitude
     cover = None
     if clouds is not None:
@@ -508,7 +466,6 @@ def _picture(
 def _telemetry(
     request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator
 ) -> Telemetry:
-    """Telemetry of a pose with its errors."""
     errors, height = request.errors, 1 + request.errors.agl_bias
     yaw_deg, pitch_deg, roll_deg = pose.reported_deg
     yaw_deg += errors.yaw_bias_deg

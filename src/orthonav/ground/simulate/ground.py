@@ -17,24 +17,17 @@ from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.ground.planning.area import Area
 from orthonav.ground.simulate.perspective import Raster, coloured, met, rays_enu
 
-COVERAGE_PX = 1024
-"""Size of the coverage mask; bounds its memory for any imagery."""
-MAX_NODES = 4000
-"""Heights along a side of the area, at most; bounds their memory."""
+COVERAGE_PX = 1024  # size of the coverage mask; bounds its memory for any imagery
+MAX_NODES = 4000  # heights along a side of the area, at most; bounds their memory
 READ_ROWS = 64
-FARTHEST = 12.0
-"""Ground farther away than so many heights above it is not rendered: it is sky."""
-NEAR = 3.0
-"""Ground nearer than so many heights must be covered by imagery."""
-MANY_PX = 500_000
-"""Of larger pictures every second ray is followed."""
+FARTHEST = 12.0  # ground farther away than so many heights above it is not rendered: it is sky
+NEAR = 3.0  # ground nearer than so many heights must be covered by imagery
+MANY_PX = 500_000  # of larger pictures every second ray is followed
 BORDER = 9
 Array = NDArray[np.float64]
 
 
 class Coverage:
-    """Mask of the covered area, subsampled to at most `COVERAGE_PX` pixels across."""
-
     def __init__(self, mosaic: Mosaic, area: Area) -> None:
         self._west, south, east, self._north = area.extent_en_m
         across = max(east - self._west, self._north - south)
@@ -68,10 +61,6 @@ class Coverage:
         return not (part & (inside > 0)).any()
 
     def box_en_m(self) -> tuple[float, float, float, float]:
-        """West, south, east, north of a box that is fully covered by imagery.
-
-        Raises `AreaError` if the imagery is too fragmented.
-        """
         height, width = self._missing.shape
         left, top, right, bottom = 0, 0, width, height
         while left < right and top < bottom:
@@ -96,17 +85,14 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class GroundImagery:
-    """Imagery in a local plane.
+    """Imagery in a local plane. `west_m`, `north_m`: its north-west corner. `mirror_px`: box (left,
+    top, right, bottom) that is mirrored at its sides to fill pixels without imagery, None for no
+    filling."""
 
-    `raster`: the resampled imagery. `west_m`, `north_m`: its north-west corner. `gsd_m`: metres per
-    pixel. `mirror_px`: box (left, top, right, bottom) that is mirrored at its sides to fill pixels
-    without imagery, None for no filling.
-    """
-
-    raster: SheetRaster
+    raster: SheetRaster  # the resampled imagery
     west_m: float
     north_m: float
-    gsd_m: float
+    gsd_m: float  # metres per pixel
     mirror_px: tuple[int, int, int, int] | None = None
 
     def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
@@ -136,17 +122,13 @@ class GroundImagery:
 
 
 def reflected(index: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
-    """Indices reflected into low..high-1 at both ends."""
     size = high - low
     folded = (index - low) % (2 * size)
     return np.asarray(low + np.minimum(folded, 2 * size - 1 - folded))
 
 
 def ground_below_m(terrain: TerrainHeights, frame: LocalFrame, places_en_m: Array) -> Array:
-    """Heights of the ground (N,) above mean sea level below places (N, 2) of a plane.
-
-    Raises `AreaError` where one is unknown.
-    """
+    """Heights of the ground (N,) above mean sea level below places (N, 2) of a plane."""
     lat, lon = frame.latlon_from_en(places_en_m)
     found = terrain(lat, lon)
     unknown = np.flatnonzero(~np.isfinite(found))
@@ -162,10 +144,8 @@ def reported_heights(
     telemetry: Telemetry, agl_m: float, home_m: float | None, amsl_m: float
 ) -> Telemetry:
     """The telemetry with heights above sea and take-off in place of a measured one above ground.
-
     `agl_m`, `home_m`, `amsl_m`: true heights; all are reported with the error of that above ground.
-    As in imports without a terrain, the height above take-off stands for that above ground.
-    """
+    As in imports without a terrain, the height above take-off stands for that above ground."""
     error_m = telemetry.agl_m - agl_m
     above_home_m = None if home_m is None else round(home_m + error_m, 3)
     return replace(
@@ -182,10 +162,8 @@ def surface_of(
     extent_en_m: tuple[float, float, float, float],
     posting_m: float,
 ) -> Raster:
-    """Heights over a plane, west, south, east, north; holes have the height of their border.
-
-    Level ground at 0 without `terrain`. Raises `AreaError` where no height is known.
-    """
+    """Heights over a plane, west, south, east, north; holes have the height of their border. Level
+    ground at 0 without `terrain`."""
     west, south, east, north = extent_en_m
     across = max(east - west, north - south)
     if terrain is None:

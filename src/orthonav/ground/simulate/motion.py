@@ -11,34 +11,23 @@ from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import attitude_of, enu_from_camera
 from orthonav.ground.planning.route import along_polyline_en_m
 
-GUST_STD = 0.15
-"""Standard deviation of the gusts per axis, as a share of the wind speed."""
-LARGEST_GUST = 0.4
-"""Largest gust, as a share of the wind speed."""
-GUST_TIME_S = 60.0
-"""Time constant of the gusts."""
-DRIFT_TIME_S = 300.0
-"""Time constant of the odometry error, which hardly changes within a minute."""
-ARC_STEP_DEG = 2.0
-"""Angle between the points of an arc."""
-SHARPEST_DEG = 179.0
-"""Sharper corners are flown as turns on the spot."""
-LONGEST_STEP_S = 0.5
-"""Longest time step with constant wind and course."""
-HORIZON_TIME_S = 15.0
-"""Correlation time of the horizon. Errors of real autopilots change within 10 to 30 s."""
-MAX_STEPS = 1_000_000
-"""Limit of the time steps of a flight in wind: 139 hours."""
+GUST_STD = 0.15  # standard deviation of the gusts per axis, as a share of the wind speed
+LARGEST_GUST = 0.4  # largest gust, as a share of the wind speed
+GUST_TIME_S = 60.0  # time constant of the gusts
+DRIFT_TIME_S = 300.0  # time constant of the odometry error, which hardly changes within a minute
+ARC_STEP_DEG = 2.0  # angle between the points of an arc
+SHARPEST_DEG = 179.0  # sharper corners are flown as turns on the spot
+LONGEST_STEP_S = 0.5  # longest time step with constant wind and course
+HORIZON_TIME_S = 15.0  # errors of real autopilots change within 10 to 30 s
+MAX_STEPS = 1_000_000  # limit of the time steps of a flight in wind: 139 hours
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Wind:
-    """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts.
-
-    Gusts are an Ornstein-Uhlenbeck process per axis with the standard deviation `GUST_STD` (a share
-    of the wind speed) and the time constant `GUST_TIME_S`.
-    """
+    """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts. Gusts
+    are an Ornstein-Uhlenbeck process per axis with the standard deviation `GUST_STD` (a share of
+    the wind speed) and the time constant `GUST_TIME_S`."""
 
     speed_mps: float
     from_deg: float = 270.0
@@ -53,27 +42,19 @@ class Wind:
 
     @property
     def strongest_mps(self) -> float:
-        """Wind speed in the strongest gust."""
         return self.speed_mps * (1 + LARGEST_GUST)
 
     @property
     def velocity_en_mps(self) -> Array:
-        """Mean velocity of the air over ground (2,)."""
         return -self.speed_mps * direction(self.from_deg)
 
 
 @dataclass(frozen=True, eq=False)
 class FlownPath:
-    """N views along a route.
-
-    `places_en_m` (N, 2): positions. `headings_deg` (N,). `times_s` (N,): time since the first.
-    `first_velocity_en_mps` (2,): velocity over ground at the first.
-    """
-
-    places_en_m: Array
-    headings_deg: Array
-    times_s: Array
-    first_velocity_en_mps: Array
+    places_en_m: Array  # (N, 2)
+    headings_deg: Array  # (N,)
+    times_s: Array  # (N,) time since the first
+    first_velocity_en_mps: Array  # (2,) velocity over ground at the first
 
     @property
     def velocities_en_mps(self) -> Array:
@@ -98,11 +79,8 @@ def windy_path(
     rng: np.random.Generator,
     most: int,
 ) -> FlownPath:
-    """Path along the polyline (M, 2) in wind, with a crab angle and a varying ground speed.
-
-    Views are `spacing_m / airspeed_mps` seconds apart, at most `most` + 1. Raises `FlightError` if
-    the strongest gust is as fast as the aircraft, or if the flight takes more than `MAX_STEPS`.
-    """
+    """Path along the polyline (M, 2) in wind, with a crab angle and a varying ground speed. Views
+    are `spacing_m / airspeed_mps` seconds apart, at most `most` + 1."""
     if wind.strongest_mps >= airspeed_mps:
         raise FlightError(
             f"wind of {wind.speed_mps:g} m/s, {wind.strongest_mps:.3g} m/s in gusts, is too strong "
@@ -151,7 +129,6 @@ def _too_long() -> FlightError:
 
 
 def _moving_air(wind: Wind, step_s: float, rng: np.random.Generator) -> Iterator[Array]:
-    """Velocity of the air (2,) at successive steps, infinitely many."""
     std, most = GUST_STD * wind.speed_mps, LARGEST_GUST * wind.speed_mps
     for gust in _wandering(step_s / GUST_TIME_S, rng):
         added = gust * std
@@ -169,16 +146,13 @@ def _wandering(step: float, rng: np.random.Generator) -> Iterator[Array]:
 
 
 def gauss_markov(step: float, count: int, rng: np.random.Generator) -> Array:
-    """`count` values (N, 2) of the process of `_wandering`."""
     return np.array([value for value, _ in zip(_wandering(step, rng), range(count), strict=False)])
 
 
 def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
-    """Velocities (N, 2) as reported by odometry with a drifting scale and direction.
-
-    The scale error (a share) and the direction error (rad) have the standard deviation `drift` and
-    the time constant `DRIFT_TIME_S`.
-    """
+    """Velocities (N, 2) as reported by odometry with a drifting scale and direction. The scale
+    error (a share) and the direction error (rad) have the standard deviation `drift` and the time
+    constant `DRIFT_TIME_S`."""
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
     off = drift * gauss_markov(step_s / DRIFT_TIME_S, len(times_s), rng)
     cos, sin = np.cos(off[:, 1]), np.sin(off[:, 1])
@@ -188,10 +162,8 @@ def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Gen
 
 
 def rounded(line_en_m: Array, radius_m: float) -> Array:
-    """The polyline (M, 2) with rounded corners; arcs are tighter at short legs.
-
-    About-turns are left unchanged.
-    """
+    """The polyline (M, 2) with rounded corners; arcs are tighter at short legs. About-turns are
+    left unchanged."""
     if len(line_en_m) < 3:
         return line_en_m
     parts = [line_en_m[:1]]
@@ -221,7 +193,6 @@ def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
 def mounted(
     attitude_deg: tuple[float, float, float], pitch_deg: float, roll_deg: float
 ) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a tilted camera in an aircraft with the given attitude."""
     level = enu_from_camera(0.0, 0.0, 0.0)
     tilted = enu_from_camera(0.0, pitch_deg, roll_deg)
     return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ tilted)
@@ -234,10 +205,8 @@ def direction(course_deg: float) -> Array:
 
 
 def horizon_errors(std_deg: float, times_s: Array, rng: np.random.Generator) -> Array:
-    """True minus reported pitch and roll (N, 2) along a route, deg, at evenly spaced times (N,).
-
-    A first-order Gauss-Markov process of this standard deviation.
-    """
+    """True minus reported pitch and roll (N, 2) along a route, deg, at evenly spaced times (N,). A
+    first-order Gauss-Markov process of this standard deviation."""
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
     return std_deg * gauss_markov(step_s / HORIZON_TIME_S, len(times_s), rng)
 

@@ -15,15 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
 
-STRIDE_PX = 1.0
-"""Steps along a ray, in pixels of the heights."""
-HALVINGS = 8
-"""Halvings of the step in which a ray meets the ground."""
+STRIDE_PX = 1.0  # steps along a ray, in pixels of the heights
+HALVINGS = 8  # halvings of the step in which a ray meets the ground
 MAX_STEPS = 4000
-MAX_HALVED = 5
-"""Imagery is averaged down to 1/32 at most where a pixel sees much ground."""
-SKY = 200.0
-"""Grey level where a ray meets no ground."""
+MAX_HALVED = 5  # imagery is averaged down to 1/32 at most where a pixel sees much ground
+SKY = 200.0  # grey level where a ray meets no ground
 Array = NDArray[np.float64]
 
 
@@ -138,30 +134,11 @@ def _between(heights: Raster, position_m: Array, rays: Array, down: Array) -> tu
     return float(box.min()), float(box.max())
 
 
-def seen_view(
-    imagery: Raster,
-    heights: Raster,
-    camera: Camera,
-    attitude_deg: tuple[float, float, float],
-    position_m: Array,
-    finer: int = 2,
-) -> tuple[NDArray[np.uint8], Array]:
-    """What a camera sees (H, W) or (H, W, C) uint8, and the ground points (h, w, 3) of its rays.
-
-    `position_m` (3,): east, north and above the zero of `heights`. `finer`: rays along both sides
-    of a pixel.
-    """
-    ground = met(heights, rays_enu(camera, attitude_deg, finer), position_m)
-    return coloured(imagery, ground, camera, position_m), ground
-
-
 def coloured(
     imagery: Raster, ground_m: Array, camera: Camera, position_m: Array
 ) -> NDArray[np.uint8]:
     """The picture (H, W) or (H, W, C) of ground points (h, w, 3), of one or more rays a pixel.
-
-    Where a ray stands for more than a pixel of the imagery, this is averaged.
-    """
+    Where a ray stands for more than a pixel of the imagery, this is averaged."""
     range_m = np.linalg.norm(ground_m - position_m, axis=-1)
     drop_m = np.maximum(position_m[2] - ground_m[..., 2], 1e-3)
     ray_px = camera.width_px / ground_m.shape[1]
@@ -178,23 +155,3 @@ def coloured(
     size = camera.width_px, camera.height_px
     small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
     return np.rint(np.clip(small, 0, 255)).astype(np.uint8)
-
-
-def random_relief(
-    shape: tuple[int, int], posting_m: float, slope: float, shortest_m: float, seed: int
-) -> NDArray[np.float32]:
-    """Heights (H, W) of random hills from 0 up with a slope (root mean square of the gradient).
-
-    Wavelengths from `shortest_m` up; amplitudes grow with them.
-    """
-    rng = np.random.default_rng(seed)
-    rows, cols = np.fft.fftfreq(shape[0], posting_m), np.fft.rfftfreq(shape[1], posting_m)
-    frequency = np.hypot(rows[:, None], cols)
-    frequency[0, 0] = 1.0
-    power = frequency**-2.0 * np.exp(-((frequency * shortest_m) ** 2))
-    power[0, 0] = 0.0
-    noise = np.fft.rfft2(rng.standard_normal(shape))
-    heights = np.fft.irfft2(noise * power, s=shape)
-    steep = np.sqrt(sum(np.mean(part**2) for part in np.gradient(heights, posting_m)))
-    heights = heights * (slope / steep) if slope > 0 else heights * 0
-    return np.asarray(heights - heights.min(), np.float32)

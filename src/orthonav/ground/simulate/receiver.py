@@ -14,48 +14,35 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.variants import Table, Variant, make_variant
 from orthonav.ground.simulate.motion import direction, gauss_markov
 
-RATE_HZ = 5.0
-"""Rate of solutions: the default of autopilots."""
-ERROR_STD_M, ERROR_TAU_S = 2.0, 180.0
-"""Slowly varying error per axis (ionosphere, orbits) and its correlation time."""
-NOISE_STD_M = 0.3
-"""Noise per axis from solution to solution."""
+RATE_HZ = 5.0  # rate of solutions: the default of autopilots
+ERROR_STD_M, ERROR_TAU_S = 2.0, 180.0  # slowly varying, per axis: ionosphere, orbits
+NOISE_STD_M = 0.3  # noise per axis from solution to solution
 MULTIPATH_PER_HOUR, MULTIPATH_M, MULTIPATH_S = 20.0, 6.0, (5.0, 60.0)
 """Rate, largest size and duration of steps by multipath."""
 VELOCITY_NOISE_MPS, VELOCITY_DRIFT_MPS, VELOCITY_TAU_S = 0.05, 0.08, 60.0
 """Noise and slowly varying error of the Doppler velocity per axis."""
-LATENCY_S = 0.12
-"""Age of a solution at its timestamp, of which the receiver does not know."""
-STATED_STD_M = 1.5
-"""Standard deviation that the receiver states: less than its error, as receivers do."""
+LATENCY_S = 0.12  # age of a solution at its timestamp, of which the receiver does not know
+STATED_STD_M = 1.5  # less than its error, as receivers do
 SATELLITES = 16
-_LIMITS = {
+_LIMITS = {  # largest values of a receiver's fields; the least is 0
     "std_m": 100.0,
     "at_s": 1e9,
     "metres": 1e6,
     "mps": 1e3,
     **dict.fromkeys(("over_s", "every_s", "for_s"), 1e9),
 }
-"""Largest values of a receiver's fields; the least is 0."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class GnssTrack:
-    """Solutions of a receiver.
-
-    `times_s` (N,): time of the message. `solved_s` (N,): timestamp by the receiver. `en_m` (N, 2):
-    positions. `vel_en_mps` (N, 2): velocities. `fix_type` (N,): 3 for a 3D fix, as GPS_FIX_TYPE of
-    MAVLink. `std_m` (N,): stated standard deviation. `satellites` (N,).
-    """
-
-    times_s: Array
-    solved_s: Array
-    en_m: Array
-    vel_en_mps: Array
-    fix_type: NDArray[np.int64]
-    std_m: Array
-    satellites: NDArray[np.int64]
+    times_s: Array  # (N,) time of the message
+    solved_s: Array  # (N,) timestamp by the receiver
+    en_m: Array  # (N, 2) positions
+    vel_en_mps: Array  # (N, 2) velocities
+    fix_type: NDArray[np.int64]  # (N,) 3 for a 3D fix, as GPS_FIX_TYPE of MAVLink
+    std_m: Array  # (N,) stated standard deviation
+    satellites: NDArray[np.int64]  # (N,)
 
 
 @dataclass(frozen=True)
@@ -76,10 +63,8 @@ class Good:
 
 @dataclass(frozen=True)
 class Step(Good):
-    """Spoofed by a step of `metres` to `bearing_deg` at `at_s`.
-
-    It takes `over_s`, and the velocity follows it; with 0 it is sudden, and the velocity does not.
-    """
+    """Spoofed by a step of `metres` to `bearing_deg` at `at_s`. It takes `over_s`, and the velocity
+    follows it; with 0 it is sudden, and the velocity does not."""
 
     at_s: float = 60.0
     metres: float = 30.0
@@ -116,8 +101,6 @@ class Drag(Good):
 
 @dataclass(frozen=True)
 class Drift(Drag):
-    """A receiver whose positions drift from `at_s` on at `mps`, while its velocity is correct."""
-
     mps: float = 0.5
 
     def _with_fault(self, track: GnssTrack) -> GnssTrack:
@@ -172,7 +155,7 @@ class Jam(Good):
         )
 
 
-RECEIVERS: Table = MappingProxyType(
+RECEIVERS: Table = MappingProxyType(  # receivers that `orthonav simulate --receiver` knows
     {
         name: Variant(f"orthonav.ground.simulate.receiver:{cls.__name__}")
         for name, cls in (
@@ -186,11 +169,9 @@ RECEIVERS: Table = MappingProxyType(
         )
     }
 )
-"""Receivers that `orthonav simulate --receiver` knows."""
 
 
 def receiver_of(text: str) -> Good:
-    """The receiver that `name:field=value,...` describes; raises `VariantError`."""
     made: Good = make_variant(RECEIVERS, text)
     return made
 
@@ -227,7 +208,6 @@ def solutions(
 
 
 def samples_of(track: GnssTrack, frame: LocalFrame) -> Iterator[GnssSample]:
-    """The solutions as samples, in the order of arrival."""
     lat, lon = frame.latlon_from_en(track.en_m)
     for i, arrived_s in enumerate(track.times_s):
         solved_ns = round(track.solved_s[i] * 1e9)
@@ -245,7 +225,6 @@ def samples_of(track: GnssTrack, frame: LocalFrame) -> Iterator[GnssSample]:
 
 
 def _multipath(times: Array, rng: np.random.Generator) -> Array:
-    """Offsets (N, 2) that come and go in steps."""
     off = np.zeros((len(times), 2))
     hours = (times[-1] - times[0]) / 3600
     for _ in range(rng.poisson(MULTIPATH_PER_HOUR * hours)):

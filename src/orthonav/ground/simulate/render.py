@@ -17,22 +17,14 @@ from orthonav.core.geo.camera import (
     undistort,
 )
 
-FEWEST_VIEWS, MOST_VIEWS = 10, 40
-"""Length of a cloudy stretch in views."""
-EDGE = 0.25
-"""Share of a stretch, at each end, over which the clouds close."""
-BROKEN = 0.3
-"""Share of the stretches whose clouds never close."""
-HEIGHT = 0.5
-"""Height of the clouds as a share of the aircraft's."""
-SOFTNESS = 0.25
-"""Width of a cloud edge, as a share of the range of cloud cover."""
-TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0
-"""Period of the cloud texture, in its pixels and in lengths of a view."""
-BLOB_PX = 40.0
-"""Size of the largest clouds in pixels of the texture."""
-GRID = 8
-"""Clouds are rendered at this fraction of the resolution of the view."""
+FEWEST_VIEWS, MOST_VIEWS = 10, 40  # length of a cloudy stretch in views
+EDGE = 0.25  # share of a stretch, at each end, over which the clouds close
+BROKEN = 0.3  # share of the stretches whose clouds never close
+HEIGHT = 0.5  # height of the clouds as a share of the aircraft's
+SOFTNESS = 0.25  # width of a cloud edge, as a share of the range of cloud cover
+TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0  # period: pixels, lengths of a view
+BLOB_PX = 40.0  # size of the largest clouds in pixels of the texture
+GRID = 8  # clouds are rendered at this fraction of the resolution of the view
 Array = NDArray[np.float64]
 
 
@@ -44,7 +36,6 @@ class CloudLayer:
     grey: NDArray[np.float32]
 
     def over(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (H, W, 3) with the clouds in front."""
         behind = picture * (1 - self.opacity[..., None])
         return np.asarray(behind + (self.opacity * self.grey)[..., None], dtype=np.uint8)
 
@@ -66,10 +57,8 @@ class Clouds:
     def before(
         self, number: int, camera: Camera, attitude: tuple[float, float, float, float], en_m: Array
     ) -> CloudLayer | None:
-        """Clouds between a view and the ground, None if it is clear.
-
-        `attitude`: heading, pitch, roll (deg) and height (m). `en_m`: position (2,).
-        """
+        """Clouds between a view and the ground, None if it is clear. `attitude`: heading, pitch,
+        roll (deg) and height (m). `en_m`: position (2,)."""
         degree, stretch = self.degree(number), int(self._stretch[number])
         if degree <= 0:
             return None
@@ -140,17 +129,10 @@ def _enlarged(part: Array, size: tuple[int, int]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class ViewEffects:
-    """Image degradation.
-
-    `exposure_std`: standard deviation of the logarithm of the exposure, 0..1. `blur_px`: standard
-    deviation of the blur in pixels, 0..50. `noise_std`: standard deviation of the sensor noise in
-    grey levels, 0..128. `jpeg_quality`: 1..100. Raises `FlightError` outside these ranges.
-    """
-
-    exposure_std: float = 0.15
-    blur_px: float = 0.6
-    noise_std: float = 2.0
-    jpeg_quality: int = 90
+    exposure_std: float = 0.15  # standard deviation of the logarithm of the exposure, 0..1
+    blur_px: float = 0.6  # standard deviation of the blur in pixels, 0..50
+    noise_std: float = 2.0  # standard deviation of the sensor noise in grey levels, 0..128
+    jpeg_quality: int = 90  # 1..100
 
     def __post_init__(self) -> None:
         limits = {"exposure_std": 1.0, "blur_px": 50.0, "noise_std": 128.0}
@@ -171,12 +153,9 @@ def render_view(
     rng: np.random.Generator,
     clouds: CloudLayer | None = None,
 ) -> NDArray[np.uint8]:
-    """Image (H, W, 3) of flat ground.
-
-    `ground_rgb` (h, w, 3) is an orthophoto with `gsd_m` metres per pixel; `ground_corner_en_m` is
-    its north-west corner, metres from the nadir of the camera. `attitude`: yaw, pitch, roll (deg)
-    and height (m).
-    """
+    """Image (H, W, 3) of flat ground. `ground_rgb` (h, w, 3) is an orthophoto with `gsd_m` metres
+    per pixel; `ground_corner_en_m` is its north-west corner, metres from the nadir of the camera.
+    `attitude`: yaw, pitch, roll (deg) and height (m)."""
     picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
     return degraded(picture, effects, rng, clouds)
 
@@ -187,7 +166,6 @@ def degraded(
     rng: np.random.Generator,
     clouds: CloudLayer | None = None,
 ) -> NDArray[np.uint8]:
-    """A perfect image (H, W, 3) with clouds, blur, exposure and noise."""
     if clouds is not None:
         picture = clouds.over(picture)
     if effects.blur_px > 0:

@@ -159,12 +159,11 @@ class NoImages:
 
 class FolderImages:
     def __init__(self, path: Path) -> None:
-        folder = open_flight(path, images_needed=False)
-        self._camera = folder.camera
-        self._views = {view.frame: view for view in folder.views}
+        self.folder = open_flight(path, images_needed=False)
+        self._views = {view.frame: view for view in self.folder.views}
 
     def shot(self, frame: str) -> Shot:
         view = self._views.get(frame)
         if view is None:
             raise FlightError("this view is not in the flight")
-        return Shot(view.telemetry, self._camera, view.grey)
+        return Shot(view.telemetry, self.folder.camera, view.grey)

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.core.files import with_paths
-from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.fixes import STATES, Identity, flight_digest, read_identity
+from orthonav.core.flight import read_truth
+from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import fault_of, gnss_of
 from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
-from orthonav.core.mapfile.signature import map_digest
+from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.calibration import is_covariance
-from orthonav.ground.evaluate.metrics import FAR_M, check_truth
+from orthonav.ground.evaluate.metrics import FAR_M, check_truth, warn_of_another_run
 from orthonav.ground.recordings.flightlog import is_flight_log
 from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 from orthonav.ground.report.imagery import (
@@ -55,9 +55,7 @@ from orthonav.ground.view.logs import LogReader
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]
 FAR_AWAY_PX = 1e9
-"""Positions farther away are not drawn."""
 RAW_PX = 640
-"""The longer side of a view as recorded."""
 log = logging.getLogger(__name__)
 
 
@@ -407,7 +405,8 @@ def open_run(request: ViewRequest) -> Run:
     """
     if not 0 < request.radius_m < 1e7:
         raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
-    sheet = SheetImagery(open_map(request.map_path))
+    opened = open_map(request.map_path)
+    sheet = SheetImagery(opened)
     feed = _feed(request)
     images = _images(request, feed)
     truth, truth_name = _truth(request)
@@ -427,7 +426,7 @@ def open_run(request: ViewRequest) -> Run:
     run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
     for problem in run.problems:
         log.warning("%s", problem)
-    _warn(request, run, feed, truth)
+    _warn(request, opened, run, feed, images)
     return run
 
 
@@ -485,27 +484,17 @@ def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
     return {}, ""
 
 
-def _differences(request: ViewRequest, run: Path) -> str:
-    """Which other map or flight folder than the given ones a file of fixes states; else ""."""
-    if not run.is_file() or is_log(run):
-        return ""
-    flight = None
-    if request.flight is not None and request.flight.is_dir() and not is_log(request.flight):
-        flight = flight_digest(open_flight(request.flight, images_needed=False).views)
-    given = Identity(map_digest(request.map_path), flight)
-    return read_identity(run).differences(given, request.map_path, request.flight)
-
-
-def _warn(request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, LatLon]) -> None:
+def _warn(request: ViewRequest, opened: MapFile, run: Run, feed: Feed, images: ViewImages) -> None:
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
-    if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
+    if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
+    folder = images.folder if isinstance(images, FolderImages) else None
     for path in filter(None, (request.run, request.second)):
-        if other := _differences(request, path):
-            log.warning("the run is of %s: %s", other, path)
+        if path.is_file() and not is_log(path):
+            warn_of_another_run(path, opened, folder)
     if not run.count:
         return
-    if truth and not run.any_known("tx"):
+    if run.labels.truth and not run.any_known("tx"):
         log.warning("no view of the run has a true position in %s", run.labels.truth)
     if request.second is not None and not run.any_known("x2"):
         log.warning("no view has a position in the second run: %s", request.second)

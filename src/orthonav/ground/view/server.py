@@ -39,14 +39,11 @@ LEAFLET = (
     "images/layers-2x.png",
     "images/marker-icon.png",
 )
-"""Files of Leaflet that the page may request."""
 SHARED = ("chart.js", "format.js", "plane.js")
-"""Scripts of `orthonav.ground.report` that the page uses."""
 
 
 log = logging.getLogger(__name__)
 TIMEOUT_S = 60.0
-"""An idle connection is closed after this time."""
 _CACHED = "private, max-age=86400"
 _NOT_CACHED = "no-store"
 _HEADERS = {

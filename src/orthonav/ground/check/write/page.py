@@ -47,7 +47,6 @@ LAYERS = {
     "persistence": "expected persistence of the ground",
     "changed": "changed since the map was made",
 }
-"""Layers of cells that the map can show."""
 INPUTS = (
     "height above ground",
     "footprint of a view",
@@ -56,13 +55,11 @@ INPUTS = (
     "error of the reported tilt",
     "drift without fixes",
 )
-"""Conditions shown beside the results."""
 DOWNLOADS = {
     "check.geojson": "GeoJSON: route, gaps, cells, ambiguous places",
     "check.tif": "GeoTIFF: a band per layer of the map",
     "check.json": "JSON: all results and conditions",
 }
-"""Files beside the page."""
 ZERO_IF_UNKNOWN = frozenset({"trials", "changed"})
 """Values that are 0, not None, in cells of which nothing is known."""
 

@@ -124,8 +124,7 @@ def _stretches(result: CheckResult) -> list[Plain]:
     return [
         {
             "number": number,
-            **to_plain(each, BY_UNIT),
-            **to_plain({"length_m": each.length_m}, BY_UNIT),
+            **to_plain({**vars(each), "length_m": each.length_m}, BY_UNIT),
             "recoverable": each.recoverable,
         }
         for number, each in enumerate(result.stretches, start=1)

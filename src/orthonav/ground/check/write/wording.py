@@ -14,7 +14,7 @@ from orthonav.ground.check.outcome import (
     Word,
     summarize,
 )
-from orthonav.ground.report.numbers import metres_text
+from orthonav.ground.report.numbers import aligned, metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -28,11 +28,9 @@ AREA_VERDICTS = {
     Word.NO_GO: "Do not rely on this map; see the reasons.",
 }
 WHAT = {"agl_m": "height above ground", "band_m": "band width"}
-"""Parameters that an alternative changes, in words."""
 CLEARLY = 0.05
 """Smaller differences may be chance, because an alternative rests on few trials."""
 MAX_STRETCHES = 7
-_MAX_REASONS = 5
 _WIDTH = 100
 SIMULATED = "Predicted from this map alone, with simulated ageing."
 
@@ -102,13 +100,10 @@ def tolerance_sentence(envelope: Envelope) -> str:
     )
 
 
-def _tilt_error_m(conditions: Conditions) -> float:
-    """Error of fixes from that of the reported tilt, root mean square of both axes."""
-    return math.sqrt(2) * conditions.agl_m * math.tan(math.radians(conditions.tilt_std_deg))
-
-
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
     yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
+    # root mean square of both axes
+    off_m = math.sqrt(2) * conditions.agl_m * math.tan(math.radians(conditions.tilt_std_deg))
     rows = {
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
         "height above ground": f"{conditions.agl_m:.0f} m",
@@ -124,7 +119,7 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
         "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)"
-        f", displaces fixes by {metres_text(_tilt_error_m(conditions))}",
+        f", displaces fixes by {metres_text(off_m)}",
         "sensor": (
             "of another kind than the map's (assumed)"
             if conditions.other_sensor
@@ -175,15 +170,13 @@ def remedies(result: CheckResult) -> list[str]:
         found.append(
             f"End the route before km {start_km:.1f}, or extend it to where fixes are likely."
         )
-    tried = any(each.what == "agl_m" for each in result.alternatives)
-    heights = "None of the other heights tried is better" if tried else "No other height was tried"
-    return found or [f"{heights}; check another route or map."]
+    return found or ["Check another route or map."]
 
 
 def text(result: CheckResult) -> str:
     """Verdict, reasons, key figures and gaps; control characters in names are replaced."""
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
-    lines += _reasons(result)
+    lines += [line for each in result.verdict.reasons for line in _item(each.text)]
     rows = _figures(result)
     width = max(len(name) for name, _ in rows)
     lines += ["", *(f"{name:<{width}}  {value}" for name, value in rows)]
@@ -192,15 +185,6 @@ def text(result: CheckResult) -> str:
     if helpful:
         lines += ["", "what may help:", *(line for each in helpful for line in _item(each))]
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
-
-
-def _reasons(result: CheckResult) -> list[str]:
-    reasons = result.verdict.reasons
-    lines = []
-    for each in reasons[:_MAX_REASONS]:
-        lines += _item(each.text)
-    more = len(reasons) - _MAX_REASONS
-    return [*lines, f"  - and {more} more"] if more > 0 else lines
 
 
 def _item(sentence: str) -> list[str]:
@@ -247,19 +231,4 @@ def _stretches(result: CheckResult) -> list[str]:
     for number, each in enumerate(result.stretches, start=1):
         if each in worst:
             rows.append(stretch_row(number, each))
-    more = len(result.stretches) - len(worst)
-    head = f"gaps without fixes ({len(result.stretches)})" + (
-        f", the {len(worst)} worst" * (more > 0)
-    )
-    return ["", head, *_columns(rows)]
-
-
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if i == len(row) - 1 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    return ["", f"gaps without fixes: {len(result.stretches)}, the worst:", *aligned(rows)]

@@ -2,6 +2,8 @@
 
 import io
 import re
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from orthonav.core.errors import RouteError
@@ -25,19 +27,14 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
 _BAND = ("band_m",)
-_MODE = ("altitudemode", "altitude_mode")
-"""Column of Litchi."""
+_MODE = ("altitudemode", "altitude_mode")  # column of Litchi
 _FRAME_OF_MODE: dict[float, HeightFrame] = {0: "home", 1: "agl"}
-_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")
-"""Unit that ends the name of a column, as in altitude(m)."""
+_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
 _METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
+_Values = Callable[..., list[float | None]]
 
 
 def read_delimited(data: bytes) -> list[Route]:
-    """The route of a table with a header, whose band is that of the leg which begins at the row.
-
-    Raises `RouteError`.
-    """
     stream = io.StringIO(decoded(data), newline=None)
     header = stream.readline(MAX_LINE_CHARS)
     stream.seek(0)
@@ -57,34 +54,24 @@ def read_delimited(data: bytes) -> list[Route]:
             "route CSV needs the columns lat_deg,lon_deg (or lat,lon or latitude,longitude), got "
             f"{','.join(names) or 'none'!s:.80}"
         )
-    comma = delimiter != ","  # then a comma in a number is a decimal comma
-    points = [
-        tuple(_number(row, column, number, comma) for column in (lat, lon))
-        for number, row in enumerate(rows, 2)
-    ]
-    return [
-        Route(
-            tuple((lat_deg, lon_deg) for lat_deg, lon_deg in points),
-            _heights(names, rows, comma),
-            _bands_m(names, rows, comma),
-        )
-    ]
+    values = partial(_values, rows, delimiter != ",")  # then commas in numbers are decimal commas
+    lats, lons = values(lat, needed=True), values(lon, needed=True)
+    waypoints = tuple((float(a or 0), float(b or 0)) for a, b in zip(lats, lons, strict=True))
+    band = _column(names, _BAND)
+    bands = [] if band is None else values(band)
+    return [Route(waypoints, _heights(names, values), tuple(bands[:-1] if bands[1:] else bands))]
 
 
-def _heights(
-    names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
-) -> tuple[Height | None, ...]:
+def _heights(names: dict[str, Any], values: _Values) -> tuple[Height | None, ...]:
     for frame, aliases in _HEIGHTS:
         column = _column(names, aliases)
         if column is not None:
-            factor = _metres_of(str(column))
-            frames = _frames(names, rows, comma) if frame is None else [frame] * len(rows)
-            found = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
-            heights = tuple(
-                None if value is None else Height(factor * value, each)
-                for value, each in zip(found, frames, strict=True)
+            factor, heights = _metres_of(str(column)), values(column)
+            frames = _frames(names, values) if frame is None else [frame] * len(heights)
+            return tuple(
+                None if height is None else Height(factor * height, each)
+                for height, each in zip(heights, frames or [None] * len(heights), strict=True)
             )
-            return heights
     return ()
 
 
@@ -96,14 +83,10 @@ def _metres_of(column: str) -> float:
     return 1.0 if unit is None else _METRES[unit[1]]
 
 
-def _frames(
-    names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
-) -> list[HeightFrame | None]:
-    """Reference of the height of each row, by its altitude mode; None without such a column."""
+def _frames(names: dict[str, Any], values: _Values) -> list[HeightFrame | None]:
+    """Reference of each height by its altitude mode; empty without such a column."""
     column = _column(names, _MODE)
-    if column is None:
-        return [None] * len(rows)
-    modes = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
+    modes = [] if column is None else values(column)
     for line, mode in enumerate(modes, 2):
         if mode is not None and mode not in _FRAME_OF_MODE:
             raise RouteError(
@@ -113,29 +96,19 @@ def _frames(
     return [None if mode is None else _FRAME_OF_MODE[mode] for mode in modes]
 
 
-def _bands_m(
-    names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
-) -> tuple[float | None, ...]:
-    column = _column(names, _BAND)
-    if column is None:
-        return ()
-    bands = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
-    return tuple(bands[:-1] if len(bands) > 1 else bands)
-
-
 def _column(names: dict[str, Any], aliases: tuple[str, ...]) -> Any:
-    """The spelling in the header of the first alias found, None if there is none."""
     return next((names[alias] for alias in aliases if alias in names), None)
 
 
-def _optional(row: dict[str, Any], column: Any, line: int, comma: bool) -> float | None:
-    if not (row.get(column) or "").strip():
-        return None
-    return _number(row, column, line, comma)
-
-
-def _number(row: dict[str, Any], column: Any, line: int, comma: bool) -> float:
-    text = row.get(column) or ""
-    if comma and "." not in text:
-        text = text.replace(",", ".")
-    return parsed(text, f"route table cannot be read: row {line}, {column}")
+def _values(
+    rows: list[dict[str, Any]], comma: bool, column: Any, needed: bool = False
+) -> list[float | None]:
+    """The numbers of a column; None where there is none, unless it is needed."""
+    found = []
+    for line, row in enumerate(rows, 2):
+        text = row.get(column) or ""
+        if comma and "." not in text:
+            text = text.replace(",", ".")
+        what = f"route table cannot be read: row {line}, {column}"
+        found.append(parsed(text, what) if needed or text.strip() else None)
+    return found

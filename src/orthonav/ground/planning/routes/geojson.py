@@ -21,12 +21,10 @@ from orthonav.ground.planning.routes.record import (
 
 
 def read_geojson(data: bytes) -> list[Route]:
-    """All lines of a GeoJSON document, in order. Raises `RouteError`."""
     return routes_of(json_object(data))
 
 
 def routes_of(plain: dict[str, Any]) -> list[Route]:
-    """All lines of a GeoJSON object, in order. Raises `RouteError` if there is none."""
     found: list[Route] = []
     others: list[tuple[str, str, Any]] = []
     for geometry, properties in _geometries(plain):
@@ -56,14 +54,10 @@ def _is_place(place: Any) -> bool:
 
 
 def to_geojson(routes: Sequence[Route]) -> str:
-    """Routes as a GeoJSON document: a feature, or a collection of several."""
     features = [_feature(route) for route in routes]
-    plain = features[0] if len(features) == 1 else _collection(features)
+    collection = {"type": "FeatureCollection", "features": features}
+    plain = features[0] if len(features) == 1 else collection
     return json.dumps(plain, allow_nan=False) + "\n"
-
-
-def _collection(features: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"type": "FeatureCollection", "features": features}
 
 
 def _feature(route: Route) -> dict[str, Any]:
@@ -121,7 +115,6 @@ def _bands_m(band: Any, legs: int) -> tuple[float | None, ...]:
 
 
 def _position(point: Any) -> tuple[float, float, float | None]:
-    """Latitude, longitude and height of a position; only numbers are accepted, not `"12"`."""
     numbers = isinstance(point, list) and all(type(value) in (int, float) for value in point[:3])
     if not numbers or len(point) < 2:
         raise RouteError(
@@ -131,7 +124,6 @@ def _position(point: Any) -> tuple[float, float, float | None]:
 
 
 def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Geometries of a GeoJSON object with their properties, without recursion."""
     stack: list[tuple[Any, dict[str, Any]]] = [(node, {})]
     while stack:
         item, properties = stack.pop()

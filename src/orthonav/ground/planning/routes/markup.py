@@ -34,21 +34,17 @@ _KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "
 """With other altitude modes, or none, the altitude is ignored, as KML specifies."""
 _POINTLESS = ("Point", "Polygon", "LinearRing", "Model")
 _END = struct.Struct("<4s4H2LH")
-_WPML_FRAMES: dict[str, HeightFrame] = {
+_WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
     "relativeToStartPoint": "home",
     "WGS84": "hae",
     "realTimeFollowSurface": "agl",
 }
-"""By `executeHeightMode`."""
 _Place = tuple[float, float, Height | None]
 
 
 def read_markup(data: bytes, kind: str, root: str) -> Element:
-    """The root of a document, with namespaces removed from its tags: `gx:Track` is Track.
-
-    `kind`: of the document, for messages. Raises `RouteError` on invalid XML, another root, a
-    DOCTYPE, more than `MAX_ELEMENTS` elements or more than `MAX_DEPTH` levels.
-    """
+    """The root of a document, with namespaces removed from its tags: `gx:Track` is Track. `kind`:
+    of the document, for messages."""
     if not data.strip():
         raise RouteError(f"{kind} file is empty")
     builder = _Builder(kind)
@@ -71,13 +67,10 @@ def read_markup(data: bytes, kind: str, root: str) -> Element:
 
 
 def text_of(element: Element, tag: str) -> str | None:
-    """Text of the first child with a tag; None if there is none or it is empty."""
     return (element.findtext(tag) or "").strip() or None
 
 
 class _Builder(TreeBuilder):
-    """Builds a tree from parser events, within limits."""
-
     def __init__(self, kind: str) -> None:
         super().__init__()
         self._kind = kind
@@ -101,10 +94,8 @@ class _Builder(TreeBuilder):
 
 
 def read_gpx(data: bytes) -> list[Route]:
-    """All routes (`rte`), and after them all tracks (`trk`), the segments of each joined.
-
-    Heights are above mean sea level. Raises `RouteError` where there are only waypoints.
-    """
+    """All routes (`rte`), and after them all tracks (`trk`), the segments of each joined. Heights
+    are above mean sea level."""
     root = read_markup(data, "GPX", "gpx")
     planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
     flown = [
@@ -148,10 +139,7 @@ def _degrees(point: Element, name: str) -> float:
 
 def read_kmz(data: bytes) -> list[Route]:
     """Lines and tracks of the archive's `doc.kml`, else of its only KML file; of a mission of DJI
-    its waylines.
-
-    Raises `RouteError`, also on archives that would unpack to more than `MAX_KML_BYTES`.
-    """
+    its waylines."""
     _check_archive(data)
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
@@ -179,7 +167,6 @@ def _chosen_members(members: list[str]) -> list[str]:
 
 
 def read_kml(data: bytes) -> list[Route]:
-    """Lines and tracks of all placemarks, those of one placemark joined. Raises `RouteError`."""
     root = read_markup(data, "KML", "kml")
     marks = list(root.iter("Placemark"))
     found = [route for mark in marks for route in _kml_routes(mark)]
@@ -214,7 +201,6 @@ def _kml_routes(mark: Element) -> list[Route]:
 
 
 def _line(element: Element) -> Iterator[_Place]:
-    """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces at commas are accepted."""
     frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
     text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
     text = text.replace(" ,", ",").replace(", ", ",")
@@ -240,7 +226,6 @@ def _kml_place(values: list[str], frame: HeightFrame | None, text: str) -> _Plac
 
 
 def _check_archive(data: bytes) -> None:
-    """Refuse archives with so many members that their list alone would exhaust memory."""
     at = data.rfind(b"PK\x05\x06")
     if at < 0 or len(data) - at < _END.size:
         raise RouteError("KMZ is not a complete zip archive (its end is missing)")
@@ -250,10 +235,7 @@ def _check_archive(data: bytes) -> None:
 
 
 def read_wpml(data: bytes) -> list[Route]:
-    """The waylines of a mission, one route per folder, their waypoints by index.
-
-    Raises `RouteError`, also for a height mode that is not known.
-    """
+    """The waylines of a mission, one route per folder, their waypoints by index."""
     root = read_markup(data, "WPML", "kml")
     folders = list(root.iter("Folder"))
     found = [route for folder in folders for route in _waylines(folder)]
@@ -261,10 +243,7 @@ def read_wpml(data: bytes) -> list[Route]:
         raise RouteError("WPML holds no wayline with waypoints")
     read = {mark for folder in folders for mark in folder.iterfind("Placemark[Point]")}
     points = [
-        (
-            _called("placemark", mark, "index"),
-            numbers_in(mark.findtext("Point/coordinates") or ""),
-        )
+        (_called("placemark", mark, "index"), numbers_in(mark.findtext("Point/coordinates") or ""))
         for mark in root.iterfind(".//Placemark[Point]")
         if mark not in read
     ]

@@ -15,7 +15,7 @@ Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml.
 import io
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from orthonav.core.errors import RouteError
@@ -37,11 +37,10 @@ WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 
 _CIRCLES = (17, 18, 19, 31, 34)
 _ARC, _SPLINE, _PLACE, _REPOSITION = 36, 82, 94, 192
 _OF_USERS = range(31000, 31005)
-FLOWN = {
+FLOWN = {  # commands with a position that the aircraft flies to
     *(WAYPOINT, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND),
     *(*_CIRCLES, _ARC, _SPLINE, _PLACE, _REPOSITION, *_OF_USERS),
 }
-"""Commands with a position that the aircraft flies to."""
 _NOT_FLOWN = {
     *(80, 83, 92, 93, 95),  # regions of interest, delays
     *range(112, 160),  # conditions
@@ -65,35 +64,20 @@ _HEIGHT_FRAMES: dict[int, HeightFrame] = {
 
 @dataclass(frozen=True)
 class MissionItem:
-    """A mission item.
+    """A mission item. `lat_deg`, `lon_deg`: position, None if it has none. `pattern`: number shared
+    by all items of one survey or corridor, which is flown as a whole."""
 
-    `command`: MAV_CMD. `frame`: MAV_FRAME, the reference of `height_m`. `lat_deg`, `lon_deg`:
-    position, None if it has none. `number`: of the item in its file. `pattern`: number shared by
-    all items of one survey or corridor, which is flown as a whole. `band_m`: search band between
-    items of one pattern.
-    """
-
-    command: int
-    frame: int
+    command: int  # MAV_CMD
+    frame: int  # MAV_FRAME, the reference of `height_m`
     lat_deg: float | None
     lon_deg: float | None
     height_m: float | None = None
-    number: int = 0
+    number: int = 0  # of the item in its file
     pattern: int | None = None
-    band_m: float | None = None
-
-
-@dataclass(frozen=True)
-class Home:
-    """The planned take-off position, and its height above mean sea level."""
-
-    lat_deg: float
-    lon_deg: float
-    amsl_m: float | None = None
+    band_m: float | None = None  # search band between items of one pattern
 
 
 def height_frame(frame: int) -> HeightFrame:
-    """Height reference of a MAV_FRAME. Raises `RouteError` for frames that are not global."""
     if frame not in _HEIGHT_FRAMES:
         raise RouteError(
             f"mission has a waypoint in MAV_FRAME {frame}; expected a global one "
@@ -102,27 +86,24 @@ def height_frame(frame: int) -> HeightFrame:
     return _HEIGHT_FRAMES[frame]
 
 
-def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
-    """The route of a mission. Raises `RouteError` if no item has a position.
-
-    As in autopilots, a position of 0, 0 or none means the current position, so a take-off without
-    a position is at home. A return to launch ends the route at home. Jumps are not followed; a
-    circle is replaced by its centre. Items with a position that are left out are named: those after
-    the return, and those whose command is not known.
-    """
+def route_of(items: Iterable[MissionItem], home: MissionItem | None) -> Route:
+    """The route of a mission. As in autopilots, a position of 0, 0 or none means the current
+    position, so a take-off without a position is at home. A return to launch ends the route at
+    home. Jumps are not followed; a circle is replaced by its centre. Items with a position that are
+    left out are named: those after the return, and those whose command is not known."""
     stops: list[MissionItem] = []
     left_out: list[str] = []
     remaining = iter(items)
     for item in remaining:
         if item.command == RETURN_HOME:
             if home is not None:
-                stops.append(_at_home(home))
+                stops.append(replace(home, height_m=None))
             break
         if item.command in FLOWN and _has_place(item):
             height_frame(item.frame)
             stops.append(item)
         elif item.command in (TAKEOFF, VTOL_TAKEOFF) and home is not None:
-            stops.append(_at_home(home))
+            stops.append(replace(home, height_m=None))
         elif _is_lost(item):
             left_out.append(_named(item))
     left_out += [f"{_named(item)} after the return" for item in remaining if _is_lost(item)]
@@ -138,13 +119,9 @@ def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
         tuple((stop.lat_deg or 0.0, stop.lon_deg or 0.0) for stop in stops),
         heights,
         bands if any(bands) else (),
-        home_amsl_m=None if home is None else home.amsl_m,
+        home_amsl_m=None if home is None else home.height_m,
         left_out=tuple(left_out),
     )
-
-
-def _at_home(home: Home) -> MissionItem:
-    return MissionItem(WAYPOINT, 0, home.lat_deg, home.lon_deg)
 
 
 def _has_place(item: MissionItem) -> bool:
@@ -154,7 +131,6 @@ def _has_place(item: MissionItem) -> bool:
 
 
 def _is_lost(item: MissionItem) -> bool:
-    """Whether an item that is left out may be flown to."""
     return (item.command in FLOWN or item.command not in _NOT_FLOWN) and _has_place(item)
 
 
@@ -177,17 +153,14 @@ _LANDINGS = ("fwLandingPattern", "vtolLandingPattern")
 
 
 def read_plan(data: bytes) -> list[Route]:
-    """The route of a plan. Raises `RouteError`, naming items that cannot be flown with a map."""
     return [plan_route(json_object(data))]
 
 
 def is_plan(plain: dict[str, Any]) -> bool:
-    """Whether a JSON object is a plan."""
     return plain.get("fileType") == "Plan"
 
 
 def plan_route(plain: dict[str, Any]) -> Route:
-    """The route of a plan read as JSON. Raises `RouteError`."""
     if not is_plan(plain):
         raise RouteError(f"plan must have fileType 'Plan', got {plain.get('fileType')!r:.40}")
     mission = plain.get("mission")
@@ -199,13 +172,14 @@ def plan_route(plain: dict[str, Any]) -> Route:
     return route_of(flown, home)
 
 
-def _plan_home(raw: Any) -> Home | None:
+def _plan_home(raw: Any) -> MissionItem | None:
     if not isinstance(raw, list) or len(raw) < 2:
         return None
     lat, lon = (number(raw[index], "plannedHomePosition") for index in (0, 1))
     if lat == 0 and lon == 0:
         return None
-    return Home(lat, lon, number_or_none(raw[2] if len(raw) > 2 else None, "height of home"))
+    height_m = number_or_none(raw[2] if len(raw) > 2 else None, "height of home")
+    return MissionItem(WAYPOINT, 0, lat, lon, height_m)
 
 
 def _plan_items(raw: Any, index: int) -> list[MissionItem]:
@@ -265,7 +239,6 @@ def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]
 def _survey_height(
     camera: dict[str, Any], inner: dict[str, Any], where: str
 ) -> tuple[int, float | None]:
-    """MAV_FRAME and height of a survey, from its camera calculation."""
     height_m = number_or_none(camera.get("DistanceToSurface"), f"{where}: DistanceToSurface")
     mode = camera.get("DistanceMode")
     if mode in _FRAME_OF_MODE:
@@ -296,17 +269,14 @@ def _latlon(point: Any, what: str) -> tuple[float, float]:
 
 _COLUMNS = 12
 _MAGIC = b"QGC WPL"
-_HOMES = (0, WAYPOINT, 179)
-"""Commands of the home position: none, a waypoint, or one that sets it."""
+_HOMES = (0, WAYPOINT, 179)  # commands of the home position: none, a waypoint, or one that sets it
 
 
 def is_wpl(data: bytes) -> bool:
-    """Whether a file begins like a waypoint file."""
     return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_MAGIC)
 
 
 def read_wpl(data: bytes) -> list[Route]:
-    """The route of a waypoint file. Raises `RouteError`."""
     lines = bounded_lines(io.StringIO(decoded(data).lstrip(), newline=None))
     try:
         first_line = next(lines)
@@ -321,8 +291,7 @@ def read_wpl(data: bytes) -> list[Route]:
     home = None
     if version[2] == "110" and items and items[0].number == 0 and items[0].command in _HOMES:
         first, *items = items
-        if first.lat_deg or first.lon_deg:
-            home = Home(first.lat_deg or 0.0, first.lon_deg or 0.0, first.height_m)
+        home = first if _has_place(first) else None
     return [route_of(items, home)]
 
 

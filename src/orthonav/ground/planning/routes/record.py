@@ -15,17 +15,13 @@ from orthonav.core.geo.swapped import swapped_hint
 
 HeightFrame = Literal["agl", "home", "amsl", "hae"]
 HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
-MAX_HEIGHT_M = 100_000.0
-"""Sanity limit: the edge of space."""
-MAX_BAND_M = 50_000.0
-"""Width of the largest sheet."""
-MAX_WAYPOINTS = 100_000
-"""Sanity limit against files that exhaust memory."""
+MAX_HEIGHT_M = 100_000.0  # sanity limit: the edge of space
+MAX_BAND_M = 50_000.0  # width of the largest sheet
+MAX_WAYPOINTS = 100_000  # sanity limit against files that exhaust memory
 MAX_NAMED = 12
 
 
 def left_out_text(left_out: Sequence[str]) -> str:
-    """A sentence that names what a route leaves out."""
     more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
     return (
         "positions that are not part of the route, so the map may not cover them: "
@@ -34,7 +30,6 @@ def left_out_text(left_out: Sequence[str]) -> str:
 
 
 def require_few_waypoints(count: int) -> None:
-    """Raise `RouteError` for more than `MAX_WAYPOINTS`; readers ask before they make them."""
     if count > MAX_WAYPOINTS:
         raise RouteError(
             f"route has at least {count:,} waypoints, at most {MAX_WAYPOINTS:,} are read; "
@@ -44,12 +39,9 @@ def require_few_waypoints(count: int) -> None:
 
 @dataclass(frozen=True)
 class Height:
-    """Height of a waypoint.
-
-    `height_m`: metres above the reference. `frame`: the reference, "agl" (terrain below the
-    waypoint), "home" (terrain at the take-off position), "amsl" (mean sea level), "hae" (the WGS 84
-    ellipsoid), or None if the file does not state it.
-    """
+    """Height of a waypoint. `height_m`: metres above the reference. `frame`: the reference, "agl"
+    (terrain below the waypoint), "home" (terrain at the take-off position), "amsl" (mean sea
+    level), "hae" (the WGS 84 ellipsoid), or None if the file does not state it."""
 
     height_m: float
     frame: HeightFrame | None = None
@@ -67,23 +59,18 @@ class Height:
 
 @dataclass(frozen=True)
 class Route:
-    """Waypoints joined by straight legs; raises `RouteError` if invalid.
-
-    Leg i goes from waypoint i to waypoint i + 1; a route of one waypoint has one leg of length 0.
-
-    - `waypoints`: `(lat_deg, lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360.
-    - `heights`: one per waypoint, None if unknown; empty if the file has none.
-    - `leg_bands_m`: full width of the search band per leg in metres, None for the default; empty
-      if the file has none.
-    - `name`: name of the line in its file, None if it has none.
-    - `home_amsl_m`: height of the take-off position above mean sea level, metres, None if unknown.
-    - `left_out`: what of the file has a position and is not part of the route, by name.
-    """
+    """Waypoints joined by straight legs; raises `RouteError` if invalid. Leg i goes from waypoint i
+    to waypoint i + 1; a route of one waypoint has one leg of length 0. `waypoints`: `(lat_deg,
+    lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360. `heights`: one per waypoint, None if
+    unknown; empty if the file has none. `leg_bands_m`: full width of the search band per leg in
+    metres, None for the default; empty if the file has none. `home_amsl_m`: height of the take-off
+    position above mean sea level, metres, None if unknown. `left_out`: what of the file has a
+    position and is not part of the route, by name."""
 
     waypoints: tuple[tuple[float, float], ...]
     heights: tuple[Height | None, ...] = ()
     leg_bands_m: tuple[float | None, ...] = ()
-    name: str | None = None
+    name: str | None = None  # name of the line in its file, None if it has none
     home_amsl_m: float | None = None
     left_out: tuple[str, ...] = ()
 
@@ -129,7 +116,6 @@ class Route:
 
     @property
     def legs(self) -> int:
-        """Number of legs, at least one."""
         return max(1, len(self.waypoints) - 1)
 
     def points_en_m(self, frame: LocalFrame) -> NDArray[np.float64]:
@@ -138,10 +124,8 @@ class Route:
         return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
 
     def bands_m(self, default_m: float | None) -> tuple[float, ...] | None:
-        """Width of the search band of each leg, `default_m` for legs without one.
-
-        None if a leg has none and there is no default.
-        """
+        """Width of the search band of each leg, `default_m` for legs without one. None if a leg has
+        none and there is no default."""
         if not self.leg_bands_m:
             return None if default_m is None else (default_m,) * self.legs
         bands = [default_m if band is None else band for band in self.leg_bands_m]
@@ -149,7 +133,6 @@ class Route:
         return known if len(known) == len(bands) else None
 
     def part(self, first: int, last: int, name: str | None = None) -> "Route":
-        """The legs from waypoint `first` to waypoint `last`, both included."""
         return Route(
             self.waypoints[first : last + 1],
             self.heights[first : last + 1],
@@ -160,21 +143,18 @@ class Route:
 
 
 def number(value: Any, what: str) -> float:
-    """A finite JSON number. Raises `RouteError` for anything else, as `"12"` or true."""
     if type(value) not in (int, float) or not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {value!r:.80}")
     return float(value)
 
 
 def number_or_none(value: Any, what: str) -> float | None:
-    """As `number`; None for null, NaN and missing values."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return None
     return number(value, what)
 
 
 def parsed(text: str, what: str) -> float:
-    """The finite number in a text. Raises `RouteError`, also for NaN and infinity."""
     try:
         value = float(text)
     except ValueError as error:
@@ -194,7 +174,6 @@ def numbers_in(text: str) -> list[float]:
 
 
 def decoded(data: bytes) -> str:
-    """Text of UTF-8 bytes, with or without a byte order mark. Raises `RouteError`."""
     if not data.strip():
         raise RouteError("route file is empty")
     try:
@@ -206,7 +185,6 @@ def decoded(data: bytes) -> str:
 
 
 def json_object(data: bytes) -> dict[str, Any]:
-    """The object of a JSON document. Raises `RouteError`."""
     try:
         plain = json.loads(decoded(data))
     except (json.JSONDecodeError, RecursionError) as error:
