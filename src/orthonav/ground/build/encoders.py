@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -139,6 +140,8 @@ def learn_encoder(
         )
         return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
     needed("torch", "train", "learning a network")
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        raise VariantError("a network is trained by one process: run the command without torchrun")
     training = importlib.import_module("orthonav.research.training")
     device = None if learning.device == "auto" else learning.device
     how: dict[str, Any] = {
