@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -130,6 +131,8 @@ def learn_encoder(
         )
         return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
     needed("torch", "train", "learning a network")
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        raise VariantError("a network is trained by one process: run the command without torchrun")
     training = importlib.import_module("orthonav.research.training")
     device = None if request.device == "auto" else request.device
     how: dict[str, Any] = {
