@@ -72,7 +72,6 @@ def test_the_demo_may_be_repeated_but_replaces_nothing_else(
     small_demo, tmp_path, capsys, names_in, monkeypatch
 ):
     monkeypatch.setattr(demo, "SPACING_M", 240.0)
-    monkeypatch.setattr(demo, "_checked", lambda folder, *_: str((folder / "check").mkdir()))
     out = tmp_path / "demo"
     out.mkdir()
     (out / "mine").write_text("mine")

@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from orthonav.cli import COMMANDS, UNITS, _parser, main
+from orthonav.cli import COMMANDS, _parser, main
 
 DIFFERENT_METAVARS = {"--out"}
 """The metavar of an output names what each command writes."""
@@ -49,21 +49,6 @@ def test_an_option_takes_the_same_value_in_all_commands():
         for command, action in OPTIONS[option]:
             values.setdefault(value_of(option, action), []).append(command)
         assert len(values) == 1, (option, values)
-
-
-def test_a_unit_in_the_name_is_the_metavar():
-    for option, uses in OPTIONS.items():
-        unit = option.rpartition("-")[2]
-        for command, action in uses:
-            if unit in UNITS and action.nargs is None and action.type in (int, float):
-                assert action.metavar == unit.upper(), (option, command)
-
-
-@pytest.mark.parametrize("command, parser", ALL, ids=[name for name, _ in ALL])
-def test_commands_with_many_options_show_the_everyday_ones_first(command, parser):
-    own = [action for action in parser._actions if action.option_strings]
-    help_all = next(action for action in own if "--help-all" in action.option_strings)
-    assert len(own) <= 16 or help_all.help != argparse.SUPPRESS
 
 
 @pytest.mark.parametrize("line", ["info", "demo", "atlas", "atlas info", "sign", "fly"])

@@ -20,13 +20,6 @@ def test_the_version_is_one():
     assert PROJECT["version"] == CITATION["version"] == __version__
 
 
-def test_the_paper_is_cited_with_its_authors():
-    (paper,) = CITATION["references"]
-    names = [author["family-names"] for author in paper["authors"]]
-    assert names[0] == "Di Piazza" and len(names) == 6
-    assert "2404.06207" in paper["url"]
-
-
 def test_the_page_of_the_package_index_has_no_relative_link():
     text = (ROOT / PROJECT["readme"]).read_text("utf-8")
     links = re.findall(r"\]\(([^)]+)\)", text)

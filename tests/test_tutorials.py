@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from console import ELIDED, NOT_RUN, check_page, is_as_shown, masked, read_steps, run_steps
+from console import check_page, read_steps
 
 from orthonav.cli import _parser
 
@@ -45,10 +45,6 @@ def called(page):
         for command in step.commands
         for words in calls(command)
     ]
-
-
-def test_there_is_a_tutorial_for_each_kind_of_user():
-    assert [page.stem for page in PAGES] == ["integrator", "operator", "researcher"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -117,59 +113,3 @@ def textured_grey():
 def test_every_tutorial_runs_and_prints_what_it_shows(page, tmp_path):
     steps = [step for step in read_steps(page.read_text("utf-8")) if step.is_run]
     assert check_page(page, tmp_path / "tutorial", steps) == []
-
-
-def test_steps_of_a_page():
-    page = [
-        "a",
-        "```bash",
-        "one \\",
-        "    two | three > file",
-        "four",
-        "```",
-        "",
-        "```text",
-        "out",
-        "```",
-    ]
-    page += ["b", "```bash", "silent", "```", "text", "```text", "no output", "```"]
-    page += [NOT_RUN, "", "```bash", "five & six", "```"]
-    first, second, third = read_steps("\n".join(page))
-    assert first.commands == ("one \\\n    two | three > file", "four")
-    assert (first.shown, page[first.first : first.end], first.is_run) == (("out",), ["out"], True)
-    assert (second.command, second.shown, second.is_run) == ("silent", (), True)
-    assert (third.command, third.is_run) == ("five & six", False)
-    assert list(calls(first.commands[0])) == [["one", "two"], ["three"]]
-    assert list(calls(third.command)) == [["five"], ["six"]]
-
-
-def test_a_block_holds_a_command():
-    with pytest.raises(ValueError, match="line 1: a block without a command"):
-        read_steps("```bash\n\n```")
-
-
-@pytest.mark.parametrize(
-    "shown, printed, is_same",
-    [
-        (["a  1.5 m"], ["a 22 m"], True),
-        (["a 1"], ["b 1"], False),
-        (["a", ELIDED], ["a", "b", "c"], True),
-        ([ELIDED, "c"], ["a", "b", "c"], True),
-        ([ELIDED, "c"], ["c", "b"], False),
-        (["a" + " " + ELIDED], ["a and more"], True),
-        ([], ["a"], False),
-    ],
-)
-def test_what_is_printed_is_as_shown(shown, printed, is_same):
-    assert is_as_shown(tuple(shown), tuple(printed)) is is_same
-
-
-def test_numbers_are_not_compared():
-    assert masked("  -1,234.5 m   of 2") == "# m of #"
-
-
-def test_steps_run_in_one_shell(tmp_path):
-    steps = read_steps("```bash\nname=x\necho $name > f; cat f\n```\n\n```bash\nprintf end\n```")
-    assert [printed.lines for printed in run_steps(steps, tmp_path)] == [("x",), ("end",)]
-    with pytest.raises(RuntimeError, match="'false' ended with 1"):
-        run_steps(read_steps("```bash\nfalse\ntrue\n```"), tmp_path)

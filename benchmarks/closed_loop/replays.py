@@ -24,11 +24,19 @@ from benchmarks.record import Section, Table, number, quantiles, say
 from benchmarks.scenes import DATA, PAST, PRESENT, map_of
 from orthonav.cli.demo import IMAGERY
 from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.records import (
+    CONFIDENT,
+    Fix,
+    NoFix,
+    Prior,
+    Telemetry,
+    View,
+    ViewResult,
+    error_ellipse,
+)
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
 from orthonav.onboard.messages.estimate import Clock, estimate_from_result

@@ -348,7 +348,7 @@ def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names
     def full(*arguments, **named):
         raise SafetensorError("I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr("orthonav.core.mapfile.writer.save_file", full)
+    monkeypatch.setattr("orthonav.core.mapfile.reader.save_file", full)
     with pytest.raises(OutputError, match="disk full"):
         cut_map(Atlas.open(str(folder)), tmp_path / "o.onav", area_around(middle, 60), workers=1)
     assert names_in(tmp_path) == []

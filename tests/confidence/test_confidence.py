@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
 from orthonav.core.localize.confidence import TILE_FEATURES, USUAL_TILES, LogisticConfidence
@@ -81,12 +79,6 @@ def test_few_trials_move_the_usual_confidence_and_without_any_nothing_is_confide
     few = fit_few(features, np.arange(20) < 8, weight, usual)
     assert wrong(evidence) < few(evidence)
     assert none({"score": 1.0, "margin": 1.0}) < 0.2
-
-
-@given(st.floats(-50, 50), st.tuples(st.floats(0, 50), st.floats(0, 50)))
-def test_plain_round_trip(bias, weights):
-    model = LogisticConfidence(bias, weights)
-    assert LogisticConfidence.from_plain(model.to_plain()) == model
 
 
 @pytest.mark.parametrize(

@@ -57,17 +57,6 @@ def test_better_evidence_never_lowers_it(plain, gain):
             assert MODEL({**plain, name: gain * plain[name]}) >= MODEL(plain) - 1e-12
 
 
-@given(
-    st.tuples(*[st.floats(-50, 50)] * 2),
-    st.tuples(*[st.floats(0, 50)] * len(FEATURES)),
-    st.tuples(*[st.floats(1e-3, 1e4)] * 3),
-)
-def test_plain_round_trip(biases, weights, chances):
-    model = RegisteredConfidence(biases, weights, Chances(*chances))
-    again = RegisteredConfidence.from_plain(json.loads(json.dumps(model.to_plain())))
-    assert again == model and again(evidence()) == model(evidence())
-
-
 def test_a_search_that_was_cut_short_is_not_confident():
     model = RegisteredConfidence.usual(Chances(32.0, 15.0, 48.0))
     clear = evidence(strength=200.0, look=90.0)

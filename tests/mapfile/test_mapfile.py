@@ -350,7 +350,7 @@ def test_huge_shapes_take_no_memory(path):
         refused(path, "truncated")
 
 
-@pytest.mark.parametrize("fails", ["orthonav.core.mapfile.writer.save_file", "os.fsync"])
+@pytest.mark.parametrize("fails", ["orthonav.core.mapfile.reader.save_file", "os.fsync"])
 @pytest.mark.parametrize("old", [True, False])
 def test_a_full_disk_keeps_the_old_map(path, content, monkeypatch, fails, old):
     if not old:

@@ -313,7 +313,7 @@ def test_a_map_that_replaces_the_checked_one_is_not_used(command, path, keys, ru
 
     monkeypatch.setattr(signature, "require_signature", check)
     monkeypatch.setattr(localize, "open_source", lambda *asked: None)  # read before the map
-    monkeypatch.setattr(localize, "take_flown", lambda *asked: None)
+    monkeypatch.setattr(localize, "_take_flown", lambda *asked: None)
     done = run(
         *{
             "verify": ("verify", path, "--public-key", public),

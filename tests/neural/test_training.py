@@ -211,14 +211,6 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
     assert not np.array_equal(first, other)
 
 
-def test_the_callers_random_state_is_unchanged():
-    torch.manual_seed(5)
-    wanted = torch.rand(3)
-    torch.manual_seed(5)
-    learn(dataclasses.replace(AUTO, epochs=1))
-    torch.testing.assert_close(torch.rand(3), wanted)
-
-
 def test_pictures_show_the_progress(tmp_path):
     learn(AUTO, tmp_path)
     tiles = cv2.imread(str(tmp_path / "tiles.png"), cv2.IMREAD_GRAYSCALE)
@@ -296,26 +288,6 @@ def test_a_loss_that_is_not_finite_ends_the_training():
 def test_triplets_need_positives():
     with pytest.raises(ValueError, match="positives"):
         learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
-
-
-@pytest.mark.parametrize(
-    "able, wanted",
-    [({"avx512_bf16": True}, True), ({"amx_bf16": True}, True), ({"avx512_bf16": False}, False)],
-)
-def test_bfloat16_is_used_where_the_processor_has_it(able, wanted, monkeypatch):
-    cpu = torch.device("cpu")
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
-    bf16 = torch.bfloat16
-    assert training.mixed_precision(Means(), cpu) is (bf16 if wanted else None)
-    assert training.mixed_precision(Means(bf16=not wanted), cpu) is (None if wanted else bf16)
-    monkeypatch.delattr(torch.cpu, "get_capabilities")
-    assert training.mixed_precision(Means(), cpu) is None
-
-
-@pytest.mark.parametrize("able, wanted", [(True, torch.bfloat16), (False, torch.float16)])
-def test_a_gpu_without_bfloat16_learns_in_float16(able, wanted, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: able)
-    assert training.mixed_precision(Means(), torch.device("cuda")) is wanted
 
 
 def test_scaled_gradients_give_the_same_result(tmp_path, monkeypatch):

@@ -1035,7 +1035,7 @@ def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(fl
 
 def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_stdout(flown, run):
     path, folder, _, _ = flown
-    command = ("fly", path, folder, "--recorded-telemetry", "--dry-run", "--pace", "10")
+    command = ("fly", path, folder, "--recorded-telemetry", "--dry-run", "--pace", "3")
     done = run(*command, "--jsonl", "-", "--deadline-ms", "60000")
     views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
     assert done.code == 0 and views

@@ -12,12 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from orthonav.core.flight.telemetry_track import RecordedTrack, Samples, attitude_of_angles
 from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.onboard import telemetry
-from orthonav.onboard.telemetry import (
-    ClockSync,
-    TelemetryBuffer,
-    VehicleState,
-    wxyz_of_angles,
-)
+from orthonav.onboard.telemetry import ClockSync, TelemetryBuffer, VehicleState, wxyz_of_angles
 
 ANGLES = st.tuples(st.floats(-40, 40), st.floats(-40, 40), st.floats(-180, 180))
 

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.geo.ellipse import error_ellipse
-from orthonav.core.records import MAP_STD_M
+from orthonav.core.records import MAP_STD_M, error_ellipse
 from orthonav.onboard.messages.estimate import (
     AT_STD_M,
     FilterCovariance,

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.geo.ellipse import error_ellipse
-from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.core.records import Fix, NoFix, ViewResult, error_ellipse
 from orthonav.ground.recordings.pixel import ellipse_95
 from orthonav.onboard.messages.estimate import (
     Clock,

@@ -196,12 +196,7 @@ def test_the_rate_limit_works_after_a_clock_was_set_back() -> None:
 
 
 @pytest.mark.parametrize(
-    "rules",
-    [
-        {"max_std_m": 0.0},
-        {"min_interval_s": {"A": 0.0}},
-        {"min_confidence": 1.1},
-    ],
+    "rules", [{"max_std_m": 0.0}, {"min_interval_s": {"A": 0.0}}, {"min_confidence": 1.1}]
 )
 def test_invalid_rules_are_refused(rules: dict) -> None:
     with pytest.raises(EstimateError):

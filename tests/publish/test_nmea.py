@@ -44,10 +44,7 @@ def read(sentence: bytes) -> pynmeagps.NMEAMessage:
 @pytest.mark.parametrize(
     ("made", "golden"),
     [
-        (
-            gga(ESTIMATE),
-            b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,6,00,,134.6,M,,,,*3E\r\n",
-        ),
+        (gga(ESTIMATE), b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,6,00,,134.6,M,,,,*3E\r\n"),
         (
             gga(ESTIMATE, quality=Quality.AUTONOMOUS),
             b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,1,00,,134.6,M,,,,*39\r\n",

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.cli.setups import setup_text
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
@@ -16,6 +15,7 @@ from orthonav.ground.recordings.setups import (
     Setup,
     Tried,
     mirrored_camera,
+    setup_text,
     try_setups,
 )
 

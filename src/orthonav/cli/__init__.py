@@ -116,7 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
             return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
-        options = _parse(arguments)
+        options = parse(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _print_any_letter()
         with _terminable():
             require_extras(options.command)
-            status: int | None = _module(options.command).run(options)
+            status: int | None = module_of(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
         _failed(_with_options(_one_line(error), options), verbose)
@@ -179,7 +179,7 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _parse(arguments: list[str]) -> argparse.Namespace:
+def parse(arguments: list[str]) -> argparse.Namespace:
     """The options; without a command it prints the help, and wrong ones end with exit code 2."""
     parser = _parser(arguments)
     options, unknown = parser.parse_known_args(arguments or ["--help"])
@@ -223,7 +223,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(name, description=text, parents=[common], allow_abbrev=False)
         command.set_defaults(command_error=command.error)
         if name in arguments:
-            module = _module(name)
+            module = module_of(name)
             module.add(command)
             example = next(group[name][1] for group in GROUPS.values() if name in group)
             notes = (command.epilog, f"example: orthonav {name} {example}".rstrip())
@@ -282,7 +282,7 @@ def _add_help_all(
     command.epilog = f"{command.epilog}; {more}" if command.epilog else more
 
 
-def _module(command: str) -> ModuleType:
+def module_of(command: str) -> ModuleType:
     # "import" is a word of Python's own.
     name = "import_" if command == "import" else command.replace("-", "_")
     return importlib.import_module(f"orthonav.cli.{name}")

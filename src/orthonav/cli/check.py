@@ -119,8 +119,6 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
         "predicts fewer fixes",
     )
     _add_number(group, "--speed-mps", 20.0, "ground speed")
-    said = "error of dead reckoning per metre flown without a fix"
-    _add_number(group, "--drift", 0.03, said, "FRACTION")
 
 
 def _add_number(
@@ -209,7 +207,6 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         prior_std_m=None if options.prior == "none" else options.prior_std_m,
         accept=_accepted(options.accept),
         speed_mps=options.speed_mps,
-        drift=options.drift,
         relief_m=options.relief_m,
         effort=options.effort,
         extras=not options.quick,

@@ -1,6 +1,8 @@
 """`orthonav demo`: build, check, fly, localize and report, over two orthophotos of the package."""
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import shlex
@@ -8,13 +10,9 @@ import shutil
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from orthonav.cli.common import Progress, print_json, progress
-from orthonav.cli.simulate import HORIZON_STD_DEG, MOUNT_STD_DEG
-
-if TYPE_CHECKING:
-    from orthonav.ground.evaluate.metrics import Metrics
+from orthonav.cli.common import print_json
 
 IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
 """Two dates of a generated area of 2 x 2 km; `lab/demo_imagery.py` makes them."""
@@ -24,8 +22,6 @@ HEIGHT_M = 270.0
 """Views then cover 346 x 259 m, a whole tile of 256 m."""
 SPACING_M = 24.0
 """About 220 views along the route."""
-RADIUS_M = 15.0
-"""Error below which a fix is correct, as in the paper (accuracy at 15 m)."""
 CHECKED_BAND_M = 300.0
 CHECK_EFFORT = 0.5
 """Half of the trials of a full check, to keep the demo short."""
@@ -57,14 +53,14 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.core.files import replacing_folder
 
     start = time.perf_counter()
-    with progress(options) as shown, replacing_folder(options.out, _is_earlier_demo) as folder:
-        plain, text = _demo(folder, options, shown)
+    with replacing_folder(options.out, _is_earlier_demo) as folder:
+        plain, text = _demo(folder, options)
         plain["made_by"] = "orthonav demo"
         (folder / MARKER).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     if options.json:
         print_json(plain)
         return
-    print(f"{text}\n\ndone in {time.perf_counter() - start:.0f} s")
+    print(f"{text}\ndone in {time.perf_counter() - start:.0f} s")
     print(_how_to_view(options.out))
 
 
@@ -105,122 +101,48 @@ def _is_earlier_demo(out: Path) -> bool:
     return made and all(name in known or name.endswith(".tif") for name in names)
 
 
-def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[dict[str, Any], str]:
-    from orthonav.cli.evaluate import map_background
-    from orthonav.cli.info import recipe_text, summary, summary_text
-    from orthonav.core.flight import open_flight, read_truth
-    from orthonav.core.flight.fixes import Identity, flight_digest, write_results
-    from orthonav.core.localize import Localizer
+def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    """Run the commands in the folder; the metrics, and what the commands printed about them."""
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.build import BuildRequest, build_map
-    from orthonav.ground.evaluate.metrics import compare, measure
-    from orthonav.ground.evaluate.report import MadeFrom, write_report
-    from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, table, verdict
-    from orthonav.ground.planning.route import read_route
-    from orthonav.ground.recordings.localize import localize_flight
-    from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-    from orthonav.onboard.run import SingleViews
 
-    past, present = (Path(shutil.copy(path, folder)) for path in sorted(IMAGERY.glob("*.tif")))
-    _say(options, f"1/4 building the map from {past.name}")
-    map_path = folder / "area.onav"
-    built = build_map(BuildRequest([past], map_path), shown)
-    opened = open_map(map_path)
-    frame = opened.manifest.sheets[0].frame
-    route = folder / "route.geojson"
-    _write_route(route, frame.latlon_from_en(WAYPOINTS_EN_M))
-    _say(options, f"2/4 checking from {past.name} alone where along the route fixes are expected")
-    checked = _checked(folder, map_path, route, shown)
-    _say(
-        options,
-        f"3/4 simulating a flight over {present.name}, heading error 5 deg, height error 5 %, "
-        "unreported tilt of mount and horizon 1 deg each",
-    )
-    request = SimulateRequest(
-        [present],
-        folder / "flight",
-        route=read_route(route),
-        agl_m=HEIGHT_M,
-        spacing_m=SPACING_M,
-        errors=Errors(
-            yaw_std_deg=5.0,
-            agl_std=0.05,
-            mount_std_deg=MOUNT_STD_DEG,
-            horizon_std_deg=HORIZON_STD_DEG,
-        ),
-        seed=options.seed,
-    )
-    simulate_flight(request, lambda share: shown("simulate", share))
-    _say(options, "4/4 localizing every view, searching the whole map")
-    results = []
-    flight = open_flight(request.out)
-    for result in localize_flight(SingleViews(Localizer(opened), use_prior=False), flight):
-        results.append(result)
-        shown("localize", len(results) / len(flight.views))
-    identity = Identity(opened.manifest.sha256, flight_digest(flight.views))
-    write_results(folder / "fixes.jsonl", results, identity)
-    comparison = compare(read_truth(request.out / "truth.csv"), results, frame)
-    metrics = measure(comparison, RADIUS_M)
-    shown_flight = FlightReport("demo", comparison, metrics, map_background(opened))
-    about = summary(built.manifest, built.size_bytes, Path(map_path.name))
-    made_from = MadeFrom(
-        map_name=map_path.name,
-        recipe=recipe_text(about["recipe"]),
-        flight=f"{len(results)} views of {present.name}",
-        command="orthonav demo",
-        version=str(about["created_by"]),
-    )
-    write_report(folder / "report", [shown_flight], made_from)
-    lines = [summary_text(about), "", f"check      {checked}", ""]
-    lines += [verdict(metrics), "", table([shown_flight], metrics), "", *_criteria_lines(metrics)]
-    return metrics_to_json(metrics), "\n".join(lines)
+    past, present = (shutil.copy(path, folder) for path in sorted(IMAGERY.glob("*.tif")))
+    with contextlib.chdir(folder):
+        past, present = Path(past).name, Path(present).name
+        _say(options, f"1/4 building the map from {past}")
+        built = _run(options, "build", "--ortho", past, "--out", "area.onav")
+        frame = open_map(Path("area.onav")).manifest.sheets[0].frame
+        _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
+        flown = ("--route", "route.geojson", "--agl-m", HEIGHT_M)
+        _say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
+        trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT, "--quick")
+        checked = _run(options, "check", "area.onav", *flown, *trials, "--out", "check")
+        _say(
+            options,
+            f"3/4 simulating a flight over {present}, heading error 5 deg, height error 5 %, "
+            "unreported tilt of mount and horizon 1 deg each",
+        )
+        errors = ("--yaw-std-deg", 5, "--agl-std", 0.05, "--seed", options.seed)
+        spaced = ("--spacing-m", SPACING_M, "--out", "flight")
+        _run(options, "simulate", "--ortho", present, *flown, *errors, *spaced)
+        _say(options, "4/4 localizing every view, searching the whole map")
+        searched = ("--prior", "none", "--no-diagnosis", "--out", "fixes.jsonl")
+        _run(options, "localize", "area.onav", "flight", *searched)
+        reported = ("--map", "area.onav", "--report", "report", "--metrics", MARKER)
+        measured = _run(options, "evaluate", "fixes.jsonl", "--flight", "flight", *reported)
+        plain = json.loads(Path(MARKER).read_text(encoding="utf-8"))
+    verdict = checked.partition("\n")[0]
+    return plain, f"{built}\ncheck      {verdict}\n\n{measured.rpartition('report: ')[0]}"
 
 
-def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
-    """The prediction for the route in one line; writes the report of the check to `check`."""
-    from orthonav import __version__
-    from orthonav.cli.info import imagery_text, recipe_text
-    from orthonav.core.mapfile import open_map
-    from orthonav.ground.check.outcome import CheckedInputs
-    from orthonav.ground.check.request import CheckRequest
-    from orthonav.ground.check.run import check_map
-    from orthonav.ground.check.write import write_check
-    from orthonav.ground.planning.route import read_route
+def _run(options: argparse.Namespace, *words: object) -> str:
+    """Run another command; returns what it printed."""
+    from orthonav import cli
 
-    manifest = open_map(map_path).manifest
-    request = CheckRequest(
-        map_path,
-        route=read_route(route),
-        band_m=CHECKED_BAND_M,
-        agl_m=HEIGHT_M,
-        effort=CHECK_EFFORT,
-        extras=False,
-        about=CheckedInputs(
-            map_path.name,
-            imagery_text(manifest.imagery),
-            recipe_text(manifest.recipe),
-            route_name="demo",
-            command="orthonav demo",
-            version=__version__,
-        ),
-    )
-    result, opened = check_map(request, shown)
-    write_check(result, opened, folder / "check")
-    assert result.along is not None
-    mean, word = float(result.along.probability.mean()), result.verdict.word.value
-    return (
-        f"{word}: {mean:.0%} of views along the route are expected to give a correct, confident fix"
-    )
-
-
-def _criteria_lines(metrics: "Metrics") -> list[str]:
-    """Accepted share and accuracy at each confidence threshold."""
-    return [
-        f"confidence >= {row.threshold:g}: {row.share_accepted:.0%} of views accepted, "
-        f"{row.accuracy:.1%} of them within {metrics.radius_m:g} m"
-        for row in metrics.criteria
-        if row.name == "confidence" and row.share_accepted > 0
-    ]
+    quiet = ["--quiet"] if options.quiet else []
+    parsed = cli.parse([*map(str, words), *quiet])
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        cli.module_of(parsed.command).run(parsed)
+    return printed.getvalue()
 
 
 def _write_route(path: Path, latlon_deg: Any) -> None:

@@ -43,12 +43,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
     )
     parser.add_argument(
-        "--rpe-distance-m",
-        type=float,
-        default=100.0,
-        help="distance of the relative pose error (default 100)",
-    )
-    parser.add_argument(
         "--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file"
     )
     parser.add_argument(
@@ -120,10 +114,8 @@ def _check_options(options: argparse.Namespace) -> None:
         options.wrong_usage(
             "give --flight FLIGHT_DIR, whose truth.csv is used, or --truth truth.csv"
         )
-    for option in ("radius_m", "rpe_distance_m"):
-        value = getattr(options, option)
-        if not 0 < value < 1e7:
-            raise FlightError(f"--{option.replace('_', '-')} must be above 0, got {value}")
+    if not 0 < options.radius_m < 1e7:
+        raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
     if options.report:
         require_extras("evaluate --report")
     if options.report_changes and not (options.map and options.flight):
@@ -182,7 +174,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         worst: tuple[Row, ...] = ()
         if sheet and folders and options.report:
             worst = tuple(worst_rows(comparison, results, folders[i], sheet))
-        metrics = measure(comparison, options.radius_m, rpe_distance_m=options.rpe_distance_m)
+        metrics = measure(comparison, options.radius_m)
         flights.append(
             FlightReport(
                 _names(options.fixes)[i],

@@ -38,12 +38,7 @@ from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases, Resumed
-from orthonav.onboard.gnss.watch import (
-    GnssSource,
-    GnssWatch,
-    LiveSolutions,
-    RecordedSolutions,
-)
+from orthonav.onboard.gnss.watch import GnssSource, GnssWatch, LiveSolutions, RecordedSolutions
 from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
@@ -305,10 +300,7 @@ def _publisher(
         interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
     _warn_of_a_low_rate(options)
     rules = GateRules(
-        least,
-        options.max_std_m,
-        min_interval_s=interval,
-        send_coasting=options.send_coasting,
+        least, options.max_std_m, min_interval_s=interval, send_coasting=options.send_coasting
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
     chosen = MessageOptions(

@@ -27,7 +27,7 @@ from orthonav.cli.common import (
 )
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
-from orthonav.cli.setups import Counts, SetupAdvice
+from orthonav.cli.setups import SetupAdvice
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
@@ -62,12 +62,6 @@ EVERYDAY = (
 
 log = logging.getLogger(__name__)
 
-_CHOICES = {
-    "heading": ("known", "unknown"),
-    "prior": ("telemetry", "none"),
-    "registration": ("on", "off"),
-    "position": ("peak", "best", "neighbours", "weighted"),
-}
 _HINTS = (
     ("yaw_deg", "give --heading unknown"),
     ("agl_m", "give --agl-m"),
@@ -218,6 +212,7 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
+    from orthonav.ground.recordings.flightlog import compare_with_flight
     from orthonav.ground.recordings.localize import smoothed_track
     from orthonav.onboard.run import Locator, MountCorrected, SingleViews, model_of
 
@@ -255,7 +250,7 @@ def _on_map(options: argparse.Namespace) -> None:
         if tracker is not None and options.smooth:
             results = smoothed_track(tracker, results, accept)
         else:
-            _compare_with_flight(flight, results)
+            compare_with_flight(flight, results)
         _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
@@ -382,6 +377,7 @@ def _print_summary(
     import numpy as np
 
     from orthonav.core.files import is_stdout
+    from orthonav.ground.recordings.setups import Counts
 
     counts = Counts.of(results)
     latencies = np.array([result.latency_ms for result in results])
@@ -431,6 +427,7 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
     from orthonav.core.errors import FlightError
     from orthonav.core.flight.mount import read_mount
     from orthonav.ground.recordings import LoggedFlight
+    from orthonav.ground.recordings.flightlog import LOCALIZE_CHOICES, logged_options
 
     mount: Mount | None = read_mount(options.mount) if options.mount else None
     if not isinstance(flight, LoggedFlight):
@@ -438,8 +435,10 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
             raise FlightError(f"--as-flown needs a flight log: {flight.path}")
         return mount
     _check_map(options, flight.session.get("map"))
-    flown = _logged_options(flight.session.get("options"))
-    chosen: dict[str, Any] = {name: getattr(options, name) for name in (*_CHOICES, "accept")}
+    flown = logged_options(flight.session.get("options"))
+    chosen: dict[str, Any] = {
+        name: getattr(options, name) for name in (*LOCALIZE_CHOICES, "accept")
+    }
     chosen["track"] = options.track or options.smooth
     chosen["mount"] = mount
     if flown.get("accept") is None:  # the runner logs every fix, so the default applies
@@ -447,7 +446,7 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
         chosen.pop("accept")
     differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
     if options.as_flown:
-        for name in (*_CHOICES, "accept", "track"):
+        for name in (*LOCALIZE_CHOICES, "accept", "track"):
             setattr(options, name, flown.get(name, getattr(options, name)))
         options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
         return flown.get("mount", mount)
@@ -459,31 +458,6 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
     return mount
 
 
-def _compare_with_flight(flight: "Recording", results: Sequence["ViewResult"]) -> None:
-    """Log how many results of a replay differ from those of the flight."""
-    from orthonav.ground.recordings import LoggedFlight
-
-    if not isinstance(flight, LoggedFlight):
-        return
-    logged = {result.frame: _comparable(result) for result in flight.results()}
-    both = [result for result in results if result.frame in logged]
-    other = [result.frame for result in both if logged[result.frame] != _comparable(result)]
-    if other:
-        counts = len(other), len(both), other[0]
-        log.warning("%d of %d results differ from those of the flight, first: %s", *counts)
-    else:
-        log.info("all %d results equal those of the flight", len(both))
-
-
-def _comparable(result: "ViewResult") -> str:
-    """A result as text, without its latency."""
-    from dataclasses import replace
-
-    from orthonav.core.flight.fixes import result_to_json
-
-    return result_to_json(replace(result, latency_ms=0.0))
-
-
 def _check_map(options: argparse.Namespace, logged: Any) -> None:
     from orthonav.core.mapfile.signature import map_digest
 
@@ -492,29 +466,6 @@ def _check_map(options: argparse.Namespace, logged: Any) -> None:
         log.warning(
             "the log was flown with another map (%.80s): %s", logged.get("name"), options.map
         )
-
-
-def _logged_options(logged: Any) -> dict[str, Any]:
-    """Options of a log, validated: a log is untrusted input."""
-    from orthonav.core.errors import FlightError
-    from orthonav.core.flight.mount import logged_mount
-
-    if not isinstance(logged, dict):
-        return {}
-    found: dict[str, Any] = {}
-    for name, choices in _CHOICES.items():
-        if name in logged:
-            if logged[name] not in choices:
-                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
-            found[name] = logged[name]
-    for name, kinds in (("accept", str | None), ("track", bool)):
-        if name in logged:
-            if not isinstance(logged[name], kinds):
-                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
-            found[name] = logged[name]
-    if "mount" in logged:
-        found["mount"] = logged_mount(logged)
-    return found
 
 
 def _check_destination(options: argparse.Namespace) -> None:

@@ -1,11 +1,9 @@
-"""Counts of a run, and what to check where few of its views are confident."""
+"""What to check where few views of a run are confident."""
 
 import argparse
 import math
 import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.build import reporter
@@ -23,50 +21,12 @@ if TYPE_CHECKING:
 
 BUDGET_S = 15.0
 """After so long no further view is localized: the search for the cause takes at most 20 s."""
-_SCATTERED_DEG = 20.0
-"""Headings that differ by a constant scatter less about it: compasses err by some degrees."""
 
 
 _SILENT = (
     "no fix states the criterion {criterion}, so none can be confident; build the map from a "
     "larger or more varied area, or give --accept peak_ratio:1.3"
 )
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Views of a run by what is known of their positions."""
-
-    views: int
-    confident: int
-    low: int
-    none: int
-    reasons: tuple[tuple[str, int], ...] = ()
-    """Reasons of views without a position and their numbers, the most frequent first."""
-
-    @classmethod
-    def of(cls, results: "Sequence[ViewResult]") -> "Counts":
-        from orthonav.core.records import Fix, NoFix
-
-        reasons = Counter(
-            each.outcome.reason for each in results if isinstance(each.outcome, NoFix)
-        )
-        fixes = sum(isinstance(result.outcome, Fix) for result in results)
-        confident = sum(result.is_confident for result in results)
-        return cls(
-            len(results),
-            confident,
-            fixes - confident,
-            len(results) - fixes,
-            tuple(reasons.most_common()),
-        )
-
-    @property
-    def few(self) -> bool:
-        """Whether so few views are confident that the configuration may be wrong."""
-        from orthonav.ground.recordings.setups import FEW
-
-        return self.confident < FEW * self.views
 
 
 class SetupAdvice:
@@ -111,6 +71,7 @@ class SetupAdvice:
         Both are empty where enough views are confident.
         """
         from orthonav.core.geo.headings import RADIANS, seem_radians
+        from orthonav.ground.recordings.setups import Counts, setup_text
 
         options, counts = self._options, Counts.of(results)
         known = options.heading == "known"
@@ -163,60 +124,3 @@ def _states(result: "ViewResult", accept: "Acceptance") -> bool:
     from dataclasses import replace
 
     return replace(accept, threshold=-math.inf).accepts(result.outcome)
-
-
-def setup_text(tried: "Sequence[Tried]", *, on_map: bool) -> list[str]:
-    """Sentences: which change makes the views confident and what to check, and what else was tried.
-
-    `on_map`: the flight recorded positions, and some of them lie on the map.
-    """
-    *failed, last = tried
-    if not last.explains:
-        names = ", ".join(each.setup.name for each in tried)
-        most = max(each.confident for each in tried)
-        where = (
-            "the recorded positions lie on the map, so check the camera, and whether the ground "
-            "changed or has no structure"
-            if on_map
-            else "no position was recorded, so check first that the map shows the area, then the "
-            "camera and the ground"
-        )
-        tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
-        return [f"no other configuration explains it ({tested}); {where}"]
-    found = f"{last.confident} of {last.views} views of low confidence become confident"
-    lines = [f"{found} {_explanation(last)}"]
-    return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
-
-
-def _listed(tried: "Iterable[Tried]") -> str:
-    return ", ".join(f"{each.setup.name} ({each.confident} of {each.views})" for each in tried)
-
-
-def _explanation(found: "Tried") -> str:
-    setup, parts, checks = found.setup, [], []
-    if setup.name == "as reported":
-        return (
-            "if localized one by one: the configuration is right, but the views do not form a track"
-        )
-    if setup.without_prior:
-        return "without the prior; check the prior positions"
-    if setup.radians:
-        return "if the headings are read as radians"
-    if setup.mirrored:
-        return "if mirrored left to right, with any heading; check where the images come from"
-    if setup.any_heading:
-        off, std = found.heading_off_deg, found.heading_std_deg
-        constant = std < _SCATTERED_DEG
-        apart = ", which differs from the reported one from view to view"
-        if constant:
-            apart = f", {off:+.0f} deg from the reported one" if round(off) else ""
-            apart += f" (standard deviation {std:.0f} deg)"
-        parts.append(f"with any heading{apart}")
-        checks.append("the heading column" + " and the mounting of the camera" * constant)
-    if setup.factor != 1.0:
-        ratio = found.height_ratio
-        parts.append(
-            f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal length)"
-        )
-        checks.append("the height column (above ground?) and the camera")
-    return f"{' and '.join(parts)}; check {' and '.join(checks)}"

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.ground import Ground
 
 CONFIDENT = 0.9  # from this confidence on: the default of publishing and reports
-
 PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outside
 DEFAULT_YAW_STD_DEG = 7.0
 """Magnetic compasses of the recorded flights are off by several degrees (docs/tracking.md)."""
@@ -26,7 +24,6 @@ DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = 3.0
 """Mounts lean by 1 to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
 RADIUS_SHARE = 0.025  # least radius of the confidence over the height: an error of 1.4 deg of tilt
-
 MAP_STD_M = 3.0  # per axis, of a displacement of the map as a whole: it never averages out
 
 Evidence = Mapping[str, float]
@@ -295,3 +292,23 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
         raise FlightError(f"the image has values of {low:g} to {high:g}; {EXPECTED}")
     scale = 255.0 if array.dtype.kind == "f" and high <= 1 else 1.0
     return np.rint(array * scale).astype(np.uint8)
+
+
+_ROUNDING = 1e-9  # negative eigenvalues up to this share of the largest are rounding errors
+
+
+def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Semi-major and semi-minor axis (1 sigma), and direction of the major one, 0..180 deg from
+    north.
+
+    NaN where the (2, 2) covariance is not finite or has a negative eigenvalue."""
+    cov = np.asarray(cov_en, dtype=np.float64)
+    if not np.isfinite(cov).all():
+        return math.nan, math.nan, math.nan
+    values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
+    if values[0] < -_ROUNDING * abs(values[1]) or values[1] < 0:
+        return math.nan, math.nan, math.nan
+    east, north = vectors[:, 1]
+    direction_deg = math.degrees(math.atan2(east, north)) % 180.0 % 180.0  # -1e-20 gives 180
+    minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
+    return major, minor, direction_deg

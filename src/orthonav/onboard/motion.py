@@ -130,11 +130,7 @@ def _tracked(before: Grey, now: Grey, corners: Corners) -> tuple[Corners, Corner
 
 
 def _motion(
-    start_px: Corners,
-    end_px: Corners,
-    camera: Camera,
-    start_ns: int,
-    end_ns: int,
+    start_px: Corners, end_px: Corners, camera: Camera, start_ns: int, end_ns: int
 ) -> ImageMotion | None:
     focal_px = math.sqrt(camera.fx_px * camera.fy_px)
     start, end = _plane(start_px, camera), _plane(end_px, camera)
@@ -263,10 +259,7 @@ def explained_share(
     `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.
     """
     varying = shift - np.median(shift / seconds[:, None], axis=0) * seconds[:, None]
-    parts = (
-        (turn[:, None], turn_off[:, None], TURN_STD_RAD),
-        (varying, shift_off, SHIFT_STD),
-    )
+    parts = ((turn[:, None], turn_off[:, None], TURN_STD_RAD), (varying, shift_off, SHIFT_STD))
     shares = []
     for seen, off, least in parts:
         seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)

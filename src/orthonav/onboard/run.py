@@ -8,11 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from orthonav.core.errors import (
-    CameraError,
-    MapChangedError,
-    MapFileError,
-)
+from orthonav.core.errors import CameraError, MapChangedError, MapFileError
 from orthonav.core.flight.mount import Mount
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.records import Fix, NoFix, Telemetry, View

@@ -1,7 +1,5 @@
-"""A sheet with its ground, level or not, and a view over it.
-
-A pose says where the middle of the view's window lies, its heading, and that the camera is
-`agl_m * exp(log_scale)` above the mean ground of that window."""
+"""A sheet with its ground, level or not, and a view over it: a pose says where the middle of its
+window lies, its heading, and that the camera is `agl_m * exp(log_scale)` above its mean ground."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor

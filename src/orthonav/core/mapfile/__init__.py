@@ -2,8 +2,7 @@
 
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import SCHEMA, GreyInfo, Manifest, SheetInfo
-from orthonav.core.mapfile.reader import MapFile, open_map
-from orthonav.core.mapfile.writer import write_map
+from orthonav.core.mapfile.reader import MapFile, open_map, write_map
 
 __all__ = [
     "SCHEMA",

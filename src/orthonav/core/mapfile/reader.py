@@ -1,9 +1,11 @@
-"""Opening a map: every byte is checked at the opening, and again whenever it is read later.
+"""Opening and writing a map; every byte is checked at the opening, and whenever it is read later.
 
 The file is not memory-mapped: a mapping of a truncated file or a failing card ends the process
 (SIGBUS). Parts are read with `pread` and compared with digests of the opening, so changes in flight
 raise `MapChangedError`."""
 
+import dataclasses
+import errno
 import hashlib
 import json
 import os
@@ -18,11 +20,12 @@ from typing import Any, Generic, TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import save_file
 
-from orthonav.core.errors import MapChangedError, MapFileError, MissingFileError
-from orthonav.core.files import require_file
+from orthonav.core.errors import MapChangedError, MapFileError, MissingFileError, OutputError
+from orthonav.core.files import replacing, require_file
 from orthonav.core.mapfile.manifest import Manifest
-from orthonav.core.mapfile.writer import METADATA_KEY
 
 MAX_HEADER_BYTES = 16 * 2**20
 MIN_FILE_BYTES = 10
@@ -388,3 +391,34 @@ class ByteCache(Generic[Key, Value]):
             self.held_bytes += self._size_of(value)
             while self.held_bytes > self._limit_bytes:
                 self.held_bytes -= self._size_of(self._values.popitem(last=False)[1])
+
+
+METADATA_KEY = "orthonav"
+
+
+def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> Manifest:
+    """The manifest with its `parts` filled in. Raises `OutputError` and leaves nothing behind."""
+    parts = {name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())}
+    described = {
+        name: {
+            "dtype": str(array.dtype),
+            "shape": list(array.shape),
+            "sha256": hashlib.sha256(array.data).hexdigest(),
+        }
+        for name, array in parts.items()
+    }
+    full = dataclasses.replace(manifest, parts=described)
+    save_tensors(path, parts, full.to_json(), "map")
+    return full
+
+
+def save_tensors(path: Path, arrays: Mapping[str, NDArray[Any]], metadata: str, what: str) -> None:
+    """Complete or not at all; raises `OutputError`, which names `what`."""
+    with replacing(path) as temporary:
+        try:
+            contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+            save_file(contiguous, temporary, metadata={METADATA_KEY: metadata})
+        except SafetensorError as error:
+            if f"os error {errno.ENOSPC}" in str(error):
+                raise OSError(errno.ENOSPC, "disk full") from error
+            raise OutputError(f"{what} cannot be written ({error}): {path}") from error

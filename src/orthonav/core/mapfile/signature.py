@@ -25,8 +25,7 @@ from orthonav.core.errors import (
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import replacing, require_file, write_text
 from orthonav.core.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
-from orthonav.core.mapfile.reader import MAX_HEADER_BYTES, MIN_FILE_BYTES, open_map
-from orthonav.core.mapfile.writer import METADATA_KEY
+from orthonav.core.mapfile.reader import MAX_HEADER_BYTES, METADATA_KEY, MIN_FILE_BYTES, open_map
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import (

@@ -64,10 +64,9 @@ class Hypothesis:
     """One hypothesis of the track, with probability `share`, `mean` (10,), `covariance` (10, 10).
 
     `sighted`: new ground that it recognized, in views; `uncounted`: since the last view that
-    counted. `number`: unique in the flight. `parent`, `expected`: that of the last view and its
-    prediction; -1, None where it was born now. `recognized`: probability, by the last view and its
-    agreement with the prediction, that it showed the map here. `followed`: from a confirmed track
-    or reported position."""
+    counted. `parent`, `expected`: of the last view; -1, None where it was born now. `recognized`:
+    probability that the last view showed the map here. `followed`: from a confirmed track or
+    reported position."""
 
     share: float
     mean: Array

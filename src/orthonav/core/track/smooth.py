@@ -1,7 +1,5 @@
-"""Smoothing: the state at each view of a flight, given all views before and after it.
-
-Hypotheses are followed back through their parents (Rauch, Tung and Striebel 1965); where a track
-was born again, smoothing begins again."""
+"""Smoothing: hypotheses followed back through their parents (Rauch, Tung and Striebel 1965); where
+a track was born again, smoothing begins again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

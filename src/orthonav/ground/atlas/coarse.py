@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from orthonav.core.errors import AreaError, AtlasError
 from orthonav.core.files import no_progress, require_file
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.mapfile.writer import METADATA_KEY, save_tensors
+from orthonav.core.mapfile.reader import METADATA_KEY, save_tensors
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedRecipe, pooled_features

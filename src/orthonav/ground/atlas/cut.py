@@ -43,9 +43,8 @@ from orthonav.core.localize.confidence import (
 )
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
-from orthonav.core.mapfile.reader import MapFile, open_map
+from orthonav.core.mapfile.reader import MapFile, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
-from orthonav.core.mapfile.writer import write_map
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.represent import OrientedGradients

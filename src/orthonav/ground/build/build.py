@@ -23,8 +23,7 @@ from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.localize.policy import SearchPlan, SearchPolicy
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
-from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.writer import write_map
+from orthonav.core.mapfile.reader import MapFile, write_map
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.network import TripletRecipe
@@ -197,13 +196,12 @@ class BuildInputs:
 def _check_numbers(request: BuildRequest) -> None:
     if request.seed < 0:
         raise VariantError(f"seed must be 0 or more, got {request.seed}")
-    if not 1 <= request.calibration_views <= MAX_CALIBRATION_VIEWS:
-        raise VariantError(
-            f"calibration views must be 1 to {MAX_CALIBRATION_VIEWS}, "
-            f"got {request.calibration_views}"
-        )
-    if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
-        raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
+    for name, value, most in (
+        ("calibration views", request.calibration_views, MAX_CALIBRATION_VIEWS),
+        ("workers", 1 if request.workers is None else request.workers, MAX_WORKERS),
+    ):
+        if not 1 <= value <= most:
+            raise VariantError(f"{name} must be 1 to {most}, got {value}")
 
 
 def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
@@ -243,8 +241,6 @@ def _check_not_far(area: Area, outline_deg: NDArray[np.float64]) -> None:
             f"{south:.4f} to {north:.4f} N, {west:.4f} to {east:.4f} E{hint}"
         )
 
-
-__all__ = ["BuildRequest", "BuildResult", "build_map"]
 
 log = logging.getLogger(__name__)
 

@@ -42,11 +42,10 @@ def changed(
     most_replaced: float = 0.75,
     most_mixed: float = 0.85,
 ) -> NDArray[np.uint8]:
-    """`grey` (S, S) uint8 with the changes of years.
+    """`grey` (S, S) uint8 with the changes of years, `other` an image that is not on the map.
 
-    Parts are replaced by `other`, an image that must not occur on the map; its detail is mixed into
-    the rest; brightness and contrast of fields change, some invert; light, blur and noise differ.
-    `most_replaced`, `most_mixed`: largest replaced share and largest weight of that detail (0..1).
+    `most_replaced`: largest share replaced by it; `most_mixed`: largest weight of its detail
+    (0..1).
     """
     size = grey.shape[0]
     resized = np.asarray(cv2.resize(other, (size, size)), dtype=np.float32)
@@ -107,7 +106,7 @@ MIN_RIGHT = 10
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Grey levels (S, S) cropped from the reference, and the pixel position of its centre."""
+    """Grey levels (S, S), and the pixel position of their centre on the sheet."""
 
     grey: NDArray[np.uint8]
     row_px: float
@@ -133,11 +132,7 @@ class CropSampler:
         self._partial: list[Crop] = []
 
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        """Random first pixels (row, col), (N, 2), of crops in a block with a `share` of all
-        imagery.
-
-        They are drawn for all blocks first, so that these may be read in any order.
-        """
+        """Random first pixels (row, col), (N, 2), of crops, drawn before any block is read."""
         size = self._crop_px(height, width)
         if size < self._tile_px:
             return np.zeros((0, 2), np.intp)
@@ -195,10 +190,8 @@ def calibrate(
     usual: LogisticConfidence | None,
     slow: bool = False,
 ) -> TileCalibration:
-    """Search changed and mirrored crops on the new map and fit the confidence to the outcome.
-
-    `usual`: the confidence of such embeddings on other maps, None if unknown.
-    """
+    """Search changed and mirrored crops on the new map. `usual`: confidence on other maps, if
+    known."""
     sampled = sampler.crops
     rng = np.random.default_rng([len(sampled), 2])
     matcher = TileMatcher(grid, centres_en_m, embeddings)
@@ -254,9 +247,7 @@ def changed_picture(
     """`grey` (S, S) with simulated ageing: light, blur, noise, replaced parts."""
     size = grey.shape[0]
     other = np.asarray(cv2.resize(other, (size, size)), dtype=np.uint8)
-    mask = cv2.resize(
-        rng.random((8, 8)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
-    )
+    mask = _smooth(rng, size, 8)
     replaced = mask < np.quantile(mask, rng.uniform(0, MAX_REPLACED))
     picture = np.where(replaced, other, grey).astype(np.float32) / 255
     picture = np.power(picture, rng.uniform(0.6, 1.7)) * rng.uniform(0.5, 1.3)
@@ -288,14 +279,12 @@ def _queries(
     return np.stack(queries)
 
 
-YAW_STD_DEG = 5.0
-AGL_STD = 0.05
 FOCAL_PX = 1000.0
 """Any value: views have the resolution of the map, and only the ratio to the height matters."""
 SIDES = (0.55, 1.0)
 """Long side of a view, from and to, in tiles; the short side is three quarters of it."""
 ENOUGH_RIGHT = 10
-"""Fewest correct views of another date that anything is learnt from."""
+"""Correct views of another date, below which nothing is learnt from it."""
 FLOOR_PX = 0.6
 """Usual standard deviation per axis between orthophotos of two dates."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
@@ -396,15 +385,15 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
     matrix = np.column_stack([linear, move])
     view = cv2.warpAffine(picture, matrix, (width, height), flags=flags)
     agl_m = FOCAL_PX * grid.gsd_m
-    reported_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
+    reported_m = agl_m * max(0.5, 1 + rng.normal(0, SCALE_STD))
     telemetry = Telemetry(
         time_ns=0,
-        yaw_deg=yaw_deg + rng.normal(0, YAW_STD_DEG),
+        yaw_deg=yaw_deg + rng.normal(0, HEADING_STD_DEG),
         pitch_deg=0.0,
         roll_deg=0.0,
         agl_m=reported_m,
-        yaw_std_deg=YAW_STD_DEG,
-        agl_std_m=AGL_STD * reported_m,
+        yaw_std_deg=HEADING_STD_DEG,
+        agl_std_m=SCALE_STD * reported_m,
     )
     camera = Camera(width, height, FOCAL_PX, FOCAL_PX, width / 2, height / 2)
     return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
@@ -430,11 +419,7 @@ def _registration_calibration(
 
 
 def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
-    """The scores of chance.
-
-    The strength of a view that is judged and finished at one level is the sum of one score, not of
-    two: with small tiles most views are such, and say nothing of the sum.
-    """
+    """A view judged and finished at one level has the strength of one score, not of two."""
     look = _median(negatives, "look")
     both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
     total = look + USUAL_CHANCES.total - USUAL_CHANCES.look

@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -117,10 +118,10 @@ def learn_encoder(
     request: "BuildRequest",
     progress: Progress,
 ) -> tuple[Encoder, NDArray[np.float16]]:
-    """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
+    """The embedder, and embeddings (N, D) of the reference tiles. CAEVL learns from one date.
 
-    A triplet network's positives are the same tiles of `other_dates`; without any, the tiles
-    themselves with simulated ageing. CAEVL learns from one date.
+    Positives of a triplet network are the same tiles of `other_dates`, or tiles with simulated
+    ageing.
     """
     tiles = pictures.tiles(tiles_px, progress)
     if isinstance(recipe, WordsRecipe):
@@ -130,6 +131,8 @@ def learn_encoder(
         )
         return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
     needed("torch", "train", "learning a network")
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        raise VariantError("a network is trained by one process: run the command without torchrun")
     training = importlib.import_module("orthonav.research.training")
     device = None if request.device == "auto" else request.device
     how: dict[str, Any] = {

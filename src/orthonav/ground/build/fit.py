@@ -58,10 +58,9 @@ def fit_few(
     sample_weight: NDArray[np.float64],
     usual: LogisticConfidence | None,
 ) -> LogisticConfidence:
-    """Confidence from trials of which too few came out right for a fit.
+    """The `usual` confidence, its bias drawn to trials of which too few came out right for a fit.
 
-    It is the `usual` one, its bias drawn to the trials as far as they go. Without one, or without
-    any trial, it is the share of the trials that came out right, whatever the evidence.
+    Without one, or without any trial, the share of right trials, whatever the evidence.
     """
     if usual is None or len(features) == 0:
         share = (sample_weight @ right + FEW_RIGHT) / (sample_weight.sum() + FEW)
@@ -83,10 +82,9 @@ def fit_weights(
     sample_weight: NDArray[np.float64],
     ridge: float = TILE_RIDGE,
 ) -> tuple[float, tuple[float, ...]]:
-    """Bias and weights of a logistic regression: weighted maximum likelihood with a slight ridge.
+    """Bias and weights (at least 0) of a logistic regression with a slight ridge.
 
-    Weights are bounded at zero. `features` (N, F) are standardized inside; the result applies to
-    raw ones. `right`, `sample_weight` (N,).
+    `features` (N, F) are standardized inside; the result applies to raw ones.
     """
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
     scaled = (features - mean) / std

@@ -46,8 +46,7 @@ def halved(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Grey and valid (H, W) at half the resolution, (ceil(H / 2), ceil(W / 2)).
 
-    A pixel is the mean of the valid ones of the four below it, rounded half up; it is valid if two
-    or more of them are.
+    Means of the valid ones of four pixels, rounded half up; valid if two or more of them are.
     """
     rows, cols = grey.shape
     if rows % 2 == cols % 2 == 0 and valid.all():
@@ -161,11 +160,7 @@ class GreyLayerWriter:
 
 
 def compressed_block(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Parts:
-    """The compressed layer of a block (H, W) that fills whole chunks of `CHUNK_PX`.
-
-    `jpeg`, `mask` (B,) with `.._ends` (chunks,) are its chunks by rows, `half` and `half_valid` the
-    next level.
-    """
+    """The layer of a block of whole chunks: `jpeg`, `mask` (B,) by rows, and the next level."""
     chunks = [
         encode_chunk(grey[part], valid[part]) if valid[part].any() else (b"", b"")
         for row in range(0, grey.shape[0], CHUNK_PX)

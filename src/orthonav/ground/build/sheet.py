@@ -60,11 +60,10 @@ class _Failed:
 def in_order(
     items: Sequence[Item], opened: Callable[[], Worker[Item, Made]], workers: int
 ) -> Iterator[Made]:
-    """Results of a worker for each item, in the order of the items.
+    """Results of a worker for each item, in the order of the items, at most `workers + AHEAD`
+    ahead.
 
-    `opened` opens the worker of each thread. At most `workers + AHEAD` items are started and not
-    yet consumed. The first error, in the order of the items, is raised here; the threads then
-    finish their current items and start no new ones.
+    `opened` opens the worker of each thread. The first error, in the order of the items, is raised.
     """
     workers = min(workers, len(items))
     if workers <= 1:
@@ -235,10 +234,7 @@ def rounded_gsd_m(gsd_m: float) -> float:
 
 
 def _whole_cells(tile_px: int, overlap: float) -> float:
-    """The overlap adjusted so that tiles share all their cells.
-
-    Otherwise memory would grow with the square of the ratio of stride to cell.
-    """
+    """So that tiles share all their cells; else memory grows with the square of stride to cell."""
     micro_px = max(1, tile_px // MICRO)
     stride_px = tile_px * (1 - overlap)
     if not micro_px <= stride_px <= tile_px:
@@ -373,10 +369,9 @@ def digest(values: Any) -> str:
 
 
 class BlockCache:
-    """A folder of finished blocks. May be shared between threads.
+    """Deletes its files when the build succeeds or fails with an `AreaError`, else keeps them.
 
-    As a context manager around a build it deletes the blocks when the build succeeds, or fails with
-    an `AreaError`; on any other error or interrupt the blocks stay.
+    May be shared between threads.
     """
 
     def __init__(self, folder: Path, request: str, needed_bytes: int) -> None:
@@ -410,10 +405,7 @@ class BlockCache:
             )
 
     def begin(self, blocks: Sequence[tuple["Block", Any]]) -> int:
-        """Register the blocks, each with the inputs that it alone depends on; remove all others.
-
-        Returns the number of cached blocks.
-        """
+        """Remove the files of other blocks or inputs, and count those that are cached."""
         self._names = {
             block: f"r{block.row}-c{block.col}-{digest([FORMAT, self._request, own])[:24]}.npz"
             for block, own in blocks
@@ -471,10 +463,7 @@ class Job:
 
 
 class SheetReader:
-    """Reads a sheet and collects the input of all later steps.
-
-    `pictures`: images of all tiles, for methods that learn from them.
-    """
+    """Collects the input of all later steps; `pictures` is for methods that learn from them."""
 
     def __init__(
         self,

@@ -28,10 +28,7 @@ NAMED = 5
 
 
 def sources_in(folder: Path) -> list[Source]:
-    """The orthophotos of a folder and its folders, newest first, then the finest, then by name.
-
-    Other files are skipped and logged.
-    """
+    """The orthophotos of a folder, newest first, then the finest; other files are logged."""
     files, skipped = _orthophotos_in(folder)
     sources, unfit = open_sources(files, folder)
     skipped |= {_UNFIT: len(unfit)} if unfit else {}

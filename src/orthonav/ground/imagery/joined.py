@@ -30,8 +30,7 @@ MAX_OFF_PX = 0.05
 class Lattice:
     """Sources on one pixel lattice; where several overlap, the first wins.
 
-    `members`: indexes of the mosaic's sources. `boxes_px` (N, 4): left, top, right, bottom of each
-    from the corner that `transform` places.
+    `members`: indexes of the mosaic's sources. `boxes_px` (N, 4): left, top, right, bottom of each.
     """
 
     members: tuple[int, ...]
@@ -71,8 +70,7 @@ class Lattice:
     ) -> tuple[NDArray[Any], NDArray[np.uint8], Affine]:
         """Bands (C, h, w), mask (h, w), 0 (invalid) to 255, and transform of a window.
 
-        Averaged to about `gsd_m` where that is coarser, all windows alike: this avoids aliasing and
-        uses overviews. Raises as rasterio does.
+        Averaged to about `gsd_m` where that is coarser, against aliasing, all windows alike.
         """
         factor = self._factor(max(1, round(gsd_m / self.first.gsd_m)))
         (left, top), (width, height) = (window.col_off, window.row_off), self.size_px
@@ -115,10 +113,7 @@ class Lattice:
         return values, dataset.dataset_mask(out_shape=shape, **how)
 
     def _factor(self, wanted: int) -> int:
-        """Pixels per side that are averaged.
-
-        From `wanted` down to half of it, the largest with which squares end where tiles do, if any.
-        """
+        """Pixels per side averaged: the largest with which squares end where tiles do, if any."""
         if len(self.members) > 1:
             for factor in range(wanted, max(1, (wanted + 1) // 2) - 1, -1):
                 if not (self.boxes_px % factor).any():

@@ -58,10 +58,7 @@ class ContrastStretch:
 
 
 def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None, ...]:
-    """The stretch of each source: None for 8 bit, else common to all of one product.
-
-    From the 0.5 and 99.5 percentiles of valid pixels.
-    """
+    """None for 8 bit, else the 0.5 and 99.5 percentiles of all valid pixels of a product."""
     alike: dict[Any, list[int]] = {}
     for index, source in enumerate(sources):
         if source.dtype != "uint8" and not source.has_palette:
@@ -109,21 +106,14 @@ def _valid_values(source: Source) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """Orthophotos read as one; where several overlap, the first one given wins.
-
-    `stretches` maps the values of each source to 8 bits, None where they have 8 bits.
-    """
+    """Orthophotos read as one; where several overlap, the first one given wins."""
 
     sources: tuple[Source, ...]
     stretches: tuple[ContrastStretch | None, ...]
 
     @classmethod
     def open(cls, paths: Sequence[Path], epoch: float | None = None) -> "Mosaic":
-        """Inspect files, and all orthophotos of folders, the newest first; nothing stays open.
-
-        `epoch`: decimal year at which positions in systems of plates are those of WGS 84; None:
-        they are taken as they are.
-        """
+        """Nothing stays open. `epoch`: decimal year of positions that drift with a plate."""
         if not paths:
             raise ImageryError("no orthophoto was given")
         sources: list[Source] = []
@@ -220,10 +210,7 @@ class GreyPixels:
 
 
 class SheetRaster:
-    """A north-up raster in a sheet's plane over orthophotos; a context manager.
-
-    It belongs to the thread that enters it; start other threads than the main one inside `quiet`.
-    """
+    """Belongs to the thread that enters it; start other threads than the main one in `quiet`."""
 
     def __init__(
         self,
@@ -275,10 +262,7 @@ class SheetRaster:
     def _composed(
         self, window: Window, colours: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Values (H, W, colours) and valid (H, W); earlier lattices cover later ones.
-
-        A pixel that several lattices cover only together, as along a seam, is their mean.
-        """
+        """Values (H, W, colours) and valid (H, W); earlier lattices cover later ones."""
         shape = window.height, window.width
         out = np.zeros((*shape, colours), np.uint8)
         valid = np.zeros(shape, np.bool_)
@@ -297,6 +281,7 @@ class SheetRaster:
             if partly.any():
                 weight[part] += partly
                 total[part] += values * partly[..., None]
+        # Covered only together, as along a seam: the mean.
         closed = (weight >= WHOLLY_VALID) & ~valid
         out[closed] = np.rint(total[closed] / weight[closed][:, None])
         return out, valid | closed

@@ -38,10 +38,7 @@ _FRAMES = (
 def plate_shift_deg(
     crs: str, lat_deg: float, lon_deg: float, year: float
 ) -> tuple[float, float] | None:
-    """What latitude and longitude in a system lack to those in WGS 84 at an epoch.
-
-    `crs`: text of the system, or the beginning of its WKT. None where no motion is known.
-    """
+    """What latitude and longitude in a system lack to WGS 84 at an epoch; None if unknown."""
     name = _name(crs)
     frame = next((code for pattern, code in _FRAMES if re.search(pattern, name)), None)
     if frame is None:
@@ -60,10 +57,7 @@ def plate_shift_m(crs: str, lat_deg: float, lon_deg: float, year: float) -> floa
 
 
 def at_epoch(sources: Sequence[Source], year: float) -> list[Source]:
-    """The sources moved with their plate to where WGS 84 has them at an epoch, a decimal year.
-
-    Those of one system are moved by the same distance.
-    """
+    """The sources, those of one system moved by one distance to where WGS 84 has them."""
     if not EPOCHS[0] <= year <= EPOCHS[1]:
         raise ImageryError(f"epoch must be a year from {EPOCHS[0]:g} to {EPOCHS[1]:g}, got {year}")
     lat, lon = np.concatenate([each.outline_latlon_deg for each in sources]).mean(axis=0).tolist()

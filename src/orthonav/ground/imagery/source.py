@@ -117,8 +117,7 @@ def open_sources(
 ) -> tuple[list[Source], list[str]]:
     """Inspect orthophotos, several at a time; a file may hold several.
 
-    Of a `folder` given by the user, rasters that are not orthophotos are left out; the second list
-    has one reason for each.
+    In a `folder` of the user, other rasters are left out, with a reason in the second list.
     """
     sources: list[Source] = []
     unfit: list[str] = []
@@ -382,8 +381,7 @@ def _outline(
 def quiet() -> Iterator[None]:
     """Suppress rasterio's warnings of cases that are checked or intended.
 
-    Warning filters belong to the process, and threads that change them would interfere. So this
-    does nothing outside the main thread; callers that start threads enter it for them.
+    Filters belong to the process: callers enter it in the main thread, elsewhere it does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -429,11 +427,7 @@ MAX_TAB_OFF_PX = 0.2
 
 
 def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
-    """YYYY[-MM[-DD]] from tags, else from the first name that has one.
-
-    From IGN's names only the year: the day in them is that of the edition, and kilometres follow
-    the year of a tile.
-    """
+    """YYYY[-MM[-DD]]; from IGN's names only the year, which numbers of other meaning follow."""
     tagged = [str(tags[tag]).replace(":", "-") for tag in _TAGS if tag in tags]
     for text in (*tagged, *names):
         if years := _IGN_TILE.search(text) or _IGN_PACKAGE.search(text):

@@ -57,11 +57,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class VerticalDatum:
-    """What heights count from.
-
-    All but those above the ellipsoid are taken as above mean sea level, from which national systems
-    differ by up to two metres. `unit_m`: metres of one unit.
-    """
+    """National systems count as mean sea level, from which they differ by up to two metres."""
 
     name: str
     above_ellipsoid: bool
@@ -158,10 +154,7 @@ def _undulation(transformer: pyproj.Transformer, lat_deg: Array, lon_deg: Array)
 
 @dataclass(frozen=True, eq=False)
 class Dem:
-    """An open terrain model; calling it gives heights above mean sea level (`TerrainHeights`).
-
-    Heights are read by windows; for one thread.
-    """
+    """Calling it gives heights above mean sea level (`TerrainHeights`); for one thread."""
 
     path: Path
     datum: VerticalDatum

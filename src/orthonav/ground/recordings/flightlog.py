@@ -4,17 +4,18 @@ Written by `orthonav.onboard.log`; messages as in `orthonav.core.flight.logged`.
 anywhere: all chunks that are complete are read.
 """
 
+import logging
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, OrthonavError
 from orthonav.core.flight import decode_image
-from orthonav.core.flight.fixes import result_from_json
+from orthonav.core.flight.fixes import result_from_json, result_to_json
 from orthonav.core.flight.logged import (
     FORMAT,
     MAX_JSON_BYTES,
@@ -31,6 +32,7 @@ from orthonav.core.flight.logged import (
     picture_of,
     view_of,
 )
+from orthonav.core.flight.mount import logged_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import ViewResult
 from orthonav.ground.recordings.mcap_files import Walk, chunk_at, chunks, messages, profile_of
@@ -372,3 +374,52 @@ def logged_result(data: bytes) -> ViewResult:
     if len(data) > MAX_JSON_BYTES:
         raise FlightError(f"result of the log has {len(data)} bytes")
     return result_from_json(data.decode("utf-8"))
+
+
+log = logging.getLogger(__name__)
+LOCALIZE_CHOICES = {
+    "heading": ("known", "unknown"),
+    "prior": ("telemetry", "none"),
+    "registration": ("on", "off"),
+    "position": ("peak", "best", "neighbours", "weighted"),
+}
+"""Options of localize that a log may state, and their values."""
+
+
+def compare_with_flight(flight: Recording, results: Sequence[ViewResult]) -> None:
+    """Log how many results of a replay differ from those of the flight."""
+    if not isinstance(flight, LoggedFlight):
+        return
+    logged = {result.frame: _comparable(result) for result in flight.results()}
+    both = [result for result in results if result.frame in logged]
+    other = [result.frame for result in both if logged[result.frame] != _comparable(result)]
+    if other:
+        counts = len(other), len(both), other[0]
+        log.warning("%d of %d results differ from those of the flight, first: %s", *counts)
+    else:
+        log.info("all %d results equal those of the flight", len(both))
+
+
+def _comparable(result: ViewResult) -> str:
+    """A result as text, without its latency."""
+    return result_to_json(replace(result, latency_ms=0.0))
+
+
+def logged_options(logged: Any) -> dict[str, Any]:
+    """Options of a log, validated: a log is untrusted input."""
+    if not isinstance(logged, dict):
+        return {}
+    found: dict[str, Any] = {}
+    for name, choices in LOCALIZE_CHOICES.items():
+        if name in logged:
+            if logged[name] not in choices:
+                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
+            found[name] = logged[name]
+    for name, kinds in (("accept", str | None), ("track", bool)):
+        if name in logged:
+            if not isinstance(logged[name], kinds):
+                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
+            found[name] = logged[name]
+    if "mount" in logged:
+        found["mount"] = logged_mount(logged)
+    return found

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera, ground_en_m
-from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import TerrainHeights, sight_on_ground
 from orthonav.core.records import (
@@ -26,6 +25,7 @@ from orthonav.core.records import (
     DEFAULT_YAW_STD_DEG,
     Fix,
     Telemetry,
+    error_ellipse,
 )
 
 STEPS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05])

@@ -6,6 +6,7 @@ value changed at a time. The change that makes them confident names the value to
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -209,3 +210,96 @@ def _tried(setup: Setup, views: int, fixes: list[tuple[View, Fix]]) -> Tried:
         std = math.degrees(math.sqrt(-2 * math.log(min(max(abs(vector), 1e-12), 1.0))))
     ratio = float(np.median(ratios)) if ratios else math.nan
     return Tried(setup, views, len(fixes), mean, std, ratio)
+
+
+_SCATTERED_DEG = 20.0
+"""Headings that differ by a constant scatter less about it: compasses err by some degrees."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Views of a run by what is known of their positions."""
+
+    views: int
+    confident: int
+    low: int
+    none: int
+    reasons: tuple[tuple[str, int], ...] = ()
+    """Reasons of views without a position and their numbers, the most frequent first."""
+
+    @classmethod
+    def of(cls, results: Sequence[ViewResult]) -> "Counts":
+        reasons = Counter(
+            each.outcome.reason for each in results if isinstance(each.outcome, NoFix)
+        )
+        fixes = sum(isinstance(result.outcome, Fix) for result in results)
+        confident = sum(result.is_confident for result in results)
+        return cls(
+            len(results),
+            confident,
+            fixes - confident,
+            len(results) - fixes,
+            tuple(reasons.most_common()),
+        )
+
+    @property
+    def few(self) -> bool:
+        """Whether so few views are confident that the configuration may be wrong."""
+        return self.confident < FEW * self.views
+
+
+def setup_text(tried: Sequence[Tried], *, on_map: bool) -> list[str]:
+    """Sentences: which change makes the views confident and what to check, and what else was tried.
+
+    `on_map`: the flight recorded positions, and some of them lie on the map.
+    """
+    *failed, last = tried
+    if not last.explains:
+        names = ", ".join(each.setup.name for each in tried)
+        most = max(each.confident for each in tried)
+        where = (
+            "the recorded positions lie on the map, so check the camera, and whether the ground "
+            "changed or has no structure"
+            if on_map
+            else "no position was recorded, so check first that the map shows the area, then the "
+            "camera and the ground"
+        )
+        tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
+        return [f"no other configuration explains it ({tested}); {where}"]
+    found = f"{last.confident} of {last.views} views of low confidence become confident"
+    lines = [f"{found} {_explanation(last)}"]
+    return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
+
+
+def _listed(tried: Iterable[Tried]) -> str:
+    return ", ".join(f"{each.setup.name} ({each.confident} of {each.views})" for each in tried)
+
+
+def _explanation(found: Tried) -> str:
+    setup, parts, checks = found.setup, [], []
+    if setup.name == "as reported":
+        return (
+            "if localized one by one: the configuration is right, but the views do not form a track"
+        )
+    if setup.without_prior:
+        return "without the prior; check the prior positions"
+    if setup.radians:
+        return "if the headings are read as radians"
+    if setup.mirrored:
+        return "if mirrored left to right, with any heading; check where the images come from"
+    if setup.any_heading:
+        off, std = found.heading_off_deg, found.heading_std_deg
+        constant = std < _SCATTERED_DEG
+        apart = ", which differs from the reported one from view to view"
+        if constant:
+            apart = f", {off:+.0f} deg from the reported one" if round(off) else ""
+            apart += f" (standard deviation {std:.0f} deg)"
+        parts.append(f"with any heading{apart}")
+        checks.append("the heading column" + " and the mounting of the camera" * constant)
+    if setup.factor != 1.0:
+        ratio = found.height_ratio
+        parts.append(
+            f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal length)"
+        )
+        checks.append("the height column (above ground?) and the camera")
+    return f"{' and '.join(parts)}; check {' and '.join(checks)}"

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import OrthonavError
-from orthonav.core.geo.ellipse import error_ellipse
-from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
+from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult, error_ellipse
 
 AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
 """Time over which the filters of autopilots average positions, for a claim of `AT_STD_M`; it grows

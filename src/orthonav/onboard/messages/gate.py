@@ -13,9 +13,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.geo.ellipse import error_ellipse
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, error_ellipse
 from orthonav.onboard.messages.estimate import (
     Clock,
     EstimateError,

@@ -13,8 +13,7 @@ from typing import Any
 
 from orthonav.core.errors import MissingExtraError
 from orthonav.core.extras import needed
-from orthonav.core.geo.ellipse import error_ellipse
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, error_ellipse
 from orthonav.onboard.messages.estimate import (
     Clock,
     EstimateError,

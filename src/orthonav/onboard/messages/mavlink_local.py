@@ -173,10 +173,7 @@ def set_gps_global_origin(origin: Origin, *, target_system: int = 1) -> Message:
 
 
 def _position(
-    estimate: NavigationEstimate,
-    pose: LocalPose,
-    autopilot: Autopilot,
-    message: str,
+    estimate: NavigationEstimate, pose: LocalPose, autopilot: Autopilot, message: str
 ) -> tuple[Triple, Array]:
     """North, east, down in metres and their covariance (3, 3), all known. ArduPilot makes one
     standard deviation of it: it gets the one that comes out as the horizontal one."""

@@ -9,8 +9,7 @@ import math
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 
-from orthonav.core.geo.ellipse import error_ellipse
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, error_ellipse
 from orthonav.onboard.messages.estimate import NavigationEstimate
 
 MPS_PER_KNOT = 1852 / 3600
