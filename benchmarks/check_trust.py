@@ -1,6 +1,6 @@
 """How far the verdict of a check can be trusted: predicted against measured, scenes left out.
 
-`python -m benchmarks.check_trust --work DIR [--views 20] [--conditions N] [--fit]` checks maps of
+`python -m benchmarks.check_trust --work DIR [--views 20] [--fit]` checks maps of
 scenes of two dates without the second date, and places simulated views of that date. Views are 256,
 160 and 112 px of the map wide, with a prior position and without: each pair is measured under three
 of these six conditions, so that all occur in every scene. What is predicted for a scene is
@@ -100,7 +100,6 @@ class Outcome:
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=20, help="views per condition (default 20)")
     parser.add_argument("--effort", type=float, default=0.05, help="of the checks (default 0.05)")
-    parser.add_argument("--conditions", type=int, help="end after so many (default: all)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="pairs whose name has this")
     parser.add_argument("--fit", action="store_true", help="print what all scenes say")
@@ -117,11 +116,7 @@ def measure(options: argparse.Namespace) -> Section:
             name = f"{pair.name} {width_px} px{', prior' * prior}, {views} views"
             tasks[name] = (pair, width_px, prior, views, options)
     found = []
-    for each in resumed(
-        rows_path(options.work, f"conditions-{options.seed}"),
-        _measured,
-        dict(list(tasks.items())[: options.conditions]),
-    ):
+    for each in resumed(rows_path(options.work, f"conditions-{options.seed}"), _measured, tasks):
         found.append(Outcome(**each))
         say(" ".join(_row(found[-1], LEARNT)))
     if options.fit:

@@ -119,7 +119,6 @@ class Flown:
     scenario: Scenario
     samples: list[Sample] = field(default_factory=list)
     views: list[Located] = field(default_factory=list)
-    resets: int = 0
     withheld: dict[str, int] = field(default_factory=dict)
 
 
@@ -295,7 +294,6 @@ def fly(
         before = aircraft.motion
         aircraft.step(wind.next())
         estimator.feel(instruments.imu(increments(before, aircraft.motion)))
-    flown.resets = estimator.resets
     if sight is not None:
         flown.withheld = dict(sight.gate.withheld)
     return flown

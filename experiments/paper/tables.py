@@ -14,8 +14,6 @@ from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
 from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
 from experiments.paper.results import (
     ACCURACY_M,
-    EDGES,
-    FAMILIES,
     FIELD,
     TUNED,
     Result,
@@ -48,39 +46,15 @@ Published = Callable[[str, str, str], str]
 
 
 def report(out: Path, setting: str) -> Path | None:
-    """Write `tables.md` and the plot beside the result files; None without results."""
+    """Write `tables.md` beside the result files; None without results."""
     folder = out / setting
     results = read(folder)
     if not results:
         return None
-    text = [table.markdown() for table in tables(results)]
-    swept = [each for each in results if each.family and each.plain.get("sweep")]
-    if swept:
-        text.append(f"![sensitivity]({_plot(swept, folder / 'sensitivity.png').name})")
     path = folder / "tables.md"
-    path.write_text("\n".join([*text, ""]), encoding="utf-8")
+    text = "\n".join(table.markdown() for table in tables(results))
+    path.write_text(text + "\n", encoding="utf-8")
     return path
-
-
-def _plot(results: Sequence[Result], out: Path) -> Path:
-    """Accuracy at 15 m against heading and height errors, a column per method."""
-    from matplotlib.figure import Figure
-
-    families = list(dict.fromkeys(each.family for each in results))
-    figure = Figure((3.5 * len(families), 6), layout="constrained")
-    grid = figure.subplots(2, len(families), sharey=True, squeeze=False)
-    for row, (step, title) in enumerate(STEPS):
-        for axis, family in zip(grid[row], families, strict=True):
-            for each in (each for each in results if each.family == family):
-                sweep = each.plain["sweep"][step]
-                values = [100 * share(errors) for errors in sweep.values()]
-                name = "default" if each.registration else EDGES[each.edges]
-                axis.plot([float(value) for value in sweep], values, "o-", ms=3, label=name)
-            axis.set(xlabel=title, ylim=(0, 102), title=FAMILIES[family])
-            axis.legend(fontsize=8)
-        grid[row, 0].set_ylabel("within 15 m, %")
-    figure.savefig(out, dpi=110)
-    return out
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
