@@ -401,20 +401,14 @@ def undisturbed(seconds: float) -> Fault:
 
 
 def combined(camera: Fault, telemetry: Fault) -> Fault:
-    return replace(
-        camera,
-        name=f"{camera.name}, {telemetry.name}",
-        group="combined",
-        state=_both(camera, telemetry),
-    )
+    """Both faults at once."""
 
-
-def _both(one: Fault, other: Fault) -> Callable[[FaultFlight, State, float], State | None]:
-    def state(flight: FaultFlight, state: State, t: float) -> State | None:
-        made: State | None = state
-        for each in (one.state, other.state):
+    def state(flight: FaultFlight, true: State, t: float) -> State | None:
+        made: State | None = true
+        for each in (camera.state, telemetry.state):
             if each is not None and made is not None:
                 made = each(flight, made, t)
         return made
 
-    return state
+    name = f"{camera.name}, {telemetry.name}"
+    return replace(camera, name=name, group="combined", state=state)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.record import Table, number
+from benchmarks.scenes import far_m
 from numpy.typing import NDArray
 
 from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
@@ -331,10 +332,6 @@ def _above_row(scene: str, name: str, ours: Result, each: Result) -> list[str]:
     ]
 
 
-FAR_M, FAR_PX = 35.0, 10.0
-"""A position beyond both is wrong; pixels, for imagery on which 35 m are less than a view shows."""
-
-
 @dataclass(frozen=True, eq=False)
 class Placed:
     """What a method made of the views of one or several scenes.
@@ -354,7 +351,7 @@ class Placed:
         shapes = [each.plain["trajectory"] for each in rows if name in each.plain[FIELD]]
         views = [row for part in parts for row in part["views"]]
         far = [
-            max(FAR_M, FAR_PX * shape["gsd_m"])
+            far_m(shape["gsd_m"])
             for part, shape in zip(parts, shapes, strict=True)
             for _ in part["views"]
         ]
@@ -455,8 +452,8 @@ def _field_by_scene(rows: Sequence[Result], names: Sequence[str], shown: dict[st
     guess = ["the prior itself"]
     for each in rows:
         away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
-        far_m = max(FAR_M, FAR_PX * each.plain["trajectory"]["gsd_m"])
-        shares = (float((away <= radius).mean()) for radius in (ACCURACY_M, far_m))
+        radii = ACCURACY_M, far_m(each.plain["trajectory"]["gsd_m"])
+        shares = (float((away <= radius).mean()) for radius in radii)
         guess.append("/".join(map(percent, shares)))
     header = ("method", *(each.scene for each in rows))
     notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)
