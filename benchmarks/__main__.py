@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.record import options_of, provenance, save, say
 
-SUITE = ("build", "comparison", "growth", "tracking", "onboard")
+SUITE = ("build", "comparison", "growth", "onboard")
 
 
 def main(arguments: Sequence[str]) -> int:

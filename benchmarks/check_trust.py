@@ -1,6 +1,6 @@
 """How far the verdict of a check can be trusted: predicted against measured, scenes left out.
 
-`python -m benchmarks.check_trust --work DIR [--views 20] [--conditions N] [--fit]` checks maps of
+`python -m benchmarks.check_trust --work DIR [--views 20] [--fit]` checks maps of
 scenes of two dates without the second date, and places simulated views of that date. Views are 256,
 160 and 112 px of the map wide, with a prior position and without: each pair is measured under three
 of these six conditions, so that all occur in every scene. What is predicted for a scene is
@@ -45,7 +45,7 @@ from orthonav.onboard.run import SingleViews, locate_view
 
 NAME = "check_trust"
 WIDTHS_PX = (256, 160, 112)
-PRIOR_PX = 60.0
+PRIOR_PX, EFFORT = 60.0, 0.05
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
 SPREAD = 1.2816
 """Standard deviations of the logit from the middle to the ends of an 80 % interval."""
@@ -99,8 +99,6 @@ class Outcome:
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=20, help="views per condition (default 20)")
-    parser.add_argument("--effort", type=float, default=0.05, help="of the checks (default 0.05)")
-    parser.add_argument("--conditions", type=int, help="end after so many (default: all)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="pairs whose name has this")
     parser.add_argument("--fit", action="store_true", help="print what all scenes say")
@@ -117,11 +115,7 @@ def measure(options: argparse.Namespace) -> Section:
             name = f"{pair.name} {width_px} px{', prior' * prior}, {views} views"
             tasks[name] = (pair, width_px, prior, views, options)
     found = []
-    for each in resumed(
-        rows_path(options.work, f"conditions-{options.seed}"),
-        _measured,
-        dict(list(tasks.items())[: options.conditions]),
-    ):
+    for each in resumed(rows_path(options.work, f"conditions-{options.seed}"), _measured, tasks):
         found.append(Outcome(**each))
         say(" ".join(_row(found[-1], LEARNT)))
     if options.fit:
@@ -156,7 +150,7 @@ def _measured(task: tuple[Pair, int, bool, int, argparse.Namespace]) -> dict[str
         prior_std_m=prior_m,
         relief_m=0.0,
         tilt_std_deg=0.0,
-        effort=options.effort,
+        effort=EFFORT,
         extras=False,
         workers=1,
         recalibration=PLAIN,
@@ -256,7 +250,7 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     notes = (
         f"heading sd 10 deg, height sd 10 %, prior {PRIOR_PX:g} px or none; "
         f"{options.views} views over the later date each, those beside the map left out, checks of "
-        f"effort {options.effort:g} (40 trials); recalibrated by the other scenes",
+        f"effort {EFFORT:g} (40 trials); recalibrated by the other scenes",
         f"go by the low bound and the width: {len(gone)} of {len(above)}, of which {len(bad)} "
         f"measured below {GO_LOW:g}; measured below the low bound: {under} of {len(above)}",
     )

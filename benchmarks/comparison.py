@@ -135,11 +135,11 @@ def measure(options: argparse.Namespace) -> Section:
     for each in rounds():
         if options.part in (None, each.part):
             count = views if each.heading_known else max(1, views // 4)
-            section.tables.append(_table(each, count, options.work, NOTES))
+            section.tables.append(_table(each, count, options.work))
     return section
 
 
-def _table(each: Round, views: int, work: Path, notes: tuple[str, ...]) -> Table:
+def _table(each: Round, views: int, work: Path) -> Table:
     past, present = ortho(each.pair.map, work), ortho(each.pair.views, work)
     localizer = localizer_of(each.pair.map, work)
     pixels = store(past, localizer, work / f"{past.parent.name}-{past.stem}.npz")
@@ -157,7 +157,7 @@ def _table(each: Round, views: int, work: Path, notes: tuple[str, ...]) -> Table
         carried_mb = _carried_mb(entrant, map_path, pixels)
         rows.append(_row(entrant, Verdict.of(result["rows"]), result["peak_mb"], carried_mb))
         say(f"        {each.title}: {' '.join(rows[-1])}")
-    return Table(f"{each.title}, {views} views", HEADER, rows, notes)
+    return Table(f"{each.title}, {views} views", HEADER, rows, NOTES)
 
 
 def _carried_mb(entrant: Entrant, map_path: Path, pixels: Path) -> float:
@@ -175,7 +175,7 @@ def _carried_mb(entrant: Entrant, map_path: Path, pixels: Path) -> float:
 
 def _row(entrant: Entrant, verdict: Verdict, peak_mb: float, carried_mb: float) -> list[str]:
     stated = ["-", "-", "-"]
-    if verdict.states_confidence:
+    if np.isfinite(verdict.confidence).any():
         accepted = percent(float(verdict.accepted.mean()))
         stated = [accepted, str(verdict.wrong_accepted), f"{verdict.ece:.3f}"]
     return [

@@ -154,7 +154,7 @@ class Fault:
 
     `delay_s(number)` by image number and `t`: exposure to arrival. `picture`: what arrives instead.
     `arrives`: whether an image arrives. `state`: what the autopilot reports, None for nothing.
-    `others`: frames of other vehicles. `begins`, `ends`: called once. `ground_en_m`: displacement
+    `others`: frames of other vehicles. `begins`: called once. `ground_en_m`: displacement
     of the ground under the aircraft against the map.
     """
 
@@ -168,7 +168,6 @@ class Fault:
     state: Callable[["FaultFlight", State, float], State | None] | None = None
     others: Callable[["FaultFlight", State, int], list[bytes]] | None = None
     begins: Callable[["FaultFlight"], None] | None = None
-    ends: Callable[["FaultFlight"], None] | None = None
     ground_en_m: tuple[float, float] = (0.0, 0.0)
     stated_s: float | None = STATED_S
     leaves_map: bool = False
@@ -305,7 +304,7 @@ class FaultFlight:
 
     def fly(self) -> Report:
         """Fly to the end, or until the flight has recovered."""
-        began = ended = False
+        began = False
         due_s = 0.0
         while self.since_s < self.end_s and not self._has_recovered():
             self.time.go(STEP_S)
@@ -313,10 +312,6 @@ class FaultFlight:
                 began = True
                 if self.fault.begins is not None:
                     self.fault.begins(self)
-            if not ended and self.since_s >= self.fault_s[1]:
-                ended = True
-                if self.fault.ends is not None:
-                    self.fault.ends(self)
             self._talk()
             if self.since_s >= due_s:
                 due_s += 1 / VIEWS_HZ
@@ -406,20 +401,14 @@ def undisturbed(seconds: float) -> Fault:
 
 
 def combined(camera: Fault, telemetry: Fault) -> Fault:
-    return replace(
-        camera,
-        name=f"{camera.name}, {telemetry.name}",
-        group="combined",
-        state=_both(camera, telemetry),
-    )
+    """Both faults at once."""
 
-
-def _both(one: Fault, other: Fault) -> Callable[[FaultFlight, State, float], State | None]:
-    def state(flight: FaultFlight, state: State, t: float) -> State | None:
-        made: State | None = state
-        for each in (one.state, other.state):
+    def state(flight: FaultFlight, true: State, t: float) -> State | None:
+        made: State | None = true
+        for each in (camera.state, telemetry.state):
             if each is not None and made is not None:
                 made = each(flight, made, t)
         return made
 
-    return state
+    name = f"{camera.name}, {telemetry.name}"
+    return replace(camera, name=name, group="combined", state=state)

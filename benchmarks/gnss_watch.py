@@ -372,14 +372,11 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace) -> Section:
-    hours, trials = (0.5, 1) if options.quick else (options.hours, options.trials)
-    tables = [
-        delay_table(trials),
-        recovery_table(trials),
-        slow_drag_table(min(trials, 4)),
-        false_alarm_table(hours),
-    ]
-    return Section("GNSS watch", tables)
+    if options.quick:
+        return Section("GNSS watch", [delay_table(1), false_alarm_table(0.1)])
+    trials = options.trials
+    tables = [delay_table(trials), recovery_table(trials), slow_drag_table(min(trials, 4))]
+    return Section("GNSS watch", [*tables, false_alarm_table(options.hours)])
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.looped_flight import read_rows, route_of, write_rows
+from benchmarks.placing import row_of
 from benchmarks.record import (
     Section,
     Table,
@@ -31,12 +33,13 @@ from benchmarks.record import (
     say,
 )
 from benchmarks.scenes import FAR_M, PAST, PRESENT, area, map_of
+from benchmarks.verdicts import Verdict
 from orthonav.core.files import write_text
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import CONFIDENT, Fix, ViewResult
+from orthonav.core.records import ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
 from orthonav.ground.recordings.localize import localize_flight
@@ -196,59 +199,36 @@ def _followed(task: tuple[Plan, Path, Path, Path]) -> dict[str, Any]:
 
 
 def _record(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> dict[str, Any]:
-    """One view: error east and north in m and stated values; None without a fix."""
-    out, frame = result.outcome, localizer.sheet.frame
-    record = {"frame": result.frame, "state": result.state, "ms": round(result.latency_ms, 2)}
-    if not isinstance(out, Fix):
-        return {**record, "error_en_m": None, "confidence": None}
-    error = frame.en_from_latlon(out.lat_deg, out.lon_deg) - frame.en_from_latlon(*truth)
-    stated = {"confidence": out.confidence, "radius_m": out.radius_m}
-    return {**record, **stated, "error_en_m": error.tolist(), "cov_en_m2": out.cov_en_m2.tolist()}
+    """One view: its row as `Verdict` takes it."""
+    row = [*row_of(result.outcome, localizer.sheet.frame, truth), round(result.latency_ms, 2)]
+    return {"frame": result.frame, "state": result.state, "row": row}
 
 
 @dataclass(frozen=True, eq=False)
-class Figures:
-    """Views (N) of one flight or more in numbers, infinite errors where there is no fix."""
+class Figures(Verdict):
+    """Views (N) of one flight or more; `tracking`: mask (N,)."""
 
-    errors_m: Array
-    nees: Array
     tracking: NDArray[np.bool_]
-    confident: NDArray[np.bool_]
-    radius_m: Array
-    ms: Array
 
     @classmethod
-    def of(cls, views: Sequence[dict[str, Any]]) -> "Figures":
+    def of_views(cls, views: Sequence[dict[str, Any]]) -> "Figures":
         """From the views of `_followed`."""
-        known = np.array([view["error_en_m"] is not None for view in views])
-        fixed = [view for view in views if view["error_en_m"] is not None]
-        errors, nees = np.full(len(views), np.inf), np.full(len(views), np.nan)
-        radius = np.full(len(views), np.nan)
-        if fixed:
-            off = np.array([view["error_en_m"] for view in fixed])
-            cov = np.array([view["cov_en_m2"] for view in fixed])
-            errors[known], nees[known] = np.hypot(*off.T), normalized_squared(off, cov)
-            radius[known] = [view["radius_m"] for view in fixed]
-        return cls(
-            errors,
-            nees,
-            np.array([view["state"] == "tracking" for view in views]),
-            np.array([(view["confidence"] or 0.0) >= CONFIDENT for view in views]),
-            radius,
-            np.array([view["ms"] for view in views]),
-        )
+        verdict = Verdict.of([view["row"] for view in views])
+        return cls(**vars(verdict), tracking=np.array([v["state"] == "tracking" for v in views]))
 
-    @property
-    def median_m(self) -> float:
-        """Median error of all views that have a position, tracking or not."""
-        known = self.errors_m[np.isfinite(self.errors_m)]
-        return float(np.median(known)) if known.size else math.nan
+    @cached_property
+    def nees(self) -> Array:
+        """Normalized errors squared (N,); NaN without a fix."""
+        known, nees = np.isfinite(self.errors_m), np.full(len(self.errors_m), np.nan)
+        if known.any():
+            nees[known] = normalized_squared(self.errors_en_m[known], self.cov_en_m2[known])
+        return nees
 
     @property
     def wrong(self) -> int:
         """Number of views that are confident and wrong."""
         far = self.errors_m > np.fmax(FAR_M, self.radius_m)
-        return int((self.confident & far).sum())
+        return int((self.accepted & far).sum())
 
     @property
     def divergences(self) -> int:
@@ -261,7 +241,7 @@ class Figures:
         """Median, 95 %, largest error while tracking; confident; wrong; divergences."""
         errors = self.errors_m[self.tracking]
         spread = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
-        confident = percent(float(self.confident.mean()))
+        confident = percent(float(self.accepted.mean()))
         return [*map(number, spread), confident, str(self.wrong), str(self.divergences)]
 
     def consistency(self) -> list[str]:
@@ -276,13 +256,13 @@ def _back_after(followed: dict[str, Any]) -> int | None:
     """Views from the first after a kidnapping to the first that is tracking and right."""
     views = followed["views"]
     first = [view["frame"] for view in views].index(followed["first_after"])
-    figures = Figures.of(views[first:])
+    figures = Figures.of_views(views[first:])
     right = np.flatnonzero(figures.tracking & (figures.errors_m <= FAR_M))
     return int(right[0]) + 1 if right.size else None
 
 
 def _row(followed: dict[str, Any]) -> list[str]:
-    figures = Figures.of(followed["views"])
+    figures = Figures.of_views(followed["views"])
     first = int(np.argmax(figures.tracking)) + 1 if figures.tracking.any() else None
     back = "-"
     if followed["kidnapped"]:
@@ -290,26 +270,26 @@ def _row(followed: dict[str, Any]) -> list[str]:
     return [
         str(followed["flight"]),
         followed["kidnapped"] or "-",
-        str(len(figures.ms)),
+        str(len(figures.times_ms)),
         number(figures.median_m),
         str(first or "never"),
         *figures.cells(),
         back,
         *figures.consistency(),
-        *quantiles(figures.ms, 50),
+        *quantiles(figures.times_ms, 50),
     ]
 
 
 def _section(outcomes: Sequence[dict[str, Any]], km: float) -> Section:
-    figures = [Figures.of(each["views"]) for each in outcomes]
-    every = Figures.of([view for each in outcomes for view in each["views"]])
+    figures = [Figures.of_views(each["views"]) for each in outcomes]
+    every = Figures.of_views([view for each in outcomes for view in each["views"]])
     means = [float(f.nees[f.tracking].mean()) for f in figures if f.tracking.any()]
     lost = [each for each in outcomes if each["kidnapped"]]
     found = sum(_back_after(each) is not None for each in lost)
-    total = ["**all**", "", str(len(every.ms)), number(every.median_m), "", *every.cells()]
+    total = ["**all**", "", str(len(every.times_ms)), number(every.median_m), "", *every.cells()]
     total[-1] = str(sum(each.divergences for each in figures))
     back = f"{found} of {len(lost)}" if lost else "-"
-    total += [back, *every.consistency(), *quantiles(every.ms, 50)]
+    total += [back, *every.consistency(), *quantiles(every.times_ms, 50)]
     half = 1.96 * float(np.std(means, ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else 0.0
     notes = (
         f"{km:g} km of random legs over another date than the map's, {AGL_M:g} m high, a view "

@@ -10,7 +10,6 @@ import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -46,15 +45,12 @@ class Scene:
 
     - `name`, `folder`: name, and folder below `DATA`, or `generated:SEED`.
     - `gsd_m`: metres per pixel, nominal.
-    - `ground`, `terrain`: kind of ground, and whether it is level or hilly.
     - `dates`: names of the orthophotos, in order.
     """
 
     name: str
     folder: str
     gsd_m: float
-    ground: str
-    terrain: str
     dates: tuple[str, ...]
 
     def file(self, date: str) -> str:
@@ -63,23 +59,17 @@ class Scene:
 
     def pair(self, past: str, present: str) -> "Pair":
         """A map of one date and views of another."""
-        years = year_of(present) - year_of(past)
-        return Pair(self.name, self.file(past), self.file(present), self.gsd_m, years)
-
-    def pairs(self) -> list["Pair"]:
-        """All ordered pairs of its dates."""
-        return [self.pair(*both) for both in permutations(self.dates, 2)]
+        return Pair(self.name, self.file(past), self.file(present), self.gsd_m)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A map and an orthophoto of another date, `years` later, that views are taken of."""
+    """A map and an orthophoto of another date, that views are taken of."""
 
     scene: str
     map: str
     views: str
     gsd_m: float
-    years: float
 
     @property
     def name(self) -> str:
@@ -93,45 +83,35 @@ class Pair:
         return is_there(self.map, self.views)
 
 
-SZADA_YEARS = {"a": 2000.0, "b": 2005.0}
-"""Nominal: the set states years between the dates, not the dates."""
 SCENES = {
     each.name: each
     for each in (
-        Scene(
-            "naip", "naip_nd", 5.0, "fields, river, forest", "level",
-            ("20090818", "20120731", "20150926", "20180716"),
-        ),
+        Scene("naip", "naip_nd", 5.0, ("20090818", "20120731", "20150926", "20180716")),
         *(
-            Scene(f"szada_{n}", "airchange", 1.5, "village, fields", "level",
-                  (f"szada_{n}_a", f"szada_{n}_b"))
+            Scene(f"szada_{n}", "airchange", 1.5, (f"szada_{n}_a", f"szada_{n}_b"))
             for n in ("1", "5", "7", "mosaic")
         ),
         Scene(
-            "garching", "scenes/garching", 1.5, "fields, forest, campus", "level",
+            "garching", "scenes/garching", 1.5,
             ("2001_09", "2009_04", "2015_04", "2018_04", "2020_03"),
         ),
         Scene(
-            "schiphol", "scenes/schiphol", 1.5, "airport, fields", "level",
+            "schiphol", "scenes/schiphol", 1.5,
             ("2004_05", "2008_05", "2015_09", "2018_04", "2021_06"),
         ),
         Scene(
-            "solar_farm", "scenes/solar_farm", 1.5, "desert, solar farm", "level",
+            "solar_farm", "scenes/solar_farm", 1.5,
             ("2009_12", "2012_12", "2015_12", "2017_12", "2020_12"),
         ),
+        Scene("atlanta", "scenes/atlanta", 9.35, ("2012_11", "2016_12", "2021_08", "2024_02")),
         Scene(
-            "atlanta", "scenes/atlanta", 9.35, "woods, suburbs", "hilly",
-            ("2012_11", "2016_12", "2021_08", "2024_02"),
-        ),
-        Scene(
-            "aral", "scenes/aral", 1.5, "steppe, drying lake", "level",
+            "aral", "scenes/aral", 1.5,
             ("1985_12", "1995_12", "2000_12", "2006_12", "2012_12", "2015_12", "2020_12"),
         ),
-        Scene("tours", "scenes/tours", 1.0, "city, river, fields", "level", ("1964", "1976")),
+        Scene("tours", "scenes/tours", 1.0, ("1964", "1976")),
         *(
-            Scene(f"generated_{seed}", f"generated:{seed}", 1.0, "fields, villages", "level",
-                  (OTHER, PAST, PRESENT))
-            for seed in (1, 21, 22, 31, 32)
+            Scene(f"generated_{seed}", f"generated:{seed}", 1.0, (OTHER, PAST, PRESENT))
+            for seed in (1, 31, 32)
         ),
     )
 }  # fmt: skip
@@ -157,14 +137,6 @@ def leave_one_out_pairs() -> list[Pair]:
 def place_of(pair: Pair) -> str:
     """Scenes of one place or generator together: `szada`, `generated`."""
     return pair.scene if pair.scene == "solar_farm" else pair.scene.partition("_")[0]
-
-
-def year_of(date: str) -> float:
-    """Year of a name of a date: `20090818`, `2001_09`, `1964`, `szada_1_a`."""
-    if date.startswith("szada"):
-        return SZADA_YEARS[date[-1]]
-    month = "".join(each for each in date[4:] if each.isdigit())[:2]
-    return int(date[:4]) + ((int(month) - 0.5) / 12 if month else 0.5)
 
 
 def _generated(name: str) -> bool:

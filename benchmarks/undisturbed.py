@@ -97,7 +97,7 @@ def measure(options: argparse.Namespace) -> Section:
         for each in chosen(leave_one_out_pairs(), options.only)
         if 0.9 <= each.gsd_m <= 2.1 and not each.map.startswith("generated:")
     ]
-    seconds = min(options.seconds, 5.0) if options.quick else options.seconds
+    seconds = min(options.seconds, 15.0) if options.quick else options.seconds
     jobs = [(pair, SEED + i, seconds, options.work) for pair in pairs for i in range(options.seeds)]
     rows, wrong = [], 0
     for name, report, shown in side_by_side(_fly, jobs, options.jobs):

@@ -47,10 +47,6 @@ class Verdict:
         far = np.hypot(self.errors_en_m[:, 0], self.errors_en_m[:, 1])
         return np.where(np.isnan(far), np.inf, far)
 
-    @property
-    def states_confidence(self) -> bool:
-        return bool(np.isfinite(self.confidence).any())
-
     def within(self, radius_m: float) -> NDArray[np.bool_]:
         """Mask (N,) of the views with an error of at most `radius_m`."""
         return self.errors_m <= radius_m
@@ -89,13 +85,11 @@ class Verdict:
         return float(checked.nees_mean)
 
 
-def placed(
-    locator: Locator, views: Iterable[FlownView], frame: LocalFrame, warm: bool = True
-) -> Verdict:
-    """Views located one after the other; where they are warm, the first one prepares the map."""
+def placed(locator: Locator, views: Iterable[FlownView], frame: LocalFrame) -> Verdict:
+    """Views located one after the other; the first one prepares the map."""
     rows: list[list[float]] = []
     for each in views:
-        if warm and not rows:
+        if not rows:
             locate_view(locator, each.view)
         outcome, took_ms = locate_view(locator, each.view)
         rows.append([*row_of(outcome, frame, each.truth_latlon_deg), took_ms])

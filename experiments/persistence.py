@@ -6,7 +6,6 @@ regression to `src/orthonav/ground/check/persistence.json`. Takes some five minu
 used nowhere else, so that landscapes of others test it.
 """
 
-import argparse
 import json
 from itertools import permutations
 from pathlib import Path
@@ -37,9 +36,6 @@ OUT = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "check" / MODE
 
 def main() -> None:
     """Fit the model, print how well it predicts a held-out seed, and write it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=OUT)
-    options = parser.parse_args()
     samples = {seed: _samples(seed) for seed in SEEDS}
     held_out = []
     for seed in SEEDS:
@@ -59,7 +55,7 @@ def main() -> None:
         "left_out_correlation_and_bias": np.round(held_out, 3).tolist(),
         "model": model.to_plain(),
     }
-    options.out.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    OUT.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
 
 def _samples(seed: int) -> tuple[Array, Array]:

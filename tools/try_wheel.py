@@ -191,7 +191,8 @@ def environment(path: Path, *requirements: str) -> Path:
     venv.create(path, with_pip=True)
     python = path / "bin" / "python"
     pip = ("-m", "pip", "--quiet", "--disable-pip-version-check", "install", "-c", CONSTRAINTS)
-    step(f"install {' '.join(map(_short, requirements))}", python, *pip, *requirements, cwd=path)
+    names = " ".join(each.rpartition("/")[2] for each in requirements)
+    step(f"install {names}", python, *pip, *requirements, cwd=path)
     return python
 
 
@@ -224,10 +225,6 @@ def step(name: str, *command: object, cwd: Path) -> None:
     print(f"{time.perf_counter() - start:6.1f} s  {name}", flush=True)
     if done.returncode != 0:
         raise SystemExit(f"{name} ended with {done.returncode}:\n{done.stdout[-4000:]}")
-
-
-def _short(requirement: str) -> str:
-    return requirement.rpartition("/")[2]
 
 
 if __name__ == "__main__":

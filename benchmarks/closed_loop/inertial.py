@@ -78,7 +78,6 @@ class Filter:
         self.tuning, self.motion = tuning, motion
         self.covariance = np.diag(np.square(stds))
         self.gyro_bias, self.accel_bias, self.wind = np.zeros(3), np.zeros(3), np.zeros(2)
-        self.resets = 0
         self._steps, self._fused_step = 0, 0
         self._felt = Increments(np.zeros(3), np.zeros(3))
         self._imu: deque[Increments] = deque()
@@ -183,7 +182,6 @@ class Filter:
         was = self.motion
         self.motion = Motion(np.array([*place_ne, was.position[2]]), was.velocity, was.rotation)
         self._fused_step = self._steps
-        self.resets += 1
 
     def fuse_height(self, height_m: float) -> None:
         """Fuse a height of the barometer."""

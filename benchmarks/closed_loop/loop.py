@@ -119,7 +119,6 @@ class Flown:
     scenario: Scenario
     samples: list[Sample] = field(default_factory=list)
     views: list[Located] = field(default_factory=list)
-    resets: int = 0
     withheld: dict[str, int] = field(default_factory=dict)
 
 
@@ -295,7 +294,6 @@ def fly(
         before = aircraft.motion
         aircraft.step(wind.next())
         estimator.feel(instruments.imu(increments(before, aircraft.motion)))
-    flown.resets = estimator.resets
     if sight is not None:
         flown.withheld = dict(sight.gate.withheld)
     return flown
@@ -393,7 +391,7 @@ SCENARIOS = ("gnss", "nothing", "fixes", "start", "shifted", "mirrored", "frozen
 LASTS_S = {"shifted": 40.0, "mirrored": 40.0, "frozen": 10.0}
 HEADER = (
     *("scenario", "position median m", "95 %", "max", "position NEES", "velocity m/s", "95 %"),
-    *("tilt deg", "fixes median m", "95 %", "NEES", "tilt correlation", "slope", "sent", "false"),
+    *("tilt deg", "fixes median m", "95 %", "NEES", "slope", "sent", "false"),
 )
 
 
@@ -414,17 +412,14 @@ def scenario(name: str, minutes: float, send: str) -> Scenario:
     return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, send, name, begin_s, lasts_s)
 
 
-def by_tilt(views: Sequence[Located]) -> list[str]:
-    """Correlations, ahead and right, of the errors of fixes with those that the error of the
-    stated tilt makes, and the slopes."""
+def slope_by_tilt(views: Sequence[Located]) -> str:
+    """Slopes, ahead and right, of the errors of fixes over those that the stated tilt makes."""
     if len(views) < 10:
-        return ["-", "-"]
+        return "-"
     errors = np.array([view.error_m for view in views]).T
     tilts = np.array([view.tilt_off_m for view in views]).T
     spreads = [np.cov(tilt, error) for tilt, error in zip(tilts, errors, strict=True)]
-    alike = [each[0, 1] / math.sqrt(each[0, 0] * each[1, 1]) for each in spreads]
-    slopes = [each[0, 1] / each[0, 0] for each in spreads]
-    return [", ".join(f"{value:.2f}" for value in values) for values in (alike, slopes)]
+    return ", ".join(f"{each[0, 1] / each[0, 0]:.2f}" for each in spreads)
 
 
 def cells(flown: Flown) -> list[str]:
@@ -445,7 +440,7 @@ def cells(flown: Flown) -> list[str]:
         number(math.sqrt(float((tilts**2).sum(1).mean()))),
         *quantiles(errors, 50, 95),
         number(float(np.mean([view.nees for view in sent]))) if sent else "-",
-        *by_tilt(sent),
+        slope_by_tilt(sent),
         f"{len(sent) / len(views):.0%}" if views else "-",
         str(sum(view.is_wrong for view in sent)) if views else "-",
     ]
@@ -470,7 +465,7 @@ def measure(options: argparse.Namespace) -> Section:
             say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
         f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; position, velocity, "
-        "tilt: errors of the autopilot; correlation, slope: of errors of fixes with height "
+        "tilt: errors of the autopilot; slope: of errors of fixes with height "
         "times the tangent of the autopilot's error of tilt, ahead and right; false: sent, and "
         f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )

@@ -220,20 +220,10 @@ def _shown(demo: Demo, exposure: Exposure, cache: Path) -> Grey:
 
 
 RECORDED = DATA / "closed_loop"
-METHODS = ("single", "single, no prior", "track")
+METHODS = ("single", "track")
 HEADER = (
-    *(
-        "flight",
-        "method",
-        "views",
-        "tilt deg",
-        "median m",
-        "95 % m",
-        "NEES",
-        "confident",
-        "tracking",
-    ),
-    *("velocity m/s", "300 m east", "mirrored"),
+    *("flight", "method", "views", "tilt deg", "median m", "95 % m", "NEES", "confident"),
+    *("tracking", "velocity m/s", "300 m east", "mirrored"),
 )
 Rule = Callable[[str, Telemetry, bool], Telemetry]
 """From the autopilot (px4, ardupilot), telemetry, and whether GNSS aids it."""
@@ -323,7 +313,6 @@ def replay(
     recorded, demo = Recorded(flight), Demo(work)
     locators: dict[str, Locator] = {
         "single": SingleViews(demo.localizer),
-        "single, no prior": SingleViews(demo.localizer, use_prior=False),
         "track": Tracker(demo.localizer),
     }
     gates = {name: Gate(clock=Clock.BOOT) for name in methods}

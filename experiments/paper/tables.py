@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.record import Table, number
+from benchmarks.scenes import far_m
 from numpy.typing import NDArray
 
 from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
 from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
 from experiments.paper.results import (
     ACCURACY_M,
-    EDGES,
-    FAMILIES,
     FIELD,
     TUNED,
     Result,
@@ -48,39 +47,15 @@ Published = Callable[[str, str, str], str]
 
 
 def report(out: Path, setting: str) -> Path | None:
-    """Write `tables.md` and the plot beside the result files; None without results."""
+    """Write `tables.md` beside the result files; None without results."""
     folder = out / setting
     results = read(folder)
     if not results:
         return None
-    text = [table.markdown() for table in tables(results)]
-    swept = [each for each in results if each.family and each.plain.get("sweep")]
-    if swept:
-        text.append(f"![sensitivity]({_plot(swept, folder / 'sensitivity.png').name})")
     path = folder / "tables.md"
-    path.write_text("\n".join([*text, ""]), encoding="utf-8")
+    text = "\n".join(table.markdown() for table in tables(results))
+    path.write_text(text + "\n", encoding="utf-8")
     return path
-
-
-def _plot(results: Sequence[Result], out: Path) -> Path:
-    """Accuracy at 15 m against heading and height errors, a column per method."""
-    from matplotlib.figure import Figure
-
-    families = list(dict.fromkeys(each.family for each in results))
-    figure = Figure((3.5 * len(families), 6), layout="constrained")
-    grid = figure.subplots(2, len(families), sharey=True, squeeze=False)
-    for row, (step, title) in enumerate(STEPS):
-        for axis, family in zip(grid[row], families, strict=True):
-            for each in (each for each in results if each.family == family):
-                sweep = each.plain["sweep"][step]
-                values = [100 * share(errors) for errors in sweep.values()]
-                name = "default" if each.registration else EDGES[each.edges]
-                axis.plot([float(value) for value in sweep], values, "o-", ms=3, label=name)
-            axis.set(xlabel=title, ylim=(0, 102), title=FAMILIES[family])
-            axis.legend(fontsize=8)
-        grid[row, 0].set_ylabel("within 15 m, %")
-    figure.savefig(out, dpi=110)
-    return out
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
@@ -357,10 +332,6 @@ def _above_row(scene: str, name: str, ours: Result, each: Result) -> list[str]:
     ]
 
 
-FAR_M, FAR_PX = 35.0, 10.0
-"""A position beyond both is wrong; pixels, for imagery on which 35 m are less than a view shows."""
-
-
 @dataclass(frozen=True, eq=False)
 class Placed:
     """What a method made of the views of one or several scenes.
@@ -380,7 +351,7 @@ class Placed:
         shapes = [each.plain["trajectory"] for each in rows if name in each.plain[FIELD]]
         views = [row for part in parts for row in part["views"]]
         far = [
-            max(FAR_M, FAR_PX * shape["gsd_m"])
+            far_m(shape["gsd_m"])
             for part, shape in zip(parts, shapes, strict=True)
             for _ in part["views"]
         ]
@@ -481,8 +452,8 @@ def _field_by_scene(rows: Sequence[Result], names: Sequence[str], shown: dict[st
     guess = ["the prior itself"]
     for each in rows:
         away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
-        far_m = max(FAR_M, FAR_PX * each.plain["trajectory"]["gsd_m"])
-        shares = (float((away <= radius).mean()) for radius in (ACCURACY_M, far_m))
+        radii = ACCURACY_M, far_m(each.plain["trajectory"]["gsd_m"])
+        shares = (float((away <= radius).mean()) for radius in radii)
         guess.append("/".join(map(percent, shares)))
     header = ("method", *(each.scene for each in rows))
     notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)

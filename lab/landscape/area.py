@@ -138,7 +138,6 @@ def _write_heights(
     report: Report,
     path: Path,
 ) -> None:
-    """Write heights."""
     from orthonav.ground.imagery.terrain import DATUM_TAG
 
     def rounded(window: PxWindow) -> NDArray[np.float32]:
@@ -168,7 +167,6 @@ def _write(
     report: Report,
     path: Path,
 ) -> None:
-    """Write an orthophoto."""
     west_m, north_m = ORIGIN_M[0], ORIGIN_M[1] + size_px[1] * gsd_m
 
     def rendered(window: PxWindow) -> NDArray[np.uint8]:

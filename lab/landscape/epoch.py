@@ -45,19 +45,6 @@ class Epoch:
     noise: float = 2.0
     water_level_m: float = 0.0
 
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        if not self.name or any(character in self.name for character in '/\\:*?"<>|'):
-            raise ValueError(f"epoch name must be a plain file stem, got {self.name!r}")
-        if not 1 <= self.month <= 12 or not 1 <= self.year <= 9999:
-            raise ValueError(f"epoch {self.name!r}: no such month: {self.year}-{self.month}")
-        if not 15.0 <= self.sun_elevation_deg <= 90.0:
-            raise ValueError(
-                f"epoch {self.name!r}: sun elevation {self.sun_elevation_deg} is not 15..90 deg"
-            )
-        if not 0.0 <= self.haze < 1.0:
-            raise ValueError(f"epoch {self.name!r}: haze must be in [0, 1), got {self.haze}")
-
     @property
     def time_years(self) -> float:
         """Time of the photograph in years, middle of the month."""

