@@ -38,7 +38,7 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     assert f"{out}/report/index.html" in printed.out and "4/4" in printed.err
     (picture,) = [word for word in printed.out.split() if word.endswith(".png")]
     assert picture.startswith(f"{out}/") and Path(picture).read_bytes().startswith(b"\x89PNG")
-    assert f"{out}/check/index.html" in printed.out and "expected to give a correct" in printed.out
+    assert f"{out}/check/index.html" in printed.out and "\ncheck      " in printed.out
     assert json.loads((out / "check" / "check.json").read_text())["route"]["name"] == "demo"
     names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]
     assert {"area.onav", "demo.json", "check", "fixes.jsonl", "flight", "report"} <= set(names)

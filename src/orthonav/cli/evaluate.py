@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from orthonav.ground.evaluate.contact_sheet import Row
     from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
-    from orthonav.ground.report.drawing import Background
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -154,15 +153,19 @@ def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedG
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
+    from orthonav.core.mapfile.layer import preview
     from orthonav.ground.evaluate.contact_sheet import worst_rows
     from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.evaluate.track import measure_gnss, measure_track
+    from orthonav.ground.report.drawing import Background
     from orthonav.ground.report.imagery import SheetImagery
 
     sheet = SheetImagery(opened) if opened else None
     local = sheet.frame if sheet else None
-    background = map_background(opened) if opened else None
+    background = None
+    if opened:
+        background = Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)
     folders = [open_flight(path, images_needed=False) for path in options.flight]
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
@@ -239,10 +242,3 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
     if options.radius_m != 15.0:
         words += ["--radius-m", f"{options.radius_m:g}"]
     return shlex.join(words)
-
-
-def map_background(opened: "MapFile") -> "Background":
-    from orthonav.core.mapfile.layer import preview
-    from orthonav.ground.report.drawing import Background
-
-    return Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)

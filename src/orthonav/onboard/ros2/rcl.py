@@ -3,10 +3,10 @@
 Messages stay serialized on both sides: their definitions are those of the node over DDS.
 """
 
-import importlib
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict
+from importlib import import_module
 from typing import Any
 
 from orthonav.core.errors import OutputError
@@ -27,7 +27,7 @@ def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Gra
     """A node by `rclpy` where a ROS environment is sourced, else over DDS."""
     if environment.get("AMENT_PREFIX_PATH"):
         try:
-            importlib.import_module("rclpy")
+            import_module("rclpy")
         except ImportError as error:
             log.warning("rclpy of the sourced ROS environment cannot be used (%s)", error)
         else:
@@ -56,7 +56,7 @@ class RclWriter:
 class RclNode(Graph):
     def __init__(self, arguments: RosArguments) -> None:
         super().__init__(arguments)
-        self._rclpy, self._qos = _module("rclpy"), _module("rclpy.qos")
+        self._rclpy, self._qos = import_module("rclpy"), import_module("rclpy.qos")
         self._subscriptions: list[tuple[Any, str]] = []
         self._handled = 0
         self._publishers: list[tuple[Any, str]] = []
@@ -65,10 +65,10 @@ class RclNode(Graph):
             self._rclpy.init(
                 args=["--ros-args", *arguments.passed],
                 context=self._context,
-                signal_handler_options=_module("rclpy.signals").SignalHandlerOptions.NO,
+                signal_handler_options=import_module("rclpy.signals").SignalHandlerOptions.NO,
             )
             own = asdict(arguments.parameters)
-            made = _module("rclpy.parameter").Parameter
+            made = import_module("rclpy.parameter").Parameter
             self._node = self._rclpy.create_node(
                 arguments.node,
                 namespace=arguments.namespace,
@@ -79,11 +79,13 @@ class RclNode(Graph):
             )
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot join the ROS graph: {error}") from error
-        read_only = _module("rcl_interfaces.msg").ParameterDescriptor(read_only=True)
+        read_only = import_module("rcl_interfaces.msg").ParameterDescriptor(read_only=True)
         for name, value in own.items():
             if not self._node.has_parameter(name):
                 self._node.declare_parameter(name, value, read_only)
-        self._executor = _module("rclpy.executors").SingleThreadedExecutor(context=self._context)
+        self._executor = import_module("rclpy.executors").SingleThreadedExecutor(
+            context=self._context
+        )
         self._executor.add_node(self._node)
 
     def subscribe(
@@ -161,11 +163,7 @@ class RclNode(Graph):
         )
 
 
-def _module(name: str) -> Any:
-    return importlib.import_module(name)
-
-
 def _message(kind: str) -> Any:
     """The class of a message type of ROS. Raises `ImportError` where ROS does not have it."""
     package, _, name = kind.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
+    return getattr(import_module(f"{package}.msg"), name)
