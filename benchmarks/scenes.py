@@ -7,6 +7,7 @@ after the code that makes them has changed.
 """
 
 import hashlib
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -250,3 +251,8 @@ def chosen(pairs: Sequence[Pair], only: Sequence[str] | None) -> list[Pair]:
 def far_m(gsd_m: float) -> float:
     """Error beyond which a position is wrong."""
     return max(FAR_M, FAR_PX * gsd_m)
+
+
+def root_agl_of(width_px: float, gsd_m: float) -> float:
+    """Height from which the root of the area of a view is so many pixels of the map."""
+    return width_px * gsd_m / math.sqrt(math.prod(DEFAULT_CAMERA.extent))

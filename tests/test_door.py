@@ -1,5 +1,6 @@
 """What `import orthonav` gives, and the examples that use it."""
 
+import inspect
 import json
 import shutil
 import subprocess
@@ -33,6 +34,16 @@ def test_public_names_are_there_and_loaded_when_used():
         orthonav.nothing  # noqa: B018 - the attribute is the test
     code = "import sys, orthonav; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_public_names_and_their_methods_are_documented():
+    for name in orthonav.__all__:
+        found = getattr(orthonav, name)
+        if callable(found):
+            parts = vars(found).items() if isinstance(found, type) else ()
+            methods = {n: m for n, m in parts if callable(m) and not n.startswith("_")}
+            bare = [n for n, m in {name: found, **methods}.items() if not inspect.getdoc(m)]
+            assert not bare, f"{name}: {bare}"
 
 
 def test_an_image_is_localized_and_followed(map_path, area, flight, flight_path):

@@ -275,6 +275,14 @@ def same(one, other):
     return values[0] == values[1] and (one.cov_en_m2 == other.cov_en_m2).all()
 
 
+def test_a_narrow_prior_does_not_raise_the_confidence_of_negatives(localizer):
+    """With hardly any place to choose from, a wrong one does not look right."""
+    for place in ((40.0, -25.0), (-100.0, 60.0)):
+        prior = prior_at(localizer, np.array(place), 3.0)
+        outcome = localizer.locate(View(mirrored(place), CAMERA, telemetry(33.0)), prior=prior)
+        assert isinstance(outcome, NoFix) or outcome.confidence < 0.7
+
+
 def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
     threaded = Localizer(open_map(map_path), plan=planned(threads=3))
     view = View(plain[0], CAMERA, plain[1])

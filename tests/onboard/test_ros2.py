@@ -34,6 +34,9 @@ from orthonav.core.records import ViewResult, error_ellipse
 from orthonav.ground.recordings.opening import open_source
 from orthonav.onboard.messages.estimate import (
     Clock,
+    EstimateError,
+    NavigationEstimate,
+    floored,
     messages_averaged,
 )
 from orthonav.onboard.messages.gate import Gate, GateRules
@@ -382,6 +385,12 @@ def test_lost_images_are_a_problem_of_their_topic(arrive, is_lost):
     assert (lost.reason() is not None) is is_lost
 
 
+def test_images_without_camera_info_are_not_lost():
+    lost = LostImages()
+    lost.images.extend(range(0, 100 * S, S))
+    assert lost.reason() is None
+
+
 def test_stamps_that_go_back(peer, reading, caplog):
     flying = joined(peer, reading, *SEEN)
     now_ns = time.time_ns()
@@ -590,6 +599,16 @@ def test_covariances_are_for_filters(peer, publishing):
     assert full[:2, :2] == pytest.approx(COV * averaged)
 
 
+def test_covariances_of_the_fix_on_request(env, peer, publishing):
+    flying = publishing("-p", "covariance:=fix")
+    for time_s in (7, 8, 9):
+        flying.publish(fix(), time_s * S)
+    wait_for(lambda: len(peer.heard("/orthonav/fix")) > 2)
+    for each in peer.heard("/orthonav/fix"):
+        full = np.reshape(each.position_covariance, (3, 3))
+        assert full[:2, :2] == pytest.approx(COV)
+
+
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [("none", math.nan), ("terrain", 512.0), ("home", 260.0), ("-3.5", -3.5)],
@@ -621,12 +640,27 @@ def test_withheld_positions_are_not_published(peer, publishing, changes, reason)
     assert len(wait_for(lambda: peer.heard("/orthonav/pose"))) == 1
 
 
+def test_the_publisher_itself_refuses_a_low_confidence(publishing):
+    flying = publishing()
+    with pytest.raises(EstimateError, match="NavSatFix"):
+        flying.out.position(
+            NavigationEstimate(47.0, 8.0, COV, 0.5, utc_ns=1), VehicleState(None), 1
+        )
+
+
 def test_a_dry_run_sends_health_and_no_position(peer, publishing):
     flying = publishing(silent=True)
     assert flying.publish(fix()) == ()
     flying.whole.health({"health": "OK", "reasons": []})
     wait_for(lambda: peer.heard("/diagnostics"))
     assert peer.heard("/orthonav/fix") == peer.heard("/orthonav/pose") == []
+
+
+def test_min_std_m_is_a_bound_in_every_direction():
+    assert np.linalg.eigvalsh(floored(COV, 4.5)).tolist() == pytest.approx(
+        [4.5**2, np.linalg.eigvalsh(COV)[1]]
+    )
+    assert floored(COV, 0.0) == pytest.approx(COV)
 
 
 def test_the_origin_is_latched_for_later_subscribers(peer, publishing):
