@@ -87,3 +87,18 @@ def test_a_growing_latency_is_noticed_before_it_matters():
     flight = ComputedFlight(Flown(70, seed=3), 0.12, lambda at_s: 0.12 + 0.1 * max(0, at_s - 25))
     errors = [error_m for _, error_m in sent(flight.fly(40))]
     assert max(errors) < 13.0  # 15 m/s; without a comparison it would be 22 m
+
+
+@pytest.mark.parametrize("late_s", [0.6, 1.0, 2.0])
+def test_calm_flight_does_not_clear_a_latency_that_turns_contradicted(late_s):
+    flown = Flown(80, turns_until_s=30, turbulence_deg=0.05, seed=1)
+    flight = ComputedFlight(flown, 0.12, lambda at_s: late_s)
+    images = flight.fly(70)
+    assert not [at_s for at_s, error_m in sent(images) if at_s > 30]
+
+
+def test_a_steady_orbit_does_not_clear_a_jump():
+    flown = Flown(100, turns_until_s=30, then_deg_s=12.0, turbulence_deg=0.05, seed=2)
+    flight = ComputedFlight(flown, 0.12, lambda at_s: 0.12 if at_s < 25 else 2.0)
+    flight.fly(32)
+    assert not sent(flight.fly(90))

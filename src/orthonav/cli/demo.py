@@ -98,7 +98,7 @@ def _is_earlier_demo(out: Path) -> bool:
     names = {path.name for path in out.iterdir()}
     known = {MARKER, "area.onav", "check", "fixes.jsonl", "flight", "report", "route.geojson"}
     made = isinstance(plain, dict) and plain.get("made_by") == "orthonav demo"
-    return made and all(name in known or name.endswith(".tif") for name in names)
+    return made and all(name in known or name.endswith((".tif", ".tif.aux.xml")) for name in names)
 
 
 def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -59,6 +59,8 @@ TELEMETRY_WAIT_S = 0.15
 """Longest wait for telemetry after the exposure: three attitudes at 20 Hz, the least rate."""
 JUMP_NS = 10**9
 """Recorded images that are earlier than the one before by more belong to another run."""
+ASSUMED_MPS = 20.0
+"""Speed assumed in the error of the latency where none is known."""
 _POLL_S = 0.001
 Grey = NDArray[np.uint8]
 Velocity = tuple[float, float]
@@ -613,12 +615,13 @@ def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> 
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
-    """Fix whose covariance includes the distance flown in the standard deviation of the latency."""
+    """Fix whose covariance includes the distance flown in the standard deviation of the latency, in
+    all directions where the velocity is not known."""
     evidence = fix.evidence
     own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
     velocity = np.array(telemetry.vel_en_mps or own)
     if not np.isfinite(velocity).all():
-        return fix
+        return replace(fix, cov_en_m2=fix.cov_en_m2 + (std_s * ASSUMED_MPS) ** 2 * np.eye(2))
     return replace(fix, cov_en_m2=fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
 
 

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,8 @@ from orthonav.onboard.motion import (
 from orthonav.onboard.telemetry import VehicleState
 
 UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
+LARGEST_STD_S = 0.3
+"""A latency that is known less well is refused: 5 m at 15 m/s."""
 STATED_STD_S = 0.03
 """Least standard deviation of a stated latency: one image at 30 Hz."""
 FIRST_NS = 5 * 10**9
@@ -98,7 +101,7 @@ class LatencyMonitor:
         self._interruptions = 0
         self._frozen_ns: int | None = None
         self._first_ns: int | None = None
-        self._compared = self._contradicted = False
+        self._compared = self._contradicted = self._in_motion = False
         self._jump_s: float | None = None
 
     def latency(self, arrived_ns: int, interruptions: int = 0) -> Latency:
@@ -144,13 +147,17 @@ class LatencyMonitor:
             self._first_ns = arrived_ns
         self._sample(state_at, covered_ns)
         self._check.add(self._odometry.motion(grey, camera, arrived_ns), self._history)
-        share = self._check.share()
-        agree = share >= EXPLAINED
+        found = self._check.compared()
+        agree = found.varying >= EXPLAINED
         self._compared |= agree or arrived_ns - self._first_ns > FIRST_NS
-        if share < UNEXPLAINED:
+        if found.share < UNEXPLAINED:
             self._contradicted, self._doubted_ns = True, arrived_ns
-        elif arrived_ns - self._doubted_ns > SETTLED_NS:  # steady turns look alike at any latency
-            self._contradicted &= not self._check.is_filled
+            self._in_motion |= found.is_reported
+        elif arrived_ns - self._doubted_ns > SETTLED_NS and self._check.is_filled:
+            # Calm and steady flight look alike at any latency: only varying motion clears it.
+            # Motion that was seen and not reported was none of the aircraft, and is over.
+            if agree or not self._in_motion:
+                self._contradicted = self._in_motion = False
             self._jump_s = None if agree else self._jump_s
 
     @property
@@ -171,6 +178,11 @@ class LatencyMonitor:
         if not self._is_stated:
             advice = "give --camera-latency-ms, as `orthonav calibrate --latency` measures it"
             return UNKNOWN, f"camera latency not known: {advice}"
+        if not self._std_s <= LARGEST_STD_S:
+            return (
+                UNKNOWN,
+                f"camera latency known to {self._std_s * 1e3:.0f} ms only: measure it again",
+            )
         if self._contradicted:
             causes = "--camera-latency-ms, --mount-deg, the height and the heading"
             return MISMATCH, f"images do not move as the autopilot reports: check {causes}"
@@ -201,6 +213,18 @@ class LatencyMonitor:
         self._check.clear()
 
 
+class Compared(NamedTuple):
+    """Comparison of the last motion that images show with the reported one.
+
+    `share`: of the motion that is both seen and reported, `varying`: the same without steady turns;
+    NaN where little moved. `is_reported`: the aircraft moved by the report.
+    """
+
+    share: float = math.nan
+    varying: float = math.nan
+    is_reported: bool = False
+
+
 class MotionCheck:
     """Whether the images of the last seconds move as the autopilot reports. Mutable."""
 
@@ -227,15 +251,15 @@ class MotionCheck:
             if np.isfinite(row[:7]).all():
                 self._rows.append((one.end_ns, row))
 
-    def share(self) -> float:
-        """Share of the last motion that is seen and reported; NaN where little moved."""
+    def compared(self) -> Compared:
+        """The motion of the last seconds beside the reported one."""
         while self._rows and self._rows[0][0] < self._rows[-1][0] - SECONDS * 1e9:
             self._rows.popleft()
         if not self.is_filled:
-            return math.nan
+            return Compared()
         pairs = np.array([row for _, row in self._rows])
-        if not np.isfinite(pairs).all():  # without the velocity only turns can be compared
-            pairs[:, [2, 3, 5, 6, 7, 8]] = 0.0
+        unknown = ~np.isfinite(pairs).all(axis=1)  # without the velocity only turns can be compared
+        pairs[np.ix_(unknown, [2, 3, 5, 6, 7, 8])] = 0.0
         pairs = _sound(pairs)
         # Sums over successive pairs: jitter of the attitudes cancels, motion adds up.
         rows = np.lib.stride_tricks.sliding_window_view(pairs, SUMMED, axis=0).sum(axis=-1)
@@ -243,14 +267,23 @@ class MotionCheck:
         # The constant part of the shift depends on height and heading, which may be off.
         velocity = rows[:, 7:9]
         seen_by_velocity = rows[:, 2:4] - rows[:, 5:7]
-        if self._contradicts(seen_by_velocity / seconds, velocity / seconds):
-            return 0.0
-        shift_off = seen_by_velocity - velocity
-        shift_off = shift_off - np.median(shift_off / seconds, axis=0) * seconds
-        turn_off = rows[:, 1] - rows[:, 4]
-        return explained_share(
-            rows[:, 0], rows[:, 1], rows[:, 2:4], turn_off, shift_off, STANDS_OUT
+        reported_shift = _varying(rows[:, 5:7] + velocity, seconds)
+        is_reported = bool(
+            np.square(rows[:, 4]).mean() > (STANDS_OUT * TURN_STD_RAD) ** 2
+            or np.square(reported_shift).sum(axis=1).mean() > (STANDS_OUT * SHIFT_STD) ** 2
         )
+        if self._contradicts(seen_by_velocity / seconds, velocity / seconds):
+            return Compared(0.0, 0.0, is_reported)
+        shift_off = _varying(seen_by_velocity - velocity, seconds)
+        turn, turn_off = rows[:, 1:2], rows[:, 1:2] - rows[:, 4:5]
+
+        def share(turn: Array, turn_off: Array) -> float:
+            return explained_share(
+                rows[:, 0], turn[:, 0], rows[:, 2:4], turn_off[:, 0], shift_off, STANDS_OUT
+            )
+
+        varying = share(_varying(turn, seconds), _varying(turn_off, seconds))
+        return Compared(share(turn, turn_off), varying, is_reported)
 
     @property
     def is_filled(self) -> bool:
@@ -264,6 +297,11 @@ class MotionCheck:
             return False
         along = float(seen @ reported) / size if self._heading_known else float(np.hypot(*seen))
         return not SCALES[0] < along / size < SCALES[1]
+
+
+def _varying(values: Array, seconds: Array) -> Array:
+    """Values (N, K) of durations (N, 1) without their median rate."""
+    return np.asarray(values - np.median(values / seconds, axis=0) * seconds)
 
 
 def _sound(pairs: Array) -> Array:

@@ -75,6 +75,9 @@ class CellSource:
     reader: Callable[[Web, Selection, Path], CellReader]
 
 
+NO_HEIGHT_M = -32768
+
+
 def service_source(
     spec: SourceSpec,
     grid: CellGrid,
@@ -98,6 +101,8 @@ def service_source(
         (row0, col0), (rows_px, cols_px) = selection.first, selection.shape_px
         west, north = grid.corner(row0, col0)
         tile_row = rows_px // height - 2**level + row0 if from_south else row0
+        # Blocks without content are filled with it, and `_heights` refuses it.
+        no_data = {f'DataValues NoData="{NO_HEIGHT_M}"': None} if heights else {}
         description = _xml(
             "GDAL_WMS",
             {
@@ -114,6 +119,7 @@ def service_source(
                 },
                 "Projection": grid.crs,
                 "BandsCount": 1 if heights else 4,
+                **no_data,
                 "DataType": "Float32" if heights else "Byte",
                 "BlockSizeX": width,
                 "BlockSizeY": height,
@@ -139,6 +145,8 @@ def service_source(
 
 
 def _xml(tag: str, content: Any) -> str:
+    if content is None:
+        return f"<{tag}/>"
     if isinstance(content, dict):
         inner = "".join(_xml(name, value) for name, value in content.items())
     else:
