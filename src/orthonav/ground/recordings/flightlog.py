@@ -209,22 +209,27 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
 
 def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is given."""
-    folder = path if path.is_dir() else path.parent
-    files = sorted(file for file in folder.glob("*.mcap") if profile_of(file) == PROFILE)
+    if not path.is_dir():
+        return _from_file(path)
+    files = sorted(file for file in path.glob("*.mcap") if profile_of(file) == PROFILE)
     found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
-    if path.is_dir():
-        runs = {run: file for file, run in reversed(found.items())}
-        if len(runs) > 1:
-            names = ", ".join(sorted(file.name for file in runs.values())[:5])
-            raise FlightError(
-                f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
-            )
-        return list(found)
+    runs = {run: file for file, run in reversed(found.items())}
+    if len(runs) > 1:
+        names = ", ".join(sorted(file.name for file in runs.values())[:5])
+        raise FlightError(
+            f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
+        )
+    return list(found)
+
+
+def _from_file(path: Path) -> list[Path]:
+    """A file and those of its name that continue its run; other files are not opened."""
     name, number = _order(path)
-    if _NUMBERED.fullmatch(path.name) is None or path not in found:
+    if _NUMBERED.fullmatch(path.name) is None or (run := run_of(path)) is None:
         return [path]
-    numbered = [each for each in found if found[each] == found[path] and _order(each)[0] == name]
-    return [each for each in numbered if _order(each)[1] >= number]
+    others = (each for each in path.parent.glob("*.mcap") if _order(each)[0] == name)
+    later = sorted((each for each in others if _order(each)[1] > number), key=_order)
+    return [path, *(each for each in later if run_of(each) == run)]
 
 
 def _order(path: Path) -> tuple[str, int]:
