@@ -293,6 +293,8 @@ def plain(autopilot: str, telemetry: Telemetry, gnss: bool) -> Telemetry:
 def flights(only: Sequence[str] = ()) -> list[Path]:
     """Folders of the recorded flights; empty where they are absent."""
     found = sorted(path.parent for path in RECORDED.glob("*/exposures.csv"))
+    if unknown := set(only) - {path.name for path in found}:
+        raise SystemExit(f"no such flight: {', '.join(sorted(unknown))}")
     return [path for path in found if not only or path.name in only]
 
 
