@@ -124,10 +124,8 @@ class LiveCamera:
         if before_ns is None:
             return
         gap_s = (arrived_ns - before_ns) / 1e9
-        if gap_s > max(GAP_S, GAP_INTERVALS * median(self._intervals_s)):
-            self._interruptions += 1
-        else:
-            self._intervals_s.append(gap_s)
+        self._interruptions += gap_s > max(GAP_S, GAP_INTERVALS * median(self._intervals_s))
+        self._intervals_s.append(gap_s)
 
     def _open(self) -> Any:
         capture = self._opener(self._name)
