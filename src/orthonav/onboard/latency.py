@@ -25,7 +25,8 @@ from orthonav.onboard.motion import (
     ImageMotion,
     PictureOdometry,
     StateHistory,
-    explained_share,
+    explained_part,
+    varying,
 )
 from orthonav.onboard.telemetry import VehicleState
 
@@ -263,27 +264,29 @@ class MotionCheck:
         pairs = _sound(pairs)
         # Sums over successive pairs: jitter of the attitudes cancels, motion adds up.
         rows = np.lib.stride_tricks.sliding_window_view(pairs, SUMMED, axis=0).sum(axis=-1)
-        seconds = rows[:, :1]
+        seconds = rows[:, 0]
         # The constant part of the shift depends on height and heading, which may be off.
         velocity = rows[:, 7:9]
         seen_by_velocity = rows[:, 2:4] - rows[:, 5:7]
-        reported_shift = _varying(rows[:, 5:7] + velocity, seconds)
+        reported_shift = varying(rows[:, 5:7] + velocity, seconds)
         is_reported = bool(
             np.square(rows[:, 4]).mean() > (STANDS_OUT * TURN_STD_RAD) ** 2
             or np.square(reported_shift).sum(axis=1).mean() > (STANDS_OUT * SHIFT_STD) ** 2
         )
-        if self._contradicts(seen_by_velocity / seconds, velocity / seconds):
+        if self._contradicts(seen_by_velocity / rows[:, :1], velocity / rows[:, :1]):
             return Compared(0.0, 0.0, is_reported)
-        shift_off = _varying(seen_by_velocity - velocity, seconds)
         turn, turn_off = rows[:, 1:2], rows[:, 1:2] - rows[:, 4:5]
-
-        def share(turn: Array, turn_off: Array) -> float:
-            return explained_share(
-                rows[:, 0], turn[:, 0], rows[:, 2:4], turn_off[:, 0], shift_off, STANDS_OUT
-            )
-
-        varying = share(_varying(turn, seconds), _varying(turn_off, seconds))
-        return Compared(share(turn, turn_off), varying, is_reported)
+        turn_least = STANDS_OUT * TURN_STD_RAD
+        shifted = explained_part(
+            varying(rows[:, 2:4], seconds),
+            varying(seen_by_velocity - velocity, seconds),
+            STANDS_OUT * SHIFT_STD,
+        )
+        turned = explained_part(turn, turn_off, turn_least)
+        turning = explained_part(varying(turn, seconds), varying(turn_off, seconds), turn_least)
+        return Compared(
+            float(np.fmin(turned, shifted)), float(np.fmin(turning, shifted)), is_reported
+        )
 
     @property
     def is_filled(self) -> bool:
@@ -297,11 +300,6 @@ class MotionCheck:
             return False
         along = float(seen @ reported) / size if self._heading_known else float(np.hypot(*seen))
         return not SCALES[0] < along / size < SCALES[1]
-
-
-def _varying(values: Array, seconds: Array) -> Array:
-    """Values (N, K) of durations (N, 1) without their median rate."""
-    return np.asarray(values - np.median(values / seconds, axis=0) * seconds)
 
 
 def _sound(pairs: Array) -> Array:

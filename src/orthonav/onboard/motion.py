@@ -250,22 +250,17 @@ class StateHistory:
         return np.asarray(np.where(known[:, None], values, math.nan))
 
 
-def explained_share(
-    seconds: Array, turn: Array, shift: Array, turn_off: Array, shift_off: Array, stands_out: float
-) -> float:
-    """Least share of the motion that is explained, of turn (N,) and of the varying part of shift
-    (N, 2), where it is at least `stands_out` least standard deviations; NaN where neither is.
+def varying(values: Array, seconds: Array) -> Array:
+    """Values (N, K) of durations (N,) without their median rate."""
+    rates = np.median(values / seconds[:, None], axis=0)
+    return np.asarray(values - rates * seconds[:, None])
 
-    `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.
-    """
-    varying = shift - np.median(shift / seconds[:, None], axis=0) * seconds[:, None]
-    parts = ((turn[:, None], turn_off[:, None], TURN_STD_RAD), (varying, shift_off, SHIFT_STD))
-    shares = []
-    for seen, off, least in parts:
-        seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
-        modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
-        used = np.argsort(off2)[: round((1 - TRIMMED) * len(off2))]
-        moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
-        if moved > (stands_out * least) ** 2:
-            shares.append(1 - float(off2[used].mean()) / moved)
-    return min(shares) if shares else float("nan")
+
+def explained_part(seen: Array, off: Array, least: float) -> float:
+    """Share of seen motion (N, K) that is explained, `off`: seen less reported; NaN where neither
+    is at least `least`."""
+    seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
+    modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
+    used = np.argsort(off2)[: round((1 - TRIMMED) * len(off2))]
+    moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
+    return 1 - float(off2[used].mean()) / moved if moved > least**2 else math.nan

@@ -34,7 +34,8 @@ from orthonav.onboard.motion import (
     ImageMotion,
     PictureOdometry,
     StateHistory,
-    explained_share,
+    explained_part,
+    varying,
 )
 
 GAP_S = 1.0  # longest interval between views over which telemetry is interpolated
@@ -153,6 +154,19 @@ class LatencyEstimate:
     def found(self) -> bool:
         """Whether the latency was observable."""
         return math.isfinite(self.delay_s)
+
+
+def explained_share(
+    seconds: Array, turn: Array, shift: Array, turn_off: Array, shift_off: Array, stands_out: float
+) -> float:
+    """Least share of the motion that is explained, of turn (N,) and of the varying part of shift
+    (N, 2), where it is at least `stands_out` least standard deviations; NaN where neither is.
+
+    `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.
+    """
+    turned = explained_part(turn[:, None], turn_off[:, None], stands_out * TURN_STD_RAD)
+    shifted = explained_part(varying(shift, seconds), shift_off, stands_out * SHIFT_STD)
+    return float(np.fmin(turned, shifted))
 
 
 class LatencyEstimator:
