@@ -72,7 +72,7 @@ class MapErrors:
     `mount_m`: constant in the aircraft at `agl_m`, as from a tilted mount. `local_m`,
     `local_tau_s`: slowly varying. `white_m`: from view to view. `displaced_m`: length of the
     constant displacement. `gaps_per_hour`: stretches of 10 to 90 s without confident positions.
-    `outlier_share`: share of confident positions that are 20 to 150 m off. `pitch_deg`: error of
+    `outlier_share`: fraction of confident positions that are 20 to 150 m off. `pitch_deg`: error of
     the reported pitch, which the position does not state. `late_s`: the images are older than
     assumed.
     """

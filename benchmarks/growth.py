@@ -30,7 +30,7 @@ class Case:
     - `side_m`: side of the map's area.
     - `ground_m`: ground that the shorter side of a view covers.
     - `yaw_std_deg`: standard deviation of the reported heading; None: heading unknown.
-    - `agl_std`: that of the reported height, as a share of it.
+    - `agl_std`: that of the reported height, as a fraction of it.
     - `prior_std_m`: that of the prior; None: no prior.
     """
 

@@ -23,7 +23,7 @@ from orthonav.core.mapfile import open_map
 NAME = "soak"
 RATE_HZ, LEAD_S, LOG_MB = 5, 6.0, 40
 WARM_UP, BLOCKS = 0.2, 10
-"""Share of the flight that caches may take to fill, and into how many parts the rest is cut."""
+"""Fraction of the flight that caches may take to fill, and into how many parts the rest is cut."""
 Array = NDArray[np.float64]
 
 
@@ -71,7 +71,7 @@ def measure(options: argparse.Namespace) -> Section:
     rows = [
         *table,
         ["largest of all (VmHWM), MB", number(samples[-1].peak_mb)],
-        ["share of the core", f"{cpu_s / wall_s:.0%}"],
+        ["fraction of the core", f"{cpu_s / wall_s:.0%}"],
         ["exit code", str(fly.process.returncode)],
     ]
     notes = (

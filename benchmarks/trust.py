@@ -73,7 +73,7 @@ class Case:
     - `kind`: `found`, or those that are not on the map or not there: `mirrored`, `other scene`,
       `beside`, `other prior` (that of another view).
     - `width_px`: shorter side of the view on the ground, pixels of the map.
-    - `share`: number of views, as a share of the requested one.
+    - `share`: number of views, as a fraction of the requested one.
     - `heading_known`: whether the reported heading is used; `prior_px`: standard deviation of a
       prior position, pixels of the map, None without.
     - `tracked`: heading and height are known as a track knows them.

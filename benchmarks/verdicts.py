@@ -68,7 +68,7 @@ class Verdict:
         return int((self.accepted & (self.errors_m > FAR_M)).sum())
 
     def accepted_of_right(self, radius_m: float) -> float:
-        """Share of the correct views that is accepted; NaN if no view is correct."""
+        """Fraction of the correct views that is accepted; NaN if no view is correct."""
         right = self.within(radius_m)
         return float(self.accepted[right].mean()) if right.any() else math.nan
 

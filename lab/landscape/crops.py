@@ -11,7 +11,7 @@ from lab.landscape.noise import Float32, Float64, key_of, uniform
 from lab.landscape.parcels import LandCover
 from lab.landscape.plan import CellPlan
 
-# Share of the fields; display colours in spring, summer and autumn; rows of the crop: strength,
+# Fraction of the fields; display colours in spring, summer and autumn; rows of the crop: strength,
 # spacing (m), strength of the tractor lanes.
 _Colours = tuple[tuple[int, int, int], ...]
 _CROPS: tuple[tuple[str, float, _Colours, tuple[float, float, float]], ...] = (

@@ -25,7 +25,7 @@ class Epoch:
     season: column of the crop and leaf colours.
     sun_azimuth_deg: direction to the sun, degrees clockwise from north.
     sun_elevation_deg: elevation of the sun above the horizon, degrees, 15..90.
-    haze: share of scattered light, 0..1.
+    haze: fraction of scattered light, 0..1.
     exposure, contrast: factors on brightness and on its spread; 1 is neutral.
     white_balance: factors on red, green and blue; 1 is neutral.
     noise: standard deviation of the sensor noise, grey levels.

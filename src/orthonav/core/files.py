@@ -12,7 +12,7 @@ from pathlib import Path
 from orthonav.core.errors import MissingFileError, OutputError, lfs_pointer
 
 Progress = Callable[[str, float], None]
-"""Receives the stage of a long task and the share of it that is done, 0 to 1."""
+"""Receives the stage of a long task and the fraction of it that is done, 0 to 1."""
 
 
 def no_progress(stage: str, share: float) -> None:

@@ -294,7 +294,7 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
     return np.rint(array * scale).astype(np.uint8)
 
 
-_ROUNDING = 1e-9  # negative eigenvalues up to this share of the largest are rounding errors
+_ROUNDING = 1e-9  # negative eigenvalues up to this fraction of the largest are rounding errors
 
 
 def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -45,7 +45,7 @@ GAP_S = 0.5
 SETTLED_NS = 8 * 10**9
 """After images or positions contradicted the latency, nothing may contradict it for so long."""
 EXPLAINED, UNEXPLAINED = 0.6, 0.3
-"""Shares of the motion common to images and report from which they agree, below which not."""
+"""Fractions of the motion common to images and report from which they agree, below which not."""
 SECONDS, LEAST_PAIRS = 4.0, 12
 """Images of so many seconds are compared, at least so many pairs."""
 LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)

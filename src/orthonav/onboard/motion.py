@@ -33,7 +33,7 @@ TURN_STD_RAD, SHIFT_STD = 0.003, 0.004
 """Least standard deviations of differences: attitudes of autopilots jitter by about 0.1 deg, and
 corners are found to 0.1 px where the focal length is 200 px."""
 TRIMMED = 0.2
-"""Share of the pairs, those that fit worst, that is left out of the explained share."""
+"""Fraction of the pairs, those that fit worst, that is left out of the explained share."""
 KEEP_S = 60.0
 """States are kept for so long: the longest latency, 30 s of motion, and some more."""
 GAP_S = 0.3

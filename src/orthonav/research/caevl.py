@@ -37,7 +37,7 @@ GEOMETRY, LIGHT = 0.8, 0.5
 """Probability of a change of geometry, and of each of blur, contrast and brightness."""
 TURN_DEG, SHIFT_PX, SHIFTED, LEAST_AREA = 30.0, 10.0, 0.75, 0.7
 """Largest rotation; largest displacement along an axis, at 256 px, and its probability; smallest
-share of a tile that is magnified."""
+fraction of a tile that is magnified."""
 SIDE_PX = 256.0
 BLUR_PX, BLUR_KERNEL = (0.1, 2.0), 5
 CONTRAST, BRIGHTNESS = (0.1, 2.0), (1.0, 2.0)

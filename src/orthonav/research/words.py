@@ -97,7 +97,7 @@ def learn_words(
 
     k-means of at most 40 descriptors per word, and at least 100000, drawn evenly from all; the
     same seed gives the same words. With `tfidf`, a word found in n of N pictures weighs
-    log((N + 1) / n), counted on the descriptors drawn. `progress` is called with the share of
+    log((N + 1) / n), counted on the descriptors drawn. `progress` is called with the fraction of
     k-means done. Raises `VariantError` if there are fewer descriptors than words,
     `MissingExtraError` without faiss.
     """

@@ -25,7 +25,7 @@ Undulation = Callable[[Array, Array], Array]
 USUAL_MPS = 30.0
 """Speed at which a position ages where none is reported: that of a fast small aircraft."""
 VELOCITY_ERROR = 0.3
-"""Error of a reported velocity as a share of it, turns between two fixes included."""
+"""Error of a reported velocity as a fraction of it, turns between two fixes included."""
 MISMATCH_M = 20.0
 """Heights above sea and above take-off that differ by more over the terrain are named: barometers
 and positions of take-off explain less, a wrong datum more."""
@@ -36,11 +36,11 @@ OFF_M = 25.0
 """Heights by the views and by the terrain that differ by more on the whole are named: barometers
 explain less, a wrong datum more."""
 SPREAD_M, SPREAD_SHARE = 3.0, 0.02
-"""So is a difference whose robust standard deviation is more, in metres and as a share of the
+"""So is a difference whose robust standard deviation is more, in metres and as a fraction of the
 height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
 (`benchmarks.terrain_flight` at d63ac91)."""
 MAX_VIEWS = 2000  # only so many of the latest confident views are kept
-HOLES_SHARE = 0.1  # so are holes below more than this share of the confident views
+HOLES_SHARE = 0.1  # so are holes below more than this fraction of the confident views
 _LOST = ("searching", "lost")  # states of a track that has no position
 log = logging.getLogger(__name__)
 

@@ -282,7 +282,7 @@ def moved_by_camera(
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
 FITS = 3  # at most,
-SMALL_SHARE = 0.2  # until a correction is below this share of its standard deviations
+SMALL_SHARE = 0.2  # until a correction is below this fraction of its standard deviations
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,21 +29,21 @@ KEPT_TO_FINISH = 3  # the best and its rivals
 KEPT_TO_FINEST = 12  # compared one level finer, at most, where they are in doubt
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
-"""Shares of the best score to stay, after one step and all (docs/decisions/registration.md)."""
+"""Fractions of the best score to stay, after one step and all (docs/decisions/registration.md)."""
 MIN_HOPEFUL = 4  # so many stay anyway: the scores need rivals
 FIRST_STEPS = 1
 FULL_STEPS = 4  # before and after the first of these decisions
 COVARIANCE_STEPS = 3  # of the best place once more, with its covariance
 FINER_STEPS = 2
 ROUGH_STEP_PX = 0.1
-EXCLUSION_SHARE = 0.25  # A rival lies farther from the best than this share of the view's side
+EXCLUSION_SHARE = 0.25  # A rival lies farther from the best than this fraction of the view's side
 MAX_RATIO = 10.0
 RIVAL_SHARE = 0.75
 """Weaker ones are finished on level ground: chance fits as well there, at half the cost."""
 AGAIN_PX = 1.0  # A window moved by more (pixels of the level, at its rim) is orthorectified again,
 ROUNDS = 3  # at most so often
 AROUND = 6  # places whose surroundings are searched on the terrain, where none stands out,
-NEAR_REACH = 0.2  # as a share of the view's side,
+NEAR_REACH = 0.2  # as a fraction of the view's side,
 NEAR_TURNS_RAD, NEAR_SCALES = (-0.1, 0.0, 0.1), (-0.09, 0.0, 0.09)
 """and with these added to heading and log scale."""
 Given = TypeVar("Given")
@@ -192,7 +192,7 @@ class Placer:
     def _hopeful(
         self, ranked: Sequence[Fit], share: float, at_least: int = MIN_HOPEFUL, least: float = 0.0
     ) -> int:
-        """How many fits, best first, reach `least` and a share of the best score."""
+        """How many fits, best first, reach `least` and a fraction of the best score."""
         values = [self._value(each) for each in ranked]
         enough = sum(value >= max(share * values[0], least) for value in values)
         return min(max(enough, at_least), len(ranked))

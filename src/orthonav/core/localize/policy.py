@@ -66,14 +66,14 @@ class SearchPolicy:
     tiles_per_candidate: int = 200
     """between them one for so many: the right one ranks lower among more."""
     tile_share_per_nat: float = 0.03
-    """Share of its similarity that a tile loses per nat against the telemetry."""
+    """Fraction of its similarity that a tile loses per nat against the telemetry."""
     tile_reach_strides: float = 1.1  # reach of the place near a tile
     nearby_log_scales: tuple[float, ...] = (-0.13, 0.0, 0.13)
     """Added to the log scale of candidates from tiles and above the coarse level, hardly known."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Side of a view, in tiles, for which tiles are asked."""
     min_candidates: int = 6  # always kept, for the scores need rivals
-    candidate_share: float = 0.5  # weaker candidates than this share of the best are dropped
+    candidate_share: float = 0.5  # weaker candidates than this fraction of the best are dropped
     clear: ClearMargin = CLEAR
     """Ends the search. Views of other places reach a ratio of 1.4, rarely 1.6."""
     clear_at_judged: ClearMargin = CLEAR_AT_JUDGED

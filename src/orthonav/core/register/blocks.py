@@ -19,7 +19,7 @@ GREY_SHARE = 0.25
 """Grey over gradients: less than in the search, seasons mislead (docs/decisions/camera.md)."""
 MIN_SEEN = 0.4  # blocks of which less is seen on valid map do not count
 MIN_ENERGY = 0.1
-"""Nor those below this share of the median energy: edges brought in would count too much."""
+"""Nor those below this fraction of the median energy: edges brought in would count too much."""
 Array = NDArray[np.float32]
 
 

@@ -36,7 +36,7 @@ DAMPING = 1e-3  # relative (Levenberg and Marquardt)
 MIN_CORRELATION = 0.08  # least in the gain, so that steps do not vanish
 WHOLE_OVERLAP = 0.97  # Above, the Gauss-Newton matrix of the whole view is used
 BLOCK_SUMS = 7
-MIN_CURVATURE = 0.05  # of a direction in the covariance, as a share of the Gauss-Newton matrix
+MIN_CURVATURE = 0.05  # of a direction in the covariance, as a fraction of the Gauss-Newton matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,7 @@ class SpreadSums(NamedTuple):
         return np.asarray(inverse @ spread @ inverse.T)
 
     def agreement(self) -> float:
-        """Share of blocks whose channels correlate positively."""
+        """Fraction of blocks whose channels correlate positively."""
         sums, counts = self.blocks[:, 4] + self.blocks[:, 5], self.blocks[:, 6]
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0
@@ -212,7 +212,7 @@ class SpreadSums(NamedTuple):
 def _bounded_inverse(
     observed: NDArray[np.float64], hessian: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Of `observed`, no direction held less than a share of what `hessian` says."""
+    """Of `observed`, no direction held less than a fraction of what `hessian` says."""
     own = np.sqrt(np.diag(hessian)) + 1e-12
     values, vectors = np.linalg.eigh(observed / np.outer(own, own))
     inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T

@@ -19,13 +19,13 @@ from orthonav.core.register.window import MapWindow, Reference
 
 Array = NDArray[np.float32]
 REACH_SHARE, MIN_REACH_PX = 0.125, 8
-"""How far the window is moved: share of its sides, pixels of the level at least."""
+"""How far the window is moved: fraction of its sides, pixels of the level at least."""
 PEAK_SHARE = 0.06
-"""Moves below this share of the view's side, or so many pixels, belong to the place itself."""
+"""Moves below this fraction of the view's side, or so many pixels, belong to the place itself."""
 MIN_PEAK_PX = 3.0
 NEAR_PX = 3.0  # the place itself is the best within so many pixels
 MAX_RATIO = 10.0
-PHASE_FLOOR = 1e-3  # share of the mean power below which frequencies count less
+PHASE_FLOOR = 1e-3  # fraction of the mean power below which frequencies count less
 
 
 class Sharpness(NamedTuple):

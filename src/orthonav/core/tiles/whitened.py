@@ -124,7 +124,7 @@ def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
 def pooled_features(
     recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Features and weights (N, F), the valid share of a cell, of tiles by their first pixels."""
+    """Features and weights (N, F), the valid fraction of a cell, of tiles by their first pixels."""
     features = _normalized(recipe, _pooled_tiles(recipe, sheet, tiles_px))
     count, channels = len(tiles_px), features.shape[-1]
     valid = sheet.micro_cells(sheet.valid[..., None], tiles_px)

@@ -139,7 +139,7 @@ def tempered(
     sighting: Sighting,
     newness: float,
 ) -> Measurement:
-    """A sighting as a measurement, tempered by the share of it that is new.
+    """A sighting as a measurement, tempered by the fraction of it that is new.
 
     `mounts`: probability and covariance (10, 10) of the initial state of each kind. `areas_m2`: of
     the map, and of the part searched. A likelihood to the power `newness` has a broader peak; the
@@ -189,7 +189,7 @@ def recognition(
 
 
 def confirmed_ground(alone: float, ground: float) -> float:
-    """New ground, in views; `ground`: share of the view that the last one did not show."""
+    """New ground, in views; `ground`: fraction of the view that the last one did not show."""
     low, high = TRUSTED
     trust = min(max((alone - low) / (high - low), 0.0), 1.0)
     return min(ground * trust, MOST_OF_ONE)

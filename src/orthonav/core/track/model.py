@@ -27,7 +27,7 @@ SEEN: Array = np.zeros((6, STATE))
 """What a sighting measures: position, heading, log scale, and the whole tilt."""
 SEEN[range(6), [0, 1, 4, 5, 6, 7]] = SEEN[[4, 5], [8, 9]] = 1.0
 SEEN.flags.writeable = False
-WHITE_SHARE = 0.2  # share of the error of a reported tilt that is independent at every view
+WHITE_SHARE = 0.2  # fraction of the error of a reported tilt that is independent at every view
 
 
 @dataclass(frozen=True)

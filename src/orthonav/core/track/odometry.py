@@ -31,7 +31,7 @@ MIN_CORRELATION = 0.4
 """Right ones have at least 0.56, wrong ones at most 0.11 (docs/decisions/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
 """An expected displacement that fits this well ends the search (docs/decisions/tracking.md)."""
-NOISE_PX, NOISE_SHARE = 0.4, 0.01  # per axis: in pixels, and as a share of its length
+NOISE_PX, NOISE_SHARE = 0.4, 0.01  # per axis: in pixels, and as a fraction of its length
 CANDIDATES = 8
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
 """Of the expected displacement at each level: most steps, and the step that ends it."""
@@ -41,7 +41,7 @@ SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 """Changes of heading, log scale, pitch, roll up to which a view is not rectified again."""
 LEVER_STEP_DEG = 0.05  # of numerical derivatives by pitch and roll
 UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
-"""Of ground without a known slope, and the share of it that a terrain leaves."""
+"""Of ground without a known slope, and the fraction of it that a terrain leaves."""
 LEAST_SCALED = 0.5  # least height or distance over the one expected: the rest is an error
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
@@ -165,7 +165,7 @@ class OdometryView:
 
 @dataclass(frozen=True, eq=False)
 class ViewDisplacement:
-    """`overlap`: share of the later view that the earlier one shows too."""
+    """`overlap`: fraction of the later view that the earlier one shows too."""
 
     displacement: CameraDisplacement
     overlap: float
@@ -216,7 +216,7 @@ def displacement(
 @dataclass(frozen=True, eq=False)
 class Terrain:
     """Ground that is not level: rise (2,) per metre below the camera and where both views look;
-    `rise`: of the ground there over that below, as a share of the height."""
+    `rise`: of the ground there over that below, as a fraction of the height."""
 
     below: Array
     seen: Array

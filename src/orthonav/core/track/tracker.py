@@ -76,7 +76,7 @@ UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
 NEAR_SHARE = 0.05  # of the side of a view: closer places are one
 KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
 KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
-SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a share of the error
+SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a fraction of the error
 Array = NDArray[np.float64]
 
 

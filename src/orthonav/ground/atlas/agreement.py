@@ -21,7 +21,7 @@ TURN_RATE_RAD_S = math.radians(12.0)  # four times a standard-rate turn (3 deg/s
 TURN_SLACK_RAD = math.radians(12.0)  # errors of two registered headings
 SCALE_SLACK = 0.12  # greatest difference of log scale between two views, besides climbing
 CLIMB_PER_S = 0.02  # change of log scale per second: 20 m/s at 1000 m
-MIN_NEW = 0.15  # share of a view that must be new ground (docs/decisions/tracking.md)
+MIN_NEW = 0.15  # fraction of a view that must be new ground (docs/decisions/tracking.md)
 ANCHORS = 30  # places that counted and are remembered: circling over them proves nothing more
 MAX_REACH_M = 5_000.0  # a chain whose aircraft may be farther away is dropped
 MIN_VELOCITY_S = 0.5  # views closer in time do not give a velocity
@@ -114,7 +114,7 @@ class Agreement:
         self, places: Sequence[PlaceEvidence], time_ns: int, side_m: float, chance: float
     ) -> None:
         """`side_m`: width of the view. `chance`: probability that the best of the wrong places lies
-        where a chain expects it, the share of the searched area that was searched there."""
+        where a chain expects it, the fraction of the searched area that was searched there."""
         gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
         made: list[Chain] = []
         supporting = [each for each in places if _support(each, gain) > 0]

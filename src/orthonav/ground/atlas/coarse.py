@@ -52,7 +52,7 @@ class CoarseTiles:
     valid: NDArray[np.uint8]  # (N, cells x cells) uint8; 255 where all of a cell shows imagery
 
     def features_of(self, tiles: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Features (n, F) of some tiles, and weights (n, F): the valid share of each feature's
+        """Features (n, F) of some tiles, and weights (n, F): the valid fraction of each feature's
         cell."""
         share = self.valid[tiles].astype(np.float32) / FULL
         repeats = self.features.shape[1] // max(1, self.valid.shape[1])

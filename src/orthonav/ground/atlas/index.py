@@ -122,7 +122,7 @@ MAX_TRAINING_TILES = 40_000  # of the whitening: twice those of a map (`MAX_LEAR
 SHARD_ROWS = 10_000_000  # 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)
 REBUILD_SHARE = 0.3
 FEW_ROWS = 200_000
-"""The index is rebuilt where more than this share of the rows is new or gone, or where it has so
+"""The index is rebuilt where more than this fraction of the rows is new or gone, or where it has so
 few rows that rebuilding takes seconds."""
 POWER = 0.5
 """Exponent of the whitening: full whitening (1) does not recognize a place an eighth of a tile off.
@@ -263,7 +263,7 @@ class _IndexBuilder:
         self, sheets: Sequence[Sheet], stage: str, shares: Iterator[float], step: int = 1
     ) -> Iterator[tuple[NDArray[np.float64], Features]]:
         """Places (n, 2) and features of every `step`-th tile of sheets, some at a time. `shares`:
-        share of the stage that is done after each sheet."""
+        fraction of the stage that is done after each sheet."""
         for sheet in sheets:
             tiles = read_coarse(self._atlas.path(sheet, "coarse"))
             for start in range(0, len(tiles.valid), step * BATCH_TILES):

@@ -53,7 +53,7 @@ from orthonav.ground.atlas.vectors import ShardedIndex
 PER_POSE = 60  # tiles found for each pose; several neighbouring tiles are one place
 EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
 MOST_EFFORT = 0.085, 1500
-"""Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
+"""Greatest number of tiles, fraction of the lists scanned, tiles compared by their stored vectors:
 finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
 (`benchmarks.atlas_search` at d63ac91)."""
 APART_STRIDES = 1.5  # tiles nearer to each other are one place: the eight neighbours of a tile

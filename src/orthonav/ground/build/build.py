@@ -73,7 +73,7 @@ class BuildRequest:
     - `band_m`: width of the search band for legs without a width of their own, metres, above 0.
     - `gsd_m`: ground resolution, metres per pixel, above 0; None: that of the finest orthophoto.
     - `tile_px`: width of a tile, pixels, 16 to 4096.
-    - `overlap`: overlap of neighbouring tiles as a share of their width, 0 to below 1; 0.875
+    - `overlap`: overlap of neighbouring tiles as a fraction of their width, 0 to below 1; 0.875
       gives a stride of 32 pixels at 256.
     - `method`: embedding, `name:field=value,..`, a row of `embed.TABLE`.
     - `edges`: image representation, a row of `represent.TABLE`; None: the default of the method.

@@ -99,7 +99,7 @@ PASTED_SHARE = 0.25
 RADIUS_STRIDES = 0.75
 """A fix is correct if its error is below this many strides."""
 MIN_VALID = 0.9
-"""Least share of valid pixels in a crop, where there are too few whole ones."""
+"""Least fraction of valid pixels in a crop, where there are too few whole ones."""
 ENOUGH_CROPS = 48
 MIN_RIGHT = 10
 

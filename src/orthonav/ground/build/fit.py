@@ -60,7 +60,7 @@ def fit_few(
 ) -> LogisticConfidence:
     """The `usual` confidence, its bias drawn to trials of which too few came out right for a fit.
 
-    Without one, or without any trial, the share of right trials, whatever the evidence.
+    Without one, or without any trial, the fraction of right trials, whatever the evidence.
     """
     if usual is None or len(features) == 0:
         share = (sample_weight @ right + FEW_RIGHT) / (sample_weight.sum() + FEW)

@@ -36,7 +36,7 @@ reaches this in 0.6 % of views."""
 TILT_DEG = 5.0
 """Unreported tilt that a view may be displaced by from where its fix puts it."""
 AGL_STD, YAW_STD_DEG = 0.03, 2.0
-"""Standard deviations of the height (a share of it) and heading of a fix."""
+"""Standard deviations of the height (a fraction of it) and heading of a fix."""
 _GREY, _VALID = 2, 3
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, share_of,
 N_BINS = 10
 NEES_LEVELS = (0.5, 0.9, 0.99)
 _LEAST_INDEPENDENCE = 1e-12  # of east and north, 1 - rho^2: below it a covariance is singular
-_ASYMMETRY = 1e-6  # share of the largest element that two mirrored ones may differ by
+_ASYMMETRY = 1e-6  # fraction of the largest element that two mirrored ones may differ by
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class CovarianceConsistency:
     `n_without`: right fixes without covariance, or with null values in it; `n_unusable`: with one
     that is singular, not positive definite or not symmetric.
     `nees` (K,): normalized estimation error squared e^T C^-1 e of the others, ascending.
-    `within`: for each of `NEES_LEVELS` the share of `nees` inside its bound.
+    `within`: for each of `NEES_LEVELS` the fraction of `nees` inside its bound.
     """
 
     n_right: int

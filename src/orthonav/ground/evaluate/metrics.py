@@ -148,12 +148,12 @@ class Metrics:
     `radius_m`: a fix within it is right.
     `n_confident_wrong`: confident fixes that err by more than `wrong_above_m` and their own radius.
     `wrong_upper_95`: one-sided 95 % upper bound of the rate of wrong ones among confident fixes.
-    `availability`: share of the true positions with a confident fix; `availability_95`: its 95 %
+    `availability`: fraction of the true positions with a confident fix; `availability_95`: its 95 %
     interval. Both bounds are those of independent views.
-    `coverage`: share of the true positions with a fix, low confidence included.
+    `coverage`: fraction of the true positions with a fix, low confidence included.
     `gap`: the longest stretch without a confident fix, of one flight.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
-    `accuracy_of_confident`: share of the confident fixes within `radius_m`.
+    `accuracy_of_confident`: fraction of the confident fixes within `radius_m`.
     `reasons`: number of views without a fix by reason.
     `standard`, `of_confident`: errors of all and of confident fixes.
     """
@@ -186,12 +186,12 @@ class Metrics:
 
     @property
     def accuracy(self) -> float:
-        """Share of all views with a fix within `radius_m`."""
+        """Fraction of all views with a fix within `radius_m`."""
         return self.acc_at_m[self.radius_m]
 
     @property
     def accuracy_of_fixes(self) -> float:
-        """Share of fixes within `radius_m`."""
+        """Fraction of fixes within `radius_m`."""
         return self.acc_fixes_at_m[self.radius_m]
 
 

@@ -136,7 +136,7 @@ def criteria_picture(metrics: Metrics) -> Drawing:
             looks: dict[str, Any] = {"color": colour, "linestyle": line, "zorder": order}
             shares = 100 * curve.share_accepted, 100 * curve.accuracy
             axes.plot(*shares, **looks, linewidth=1.8, label=LABELS[curve.name])
-        # shares of the first few views are noisy and do not set the scale
+        # fractions of the first few views are noisy and do not set the scale
         tails = [curve.accuracy[curve.share_accepted >= 0.05] for curve in drawn]
         lowest = min((float(tail.min()) for tail in tails if tail.size), default=0.0)
         bottom = max(0.0, math.floor(lowest * 10 - 0.5) * 10)

@@ -131,7 +131,7 @@ class CellCounts:
 
 @dataclass(frozen=True)
 class FetchResult:
-    """What was fetched: cells by outcome, and the share of valid pixels, 0 to 1."""
+    """What was fetched: cells by outcome, and the fraction of valid pixels, 0 to 1."""
 
     estimate: CostEstimate
     cells: CellCounts

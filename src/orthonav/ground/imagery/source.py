@@ -40,7 +40,7 @@ ALPHA_WINDOWS = 8
 ALPHA_CHECKS = 16
 """Files of one kind that are checked; their producer writes all alike."""
 MAX_PARTLY_CLEAR = 0.05
-"""Largest share of partly transparent pixels of a mask: its resampled edges."""
+"""Largest fraction of partly transparent pixels of a mask: its resampled edges."""
 HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
 MIN_SIDE_PX = 16
 OPENED_AT_ONCE = 8

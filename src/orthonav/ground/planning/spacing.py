@@ -25,7 +25,7 @@ LEAST_TILE_SHARE = 0.4
 MOST_COARSER = 4.0  # the localizer refuses views beyond these three limits: too_small, too_coarse
 FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)
 LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
-MOST_RELIEF = 0.05  # within a view, as a share of the height: the std of reported heights
+MOST_RELIEF = 0.05  # within a view, as a fraction of the height: the std of reported heights
 VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
 TRACKED_PER_S = 10.0  # views per second while tracking on one desktop core: docs/benchmarks.md
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)  # 65 by 51 deg
@@ -171,7 +171,7 @@ for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s fo
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
 _PAIRS = 1_000_000_000  # limit on pairs of points and legs, which bounds the time of an estimate
 _MOST_POINTS = 200_000
-_LEAST_POINTS = 2_500  # points sampled: a standard error of the share of 0.1 % to 1 %
+_LEAST_POINTS = 2_500  # points sampled: a standard error of the fraction of 0.1 % to 1 %
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 @dataclass(frozen=True)
 class LegProfile:
     """`relief`: largest difference of terrain height within a view centred on the leg or on an edge
-    of its search band, as a share of the height above ground; 0 below `LANDING_M`."""
+    of its search band, as a fraction of the height above ground; 0 below `LANDING_M`."""
 
     leg: int  # number, from 1
     length_m: float  # its length

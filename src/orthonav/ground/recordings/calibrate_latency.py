@@ -51,7 +51,7 @@ LEAST_S, MOST_S, STEP_S = -0.5, 12.0, 0.1
 WINDOW_S = 30.0
 MOST_PAIRS, LEAST_PAIRS = 300, 12
 PAIR_SHARE, KNOWN_SHARE = 0.9, 0.6
-"""Share of candidates for which the motion of a pair must be known, and of pairs for one
+"""Fraction of candidates for which the motion of a pair must be known, and of pairs for one
 candidate."""
 SCALE_STD, ACROSS_STD, MOUNT_STD_RAD = 0.25, 0.2, 0.08
 """Prior of errors: height (share), direction of the velocity, orientation of the camera (rad)."""
@@ -59,12 +59,12 @@ ANY_STD = 1.5  # prior of scale and direction where the heading is not known
 CONSTANT_STD, FREE_STD = 0.01, 0.5
 """Prior of a constant shift per second: by the tilt of the mount; by an unknown velocity."""
 SHARE_STD = 0.08
-"""Standard deviation of the shift by velocity as a share of it: relief, changes of height."""
+"""Standard deviation of the shift by velocity as a fraction of it: relief, changes of height."""
 NEAR_S, NEAR_MASS = 0.35, 0.99  # a latency is found where this probability lies this close to it
 LARGEST_STD_S, FLOOR_S = 0.3, 0.025
 """Largest standard deviation of an answer; least one: half an interval of the stored states."""
 EXPLAINED, STANDS_OUT = 0.6, 2.0
-"""Least share of motion of so many least standard deviations that the latency must explain."""
+"""Least fraction of motion of so many least standard deviations that the latency must explain."""
 UNEXPLAINED, MANY_PAIRS, STANDS_FAR_OUT = 0.3, 40, 4.0
 """Pictures contradict the autopilot where so many pairs, with motion of so many least standard
 deviations, are explained by less than this share at any latency."""
@@ -159,7 +159,7 @@ class LatencyEstimate:
 def explained_share(
     seconds: Array, turn: Array, shift: Array, turn_off: Array, shift_off: Array, stands_out: float
 ) -> float:
-    """Least share of the motion that is explained, of turn (N,) and of the varying part of shift
+    """Least fraction of the motion that is explained, of turn (N,) and of the varying part of shift
     (N, 2), where it is at least `stands_out` least standard deviations; NaN where neither is.
 
     `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.

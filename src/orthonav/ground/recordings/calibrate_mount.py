@@ -40,7 +40,7 @@ OUTLIER_SIGMAS = 3.0
 """Views that are off by more of their standard deviations, scatter included, do not count."""
 ROUNDS = 10  # views are left out, and the mean is taken again, at most so many times
 LEAST_SHARE = 0.1
-"""A view counts for pitch and roll if it shows at least this share of what is known of them; the
+"""A view counts for pitch and roll if it shows at least this fraction of what is known of them; the
 rest is the reported value."""
 _UNKNOWN_HEADING = Bias(0.0, DEFAULT_YAW_STD_DEG, DEFAULT_YAW_STD_DEG)
 

@@ -34,7 +34,7 @@ class Sensor:
     height_px: int
     width_mm: float | None
     """Width of the sensor, for `FocalLength`; None: the 35 mm equivalent is the better value."""
-    std: float  # standard deviation of the focal length, as a share of it
+    std: float  # standard deviation of the focal length, as a fraction of it
 
 
 _DJI_12MP = Sensor(4000, 3000, 6.2, 0.02)  # 1/2.3 inch, 1.55 um: the published fields of view
@@ -68,7 +68,7 @@ class FocalLength:
     """A focal length for pictures of one size."""
 
     px: float  # in pixels, above 0
-    std: float  # its standard deviation, as a share of it
+    std: float  # its standard deviation, as a fraction of it
     source: str  # where it comes from, for people
 
     def field_deg(self, longer_px: int) -> float:

@@ -76,12 +76,12 @@ class Errors:
     """
 
     yaw_std_deg: float = 0.0  # reported heading, degrees, 0..180
-    agl_std: float = 0.0  # reported height, as a share of it, 0..0.5
+    agl_std: float = 0.0  # reported height, as a fraction of it, 0..0.5
     tilt_std_deg: float = 0.0  # reported pitch and roll, degrees, 0..20
     attitude_std_deg: float = 0.0  # true pitch and roll (which are reported), degrees, 0..20
     prior_std_m: float | None = None
     yaw_bias_deg: float = 0.0  # reported minus true heading, degrees, -180..180
-    agl_bias: float = 0.0  # reported minus true height, as a share of it, -0.5..0.5
+    agl_bias: float = 0.0  # reported minus true height, as a fraction of it, -0.5..0.5
     pitch_bias_deg: float = 0.0
     roll_bias_deg: float = 0.0
     velocity_drift: float | None = None
@@ -148,7 +148,7 @@ class SimulateRequest:
     seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
     wind: Wind | None = None  # none for still air; only on a route
     turn_radius_m: float = 0.0
-    cloud_share: float = 0.0  # share of the views with clouds, 0..1
+    cloud_share: float = 0.0  # fraction of the views with clouds, 0..1
     beyond: bool = False
     terrain: TerrainHeights | None = None
     terrain_posting_m: float = 5.0  # resolution of the terrain

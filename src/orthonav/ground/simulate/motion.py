@@ -11,8 +11,8 @@ from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import attitude_of, enu_from_camera
 from orthonav.ground.planning.route import along_polyline_en_m
 
-GUST_STD = 0.15  # standard deviation of the gusts per axis, as a share of the wind speed
-LARGEST_GUST = 0.4  # largest gust, as a share of the wind speed
+GUST_STD = 0.15  # standard deviation of the gusts per axis, as a fraction of the wind speed
+LARGEST_GUST = 0.4  # largest gust, as a fraction of the wind speed
 GUST_TIME_S = 60.0  # time constant of the gusts
 DRIFT_TIME_S = 300.0  # time constant of the odometry error, which hardly changes within a minute
 ARC_STEP_DEG = 2.0  # angle between the points of an arc

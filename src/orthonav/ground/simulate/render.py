@@ -18,10 +18,10 @@ from orthonav.core.geo.camera import (
 )
 
 FEWEST_VIEWS, MOST_VIEWS = 10, 40  # length of a cloudy stretch in views
-EDGE = 0.25  # share of a stretch, at each end, over which the clouds close
-BROKEN = 0.3  # share of the stretches whose clouds never close
-HEIGHT = 0.5  # height of the clouds as a share of the aircraft's
-SOFTNESS = 0.25  # width of a cloud edge, as a share of the range of cloud cover
+EDGE = 0.25  # fraction of a stretch, at each end, over which the clouds close
+BROKEN = 0.3  # fraction of the stretches whose clouds never close
+HEIGHT = 0.5  # height of the clouds as a fraction of the aircraft's
+SOFTNESS = 0.25  # width of a cloud edge, as a fraction of the range of cloud cover
 TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0  # period: pixels, lengths of a view
 BLOB_PX = 40.0  # size of the largest clouds in pixels of the texture
 GRID = 8  # clouds are rendered at this fraction of the resolution of the view

@@ -211,7 +211,7 @@ class DifferenceModel:
     `map_tau_s`: correlation time of the map's local errors.
     `mount_share`: share of the map's variance that turns with the aircraft, as from a tilted mount.
     `mount_tau_s`: correlation time of that part.
-    `white_share`: share of the map's variance that is independent from view to view.
+    `white_share`: fraction of the map's variance that is independent from view to view.
     `multipath_m`: change of the difference that is no fault.
     `sigmas`: standard deviations, in addition to `multipath_m`, from which a change is a fault.
     `step_ages`: onsets of a step, in values before the newest, less than `FINE_S`.

@@ -24,7 +24,7 @@ from orthonav.onboard.messages.estimate import (
 FUTURE_S = 0.1
 """Tolerance for exposures in the future, before the clocks are taken to disagree."""
 JITTER = 0.1
-"""Share of an interval by which a message may be early: views with a small jitter all pass."""
+"""Fraction of an interval by which a message may be early: views with a small jitter all pass."""
 VELOCITY_STD_MPS = 1.0
 """Standard deviation of a velocity that has no covariance."""
 MAX_AGE_S = 1.0
