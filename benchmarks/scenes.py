@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import permutations, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,16 @@ def leave_one_out_pairs() -> list[Pair]:
         "generated_32": ((OTHER, PAST),),
     }
     return [SCENES[name].pair(*each) for name, both in dates.items() for each in both]
+
+
+def all_pairs() -> list[Pair]:
+    """Every map with the views of every other date, places in turn."""
+    by_place: dict[str, list[Pair]] = {}
+    for scene in SCENES.values():
+        for both in permutations(scene.dates, 2):
+            pair = scene.pair(*both)
+            by_place.setdefault(place_of(pair), []).append(pair)
+    return [each for turn in zip_longest(*by_place.values()) for each in turn if each is not None]
 
 
 def place_of(pair: Pair) -> str:
