@@ -41,7 +41,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
+from orthonav.ground.evaluate.statistics import nees_bound, normalized_squared
 from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import Wind

@@ -12,7 +12,8 @@ from scipy.stats import chi2
 from orthonav.core.flight.fixes import result_from_json, result_to_json
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.evaluate.calibration import (
+from orthonav.ground.evaluate.metrics import Comparison, compare, measure
+from orthonav.ground.evaluate.statistics import (
     N_BINS,
     NEES_LEVELS,
     ConfidenceCalibration,
@@ -21,9 +22,8 @@ from orthonav.ground.evaluate.calibration import (
     is_covariance,
     nees_bound,
     normalized_squared,
+    wilson,
 )
-from orthonav.ground.evaluate.figures import wilson
-from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.tables import metrics_to_json
 
 RADIUS_M = 20.0

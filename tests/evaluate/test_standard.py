@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.ground.evaluate.figures import standard_figures
+from orthonav.ground.evaluate.statistics import standard_figures
 
 TRUTH = np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0], [180.0, 0.0], [240.0, 0.0]])
 ERRORS = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan], [0.0, 10.0], [0.0, -5.0]])
@@ -14,9 +14,9 @@ ERRORS = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan], [0.0, 10.0], [0.0, 
 
 def test_pose_errors_of_the_example() -> None:
     """From fix to fix errors differ by (-3, -4), (0, 10), (0, -15). The fixes lie at 0, 60, 180 and
-    240 m: 100 m are reached at 180 m, and no second time; 60 m at 180 and 240 m."""
+    240 m: 100 m are reached at 180 m, and no second time; at twice the scale at 120, 360, 480 m."""
     found = standard_figures(TRUTH, TRUTH + ERRORS)
-    far = standard_figures(TRUTH, TRUTH + ERRORS, distance_m=60.0).rpe_distance
+    far = standard_figures(2 * TRUTH, 2 * TRUTH + ERRORS).rpe_distance
     expected = {  # n, RMSE, mean, median, std, max
         found.ape: (4, math.sqrt(37.5), 5.0, 5.0, math.sqrt(12.5), 10.0),
         found.rpe_frames: (3, math.sqrt(350 / 3), 10.0, 10.0, math.sqrt(50 / 3), 15.0),
@@ -45,9 +45,3 @@ def test_relative_errors_do_not_cross_flights() -> None:
 def test_without_a_fix_nothing_is_defined() -> None:
     found = standard_figures(TRUTH, np.full_like(TRUTH, np.nan))
     assert found.ape.n == 0 and math.isnan(found.ape.rmse_m) and math.isnan(found.cep50_m)
-
-
-@pytest.mark.parametrize("distance_m", [0.0, -1.0, math.nan, math.inf])
-def test_an_impossible_distance_is_refused(distance_m: float) -> None:
-    with pytest.raises(ValueError, match="positive and finite"):
-        standard_figures(TRUTH, TRUTH, distance_m=distance_m)
