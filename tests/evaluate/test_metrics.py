@@ -18,7 +18,7 @@ from orthonav.ground.evaluate.metrics import (
     pool,
     worst_views,
 )
-from orthonav.ground.evaluate.statistics import upper_bound
+from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
 from orthonav.ground.evaluate.tables import verdict
 
 CENTRE = LocalFrame(48.0, -4.5)
@@ -152,3 +152,35 @@ def test_confident_fixes_and_gaps_have_figures_of_their_own() -> None:
     assert found.gap.seconds_s == pytest.approx(2.0)
     assert found.gap.path_m == pytest.approx(math.hypot(100, 50) + 100, rel=1e-3)
     assert measure(pool([comparison, comparison])).gap.seconds_s == pytest.approx(2.0)
+
+
+# APE, RPE, CEP.
+
+
+PATH = np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0], [180.0, 0.0], [240.0, 0.0]])
+ERRORS = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan], [0.0, 10.0], [0.0, -5.0]])
+"""Errors of 5, 0, none, 10 and 5 m."""
+
+
+def test_pose_errors_of_the_example() -> None:
+    """From fix to fix errors differ by (-3, -4), (0, 10), (0, -15). The fixes lie at 0, 60, 180 and
+    240 m: 100 m are reached at 180 m, and no second time; at twice the scale at 120, 360, 480 m."""
+    found = standard_figures(PATH, PATH + ERRORS)
+    far = standard_figures(2 * PATH, 2 * PATH + ERRORS).rpe_distance
+    expected = {  # n, RMSE, mean, median, std, max
+        found.ape: (4, math.sqrt(37.5), 5.0, 5.0, math.sqrt(12.5), 10.0),
+        found.rpe_frames: (3, math.sqrt(350 / 3), 10.0, 10.0, math.sqrt(50 / 3), 15.0),
+        far: (2, math.sqrt(325 / 2), 12.5, 12.5, 2.5, 15.0),
+    }
+    for statistics, values in expected.items():
+        assert tuple(vars(statistics).values()) == pytest.approx(values)
+    assert found.rpe_distance.n == 0
+    assert (found.cep50_m, found.cep95_m) == pytest.approx((5.0, 5 + 0.85 * (10 - 5)))
+
+
+def test_relative_errors_do_not_cross_flights() -> None:
+    two = np.concatenate([PATH, PATH]), np.concatenate([PATH, PATH + np.array([1000.0, 0.0])])
+    assert standard_figures(*two).rpe_frames.max_m == pytest.approx(1000.0)
+    apart = standard_figures(*two, starts=(0, 5))
+    assert (apart.rpe_frames.n, apart.rpe_frames.max_m) == (8, pytest.approx(0.0))
+    assert apart.rpe_distance.n == 2 and apart.ape.n == 10

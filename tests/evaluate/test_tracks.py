@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.cli import main
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.fixes import write_results
 from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile import open_map
-from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.report import write_report
@@ -280,60 +278,46 @@ def test_tracks_of_several_flights_are_given_per_flight() -> None:
 # The command.
 
 
-@pytest.fixture(scope="module")
-def golden_flight(tmp_path_factory) -> tuple[Path, Path]:
-    """A tracked flight over the map that lies with the tests: its folder and its fixes."""
-    folder = tmp_path_factory.mktemp("track")
-    opened = open_map(GOLDEN)
-    sheet, layer = opened.manifest.sheets[0], GreyLayer.of(opened)
+@pytest.fixture
+def flight(tmp_path) -> Path:
+    """A tracked flight over the map that lies with the tests, its fixes beside it."""
+    frame = open_map(GOLDEN).manifest.sheets[0].frame
+    way = np.array([(-60.0 + 30 * i, 0.0) for i in range(4)])
     errors = [(60.0, 0.0), (2.0, 1.0), (-3.0, 1.0), (1.0, -4.0)]
     states = ["searching", *["tracking"] * 3]
-    way = np.array([(-60.0 + 30 * i, 0.0) for i in range(4)])
-    _, results = flown(errors, states, displacement_en_m=way, local=sheet.frame)
-    (folder / "flight").mkdir()
-    writer = FlightWriter(folder / "flight", Camera(96, 96, 100.0, 100.0, 48.0, 48.0), "")
-    for result, (east, north) in zip(results, way, strict=True):
-        col = round(east - sheet.grid.west_m) - 48
-        grey, _ = layer.read(0, round(sheet.grid.north_m - north) - 48, col, 96, 96)
-        lat, lon = sheet.frame.latlon_from_en(np.array([east, north]))
-        telemetry = Telemetry(result.time_ns, 84.0, 0.0, 0.0, 108.0)  # the fix knows better
-        writer.add(
-            result.frame, np.dstack([np.rot90(grey)] * 3), telemetry, (float(lat), float(lon))
-        )
+    _, results = flown(errors, states, displacement_en_m=way, local=frame)
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    writer = FlightWriter(folder, Camera(96, 96, 100.0, 100.0, 48.0, 48.0), "")
+    for result, at in zip(results, way, strict=True):
+        telemetry = Telemetry(result.time_ns, 84.0, 0.0, 0.0, 108.0)
+        lat, lon = (float(value) for value in frame.latlon_from_en(at))
+        writer.add(result.frame, np.zeros((96, 96, 3), np.uint8), telemetry, (lat, lon))
     writer.close()
-    write_results(folder / "fixes.jsonl", results)
-    return folder / "flight", folder / "fixes.jsonl"
+    write_results(tmp_path / "fixes.jsonl", results)
+    return folder
 
 
-def evaluated(golden_flight, *more, capsys) -> tuple[int, str, str]:
-    flight, fixes = golden_flight
-    telemetry = ["evaluate", fixes, "--truth", flight / "truth.csv", *more]
-    code = main([str(each) for each in telemetry])
-    said = capsys.readouterr()
-    return code, said.out, said.err
-
-
-@pytest.mark.long
-def test_evaluate_a_track(golden_flight, tmp_path: Path, capsys, no_plots) -> None:
-    flight, report, out = golden_flight[0], tmp_path / "report", tmp_path / "metrics.json"
-    more = ("--map", GOLDEN, "--report", report, "--flight", flight, "--metrics", out)
-    code, said, wrong = evaluated(golden_flight, *more, capsys=capsys)
-    assert (code, wrong) == (0, "") and "first confirmed fix: view 2 of 4" in said
+def test_evaluate_a_track(run, flight, tmp_path: Path, no_plots) -> None:
+    fixes, report, out = (tmp_path / name for name in ("fixes.jsonl", "report", "metrics.json"))
+    more = ("--map", GOLDEN, "--report", report, "--metrics", out)
+    done = run("evaluate", fixes, "--flight", flight, *more)
+    assert (done.code, done.err) == (0, "")
+    assert "first confirmed fix: view 2 of 4" in done.out
     track = json.loads(out.read_text())["track"]
     assert (track["first_view"], track["first_s"], track["n_false_locks"]) == (2, 1.0, 1)
     assert isinstance(track["first_view"], int)
     html = (report / "index.html").read_text("utf-8")
     assert html.count("<figure") == 3 and "<td>0003.jpg</td>" in html
-    assert f"<code>orthonav view {golden_flight[1]} --map {GOLDEN} --flight {flight}</code>" in html
+    assert f"<code>orthonav view {fixes} --map {GOLDEN} --flight {flight}</code>" in html
 
 
-def test_evaluate_refuses_flights_that_do_not_fit(golden_flight, tmp_path, capsys) -> None:
-    flight, _ = golden_flight
-    both = ("--map", GOLDEN, "--report", tmp_path / "r")
+def test_evaluate_refuses_flights_that_do_not_fit(run, flight, tmp_path: Path) -> None:
+    fixes, report = tmp_path / "fixes.jsonl", ("--report", tmp_path / "r")
     for more, word in (
-        (("--flight", flight, "--flight", flight, *both), "give --flight once per file"),
-        (("--flight", tmp_path / "none", *both), "does not exist"),
+        (("--flight", flight, "--flight", flight), "give --flight once per file"),
+        (("--flight", tmp_path / "none"), "does not exist"),
     ):
-        code, said, wrong = evaluated(golden_flight, *more, capsys=capsys)
-        assert (code, said, wrong.count("\n")) == (1, "", 1) and word in wrong
+        done = run("evaluate", fixes, "--map", GOLDEN, *more, *report)
+        assert (done.code, done.out, done.err.count("\n")) == (1, "", 1) and word in done.err
     assert not (tmp_path / "r").exists()

@@ -1,14 +1,19 @@
-"""Simulated flights of a real aircraft: biases, clouds, options of routes."""
+"""Simulated flights of a real aircraft: biases, clouds, corners as arcs, odometry off as stated."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import open_flight, read_image, read_truth
-from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera import Camera, enu_from_camera
+from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
 from orthonav.ground.simulate.render import Clouds
 
 SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
@@ -45,8 +50,7 @@ def pictures(flight):
     return [read_image(view.path) for view in flight.views]
 
 
-def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
-    """Numbers of the simulator as it was before it had wind, biases and clouds."""
+def test_a_seed_gives_the_numbers_of_earlier_versions(area, tmp_path):
     request = SimulateRequest(
         [area.past],
         tmp_path / "f",
@@ -130,3 +134,66 @@ def test_the_command(run, ortho, frame, tmp_path):
     done = run(*fly, "--agl-m", "900", "--out", tmp_path / "g")
     assert done.code == 1 and "does not lie completely within the imagery" in done.err
     assert not (tmp_path / "g").exists()
+
+
+# Motion along a route.
+
+
+LINE = np.array([[0.0, 0.0], [0.0, 4000.0], [3000.0, 4000.0], [2000.0, 0.0]])
+AIRSPEED = 25.0
+
+
+def test_velocities_integrate_to_the_path():
+    way = steady_path(LINE, 70.0, AIRSPEED)
+    assert np.diff(way.times_s) == pytest.approx(70.0 / AIRSPEED)
+    steps = way.velocities_en_mps[1:] * np.diff(way.times_s)[:, None]
+    assert steps.sum(axis=0) == pytest.approx(way.places_en_m[-1] - way.places_en_m[0])
+    assert way.velocities_en_mps[0] == pytest.approx([0, AIRSPEED], abs=1e-9)
+
+
+def test_dead_reckoning_drifts_by_the_stated_share_of_the_path():
+    true, times = np.tile([15.0, -20.0], (100, 1)), np.arange(100) * 1.0
+    way = true.sum(axis=0)
+    ends = [drifting(true, times, 0.02, np.random.default_rng(n)).sum(axis=0) for n in range(300)]
+    along = (ends - way) @ way / (way @ way)
+    across = (ends - way) @ [-way[1], way[0]] / (way @ way)
+    assert along.std() == pytest.approx(0.02, rel=0.15)
+    assert across.std() == pytest.approx(0.02, rel=0.15)
+    assert drifting(true, times, 0.0, np.random.default_rng(0)) == pytest.approx(true)
+
+
+corners = st.tuples(st.floats(-5000, 5000), st.floats(-5000, 5000))
+
+
+@given(st.lists(corners, min_size=3, max_size=8), st.floats(1, 1000))
+def test_rounded_corners_stay_near_the_route(points, radius_m):
+    line = np.array(points)
+    made = rounded(line, radius_m)
+    assert np.isfinite(made).all()
+    assert (made[0] == line[0]).all() and (made[-1] == line[-1]).all()
+    legs = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    assert distance_to_polyline_m(made, line).max() <= legs.max() / 2 + 1e-6
+    assert np.linalg.norm(np.diff(made, axis=0), axis=1).sum() <= legs.sum() + 1e-6
+
+
+def test_a_rounded_corner_is_an_arc_of_the_radius():
+    made = rounded(LINE, 400.0)
+    steps = np.diff(made, axis=0)
+    turns = np.diff(np.unwrap(np.arctan2(steps[:, 0], steps[:, 1])))
+    assert np.degrees(np.abs(turns)).max() <= 2.01
+    first = made[1:48]  # 90 deg in steps of 2
+    assert first[0] == pytest.approx([0, 3600]) and first[-1] == pytest.approx([400, 4000])
+    assert np.linalg.norm(first - [400, 3600], axis=1) == pytest.approx(400)
+
+
+angles = st.floats(-180, 180), st.floats(-30, 30), st.floats(-30, 30)
+
+
+@given(st.tuples(*angles), st.tuples(st.floats(-10, 10), st.floats(-10, 10)))
+def test_the_mount_tilts_in_the_aircraft(attitude, tilt):
+    """Against SciPy's rotations."""
+    aircraft = Rotation.from_euler("ZYX", attitude, degrees=True)
+    camera = Rotation.from_euler("ZYX", (0, *tilt), degrees=True)
+    axis_ned = (aircraft * camera).apply([0, 0, 1])
+    axis_enu = enu_from_camera(*mounted(attitude, *tilt))[:, 2]
+    assert axis_enu == pytest.approx([axis_ned[1], axis_ned[0], -axis_ned[2]], abs=1e-9)

@@ -186,15 +186,6 @@ def test_the_folder(area, tmp_path, names_in):
     assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,tilt_std_deg"
 
 
-def test_the_defaults_are_a_view_a_second_that_covers_a_tile(area, plane, tmp_path):
-    route, shares = route_of(plane.frame, [-100.0, 0.0], [100.0, 0.0]), []
-    request = SimulateRequest([area.past], tmp_path / "f", route, camera=SMALL, airspeed_mps=40.0)
-    assert simulate_flight(request, shares.append) == 6 and shares[-1] == 1.0
-    telemetry = [view.telemetry for view in open_flight(tmp_path / "f").views]
-    assert [each.time_ns for each in telemetry] == [n * 10**9 for n in range(6)]
-    assert 48 * SMALL.gsd_m(telemetry[0].agl_m) == pytest.approx(256, rel=0.01)
-
-
 REFUSED = {
     "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
     "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
