@@ -116,7 +116,7 @@ def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
     done = run("plan", "--bounds=-1,46,1,47", "--gsd-m", 2, "--json")
     sheets = json.loads(done.out)["map"]["sheets"]
     assert len(sheets) == 12 and sheets[0]["bounds_deg"] == [-1, 46, -0.5, 46.333333]
-    text = run("plan", "--bounds=-1,46,2,47", "--gsd-m", 2, "--no-registration").out
+    text = run("plan", "--bounds=-1,46,2,47", "--gsd-m", 2).out
     assert "--bounds=-1,46,-0.4,46.333333" in text and "and 3 more (--json)" in text
 
 

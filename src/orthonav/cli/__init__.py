@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from orthonav.cli.needs import require_extras
+from orthonav.cli.version import require_extras, show_version
 from orthonav.core.errors import OrthonavError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
@@ -35,7 +35,7 @@ GROUPS = {
         ),
         "fetch": (
             "download orthophotos of an area from open services",
-            "route.kml --source ign --out ortho.tif",
+            "--route route.kml --source ign --out ortho.tif",
         ),
         "build": (
             "build a map from orthophotos",
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose, options, started_s = False, argparse.Namespace(), time.time()
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
-            return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
+            return show_version(arguments)
         options = parse(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING

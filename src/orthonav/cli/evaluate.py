@@ -6,72 +6,44 @@ import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.changed import add_report_changes, changes_text, changes_to_plain, report_changes
-from orthonav.cli.common import beside, print_json, progress
-from orthonav.cli.needs import require_extras
+from orthonav.cli.common import add_options, beside, print_json, progress, report_changes
+from orthonav.cli.version import require_extras
 
 if TYPE_CHECKING:
     from orthonav.core.flight import FlightFolder
     from orthonav.core.mapfile.reader import MapFile
-    from orthonav.ground.changes.record import ChangedGround
     from orthonav.ground.evaluate.contact_sheet import Row
     from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "fixes",
-        type=Path,
-        nargs="+",
-        metavar="fixes.jsonl",
-        help="fixes of a flight, as written by localize or fly --jsonl; several files are compared",
-    )
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="truth.csv",
-        help="ground truth: the true positions (default: truth.csv of --flight); one for all files "
-        "of fixes, or one for each in the same order",
-    )
-    parser.add_argument(
-        "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
-    )
-    parser.add_argument(
-        "--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file"
-    )
-    parser.add_argument(
-        "--json", action="store_true", help="print the metrics as JSON instead of the table"
-    )
-    parser.add_argument(
-        "--report",
-        type=Path,
-        metavar="REPORT/",
-        help="write an HTML report with its figures as SVG and PNG",
-    )
-    parser.add_argument(
-        "--map", type=Path, metavar="MAP.onav", help="map of the flight: background of the report"
-    )
-    parser.add_argument(
-        "--flight",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FLIGHT_DIR",
-        help="flight folder with the true positions, and with the images for the worst views in "
-        "the report (with --map and --report) and for --report-changes; one for all files of "
-        "fixes, or one for each in the same order",
-    )
-    add_report_changes(parser)
+    add = parser.add_argument
+    text = "fixes of a flight, as written by localize or fly --jsonl; several files are compared"
+    add("fixes", type=Path, nargs="+", metavar="fixes.jsonl", help=text)
+    each: dict[str, Any] = {"type": Path, "action": "append", "default": []}
+    text = "ground truth: the true positions (default: truth.csv of --flight); one for all files "
+    text += "of fixes, or one for each in the same order"
+    add("--truth", **each, metavar="truth.csv", help=text)
+    add_options(parser, "--radius-m", "--json", "--report-changes")
+    add("--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file")
+    text = "write an HTML report with its figures as SVG and PNG"
+    add("--report", type=Path, metavar="REPORT/", help=text)
+    text = "map of the flight: background of the report"
+    add("--map", type=Path, metavar="MAP.onav", help=text)
+    text = "flight folder with the true positions, and with the images for the worst views in the "
+    text += "report (with --map and --report) and for --report-changes; one for all files of "
+    text += "fixes, or one for each in the same order"
+    add("--flight", **each, metavar="FLIGHT_DIR", help=text)
     parser.set_defaults(wrong_usage=parser.error)
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.files import write_text
+    from orthonav.core.flight import open_flight
+    from orthonav.core.flight.fixes import read_results
     from orthonav.core.mapfile import open_map
     from orthonav.ground.evaluate.tables import (
         covariance_verdict,
@@ -88,8 +60,15 @@ def run(options: argparse.Namespace) -> None:
     whole = total(flights)
     if options.report:
         _write_report(options.report, flights, whole, opened)
-    changed = _changed(options, opened)
-    plain = flights_to_json(flights, whole) | changes_to_plain(options, changed)
+    plain, lines = flights_to_json(flights, whole), list[str]()
+    if options.report_changes and opened:
+        seen = [
+            (open_flight(folder, images_needed=False), read_results(fixes))
+            for folder, fixes in zip(options.flight, options.fixes, strict=True)
+        ]
+        with progress(options) as shown:
+            changes, lines = report_changes(options, opened, seen, shown)
+        plain |= changes
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
     with beside(options.metrics, options.report_changes):
@@ -99,8 +78,7 @@ def run(options: argparse.Namespace) -> None:
             print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
             print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
             report = [f"report: {options.report / 'index.html'}"] if options.report else []
-            for line in (*changes_text(options, changed), *report):
-                print(line)
+            print(*lines, *report, sep="\n", end="\n" if lines or report else "")
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -136,20 +114,6 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
     return given
 
 
-def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
-    from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import read_results
-
-    if options.report_changes is None or opened is None:
-        return None
-    flights = [
-        (open_flight(folder, images_needed=False), read_results(fixes))
-        for folder, fixes in zip(options.flight, options.fixes, strict=True)
-    ]
-    with progress(options) as shown:
-        return report_changes(options, opened, flights, shown)
-
-
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
@@ -161,28 +125,29 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     from orthonav.ground.report.drawing import Background
     from orthonav.ground.report.imagery import SheetImagery
 
-    sheet = SheetImagery(opened) if opened else None
-    local = sheet.frame if sheet else None
-    background = None
+    sheet, local, background, place = None, None, None, None
     if opened:
+        sheet = SheetImagery(opened)
+        local, place = sheet.frame, (sheet.frame.lat_deg, sheet.frame.lon_deg)
         background = Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)
     folders = [open_flight(path, images_needed=False) for path in options.flight]
+    names = [path.stem for path in options.fixes]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in options.fixes]
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
-        results = read_results(fixes)
-        known = read_truth(truth)
+        results, known = read_results(fixes), read_truth(truth)
         comparison = compare(known, results, local)
-        check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
+        check_truth(known, results, place, truth)
         warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
         worst: tuple[Row, ...] = ()
         if sheet and folders and options.report:
             worst = tuple(worst_rows(comparison, results, folders[i], sheet))
-        metrics = measure(comparison, options.radius_m)
         flights.append(
             FlightReport(
-                _names(options.fixes)[i],
+                names[i],
                 comparison,
-                metrics,
+                measure(comparison, options.radius_m),
                 background,
                 measure_track(comparison, results, options.radius_m),
                 worst,
@@ -202,15 +167,6 @@ def _flight_of(truth: Path) -> "FlightFolder | None":
         if (truth.parent / "telemetry.csv").is_file():
             return open_flight(truth.parent, images_needed=False)
     return None
-
-
-def _names(paths: list[Path]) -> list[str]:
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
-    if len(set(names)) < len(names):
-        names = [str(path) for path in paths]
-    return names
 
 
 def _write_report(

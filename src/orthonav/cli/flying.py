@@ -2,9 +2,9 @@
 
 import argparse
 import hashlib
-import importlib
 import logging
 import math
+import os
 import sys
 import threading
 from collections import deque
@@ -14,10 +14,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import search_plan
-from orthonav.cli.heights import map_heights
-from orthonav.cli.signed import checked_signature
-from orthonav.cli.source import FAR_M, distance_from_map, far_text
+from orthonav.cli.common import checked_signature, search_plan
+from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
@@ -103,9 +101,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     if options.ros2:
-        ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
-        frame = localizer.sheet.frame
-        source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
+        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, least)
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
     console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
@@ -167,6 +163,54 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
     )
+
+
+def _ros2(
+    options: argparse.Namespace,
+    clocks: Clocks,
+    stopping: threading.Event,
+    stack: ExitStack,
+    frame: LocalFrame,
+    min_confidence: float,
+) -> "tuple[Any, Ros2Publisher]":
+    """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
+    of the ROS map frame unless `--origin` is given."""
+    from orthonav.onboard.ros2.arguments import ros_arguments
+    from orthonav.onboard.ros2.graph import Rosout
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
+    from orthonav.onboard.ros2.rcl import joined_graph
+    from orthonav.onboard.ros2.reader import Ros2Reader
+
+    node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
+    stack.callback(node.close)
+    own, arguments = logging.getLogger("orthonav"), node.arguments
+    stack.callback(own.setLevel, own.level)
+    stack.callback(setattr, own, "propagate", own.propagate)
+    handler = logging.NullHandler() if "rosout" in arguments.silenced else Rosout(node)
+    stack.callback(own.removeHandler, handler)
+    own.addHandler(handler)
+    own.setLevel(arguments.log_level or own.level)
+    own.propagate = own.propagate and "stdout" not in arguments.silenced
+    reader = Ros2Reader(
+        node,
+        TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
+        clocks,
+        stopping.is_set,
+        mount_deg=tuple(options.mount_deg),
+    )
+    publisher = Ros2Publisher(
+        node,
+        LocalFrame(*options.origin[:2]) if options.origin else frame,
+        reader.now_ns,
+        origin_alt_m=options.origin[2] if options.origin else math.nan,
+        min_std_m=options.min_std_m,
+        min_confidence=min_confidence,
+        silent=options.dry_run,
+    )
+    reader.report_wait = lambda why: publisher.health(
+        {"health": "FAILED", "reasons": ["no_camera"], "waiting": why}
+    )
+    return reader, publisher
 
 
 def _opened(options: argparse.Namespace) -> MapFile:
@@ -371,8 +415,6 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
-    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
-    telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
     kinds = dict.fromkeys(options.send or ["global-position"])
     sent = [KINDS[kind] for kind in kinds] if options.autopilot else []
     sent += ["ROS 2 topics"] if options.ros2 else []
@@ -381,22 +423,10 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     sent += [f"NMEA to {url}" for url in options.nmea]
     sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
     confident = f"; positions of confidence {least:g} or more"
-    start = "anywhere on the map"
-    if options.start:
-        lat_deg, lon_deg, std_m = options.start
-        start = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
-    if options.state is not None:
-        start = f"position saved in {options.state}, if it is recent, else {start}"
-    lines = [
+    return [
         f"map: {options.map}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}",
-        f"autopilot: {'telemetry from ROS 2' if options.ros2 else telemetry}",
         f"sends: {', '.join(sent) + confident if sent else 'nothing'}",
-        f"start: {start}",
-        f"GNSS: {'not used' if options.gnss == 'off' else options.gnss}",
     ]
-    if options.log is not None:
-        lines.append(f"log: {options.log}, views: {options.log_views}")
-    return lines
 
 
 def camera_line(options: argparse.Namespace, camera: Camera) -> str:
@@ -404,14 +434,9 @@ def camera_line(options: argparse.Namespace, camera: Camera) -> str:
     fisheye = camera.model == "fisheye"
     angles = [each if fisheye else 2 * math.atan(each / 2) for each in camera.extent]
     width_deg, height_deg = map(math.degrees, angles)
+    size = f"{camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg"
     given = options.camera or ("camera_info" if options.ros2 else "flight.json")
-    source, pace = "ROS 2" if options.ros2 else str(options.source), ""
-    if not options.ros2 and not cameras.is_live(source):
-        pace = f", played at {options.pace:g} times real time" if options.pace != 1 else ", played"
-    return (
-        f"camera: {camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg "
-        f"({given}); images from {source}{pace}"
-    )
+    return f"camera: {size} ({given}); images from {'ROS 2' if options.ros2 else options.source}"
 
 
 def gnss_watch(
@@ -435,7 +460,6 @@ def gnss_watch(
         raise VariantError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
     else:
         source = LiveSolutions(queue)
-
     known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(
         frame,
