@@ -249,7 +249,7 @@ def run(capfd, *arguments):
 
 def test_info(near, capfd):
     code, done = run(capfd, "info", near.url)
-    assert code == 0 and "sheets     2" in done.out
+    assert code == 0 and "sheets           2" in done.out
     for words in ("6.5", "gsd_m 2.5", "2020-06-14", "BD ORTHO, IGN, Etalab-2.0"):
         assert words in done.out
     code, done = run(capfd, "info", near.url, "--json")
@@ -266,7 +266,7 @@ def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, capfd):
     assert code == 1 and done.err.startswith("orthonav: error: no atlas")
     Atlas.open_or_create(tmp_path / "atlas", RECIPE)
     code, done = run(capfd, "info", tmp_path / "atlas")
-    assert code == 0 and "date       unknown" in done.out and "sheets     0" in done.out
+    assert code == 0 and "date             unknown" in done.out and "sheets           0" in done.out
 
 
 def test_check(near, capfd):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthonav.cli import verbosity
 from orthonav.cli.build import add_recipe, asked, recipe_of
 from orthonav.cli.common import add_area, add_options, area_of, print_json, progress, reporter
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 NOT_WHOLE = 3
 SHOWN_FAILURES = 20
+EXAMPLE = "build ATLAS --ortho orthos/"
 EVERYDAY = {
     "build": (
         *("--route", "--bounds", "--band-m", "--gsd-m", "--sheet-km"),
@@ -25,12 +27,7 @@ EVERYDAY = {
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    common = argparse.ArgumentParser(add_help=False)
-    for flags, text in (
-        (("-v", "--verbose"), "say more, on stderr"),
-        (("-q", "--quiet"), "errors only, no progress"),
-    ):
-        common.add_argument(*flags, action="store_true", default=argparse.SUPPRESS, help=text)
+    common = verbosity(default=argparse.SUPPRESS)
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def action(name: str, text: str) -> argparse.ArgumentParser:
@@ -133,7 +130,7 @@ def _build(options: argparse.Namespace) -> int:
     if options.json:
         print_json(plain)
     else:
-        print(_build_text(plain))
+        _print_rows(plain, "failed", "finish_error")
     for line in _failures(plain):
         print(f"orthonav: error: {line}", file=sys.stderr)
     return 0 if result.is_complete else 1
@@ -148,22 +145,10 @@ def _runner(options: argparse.Namespace) -> "TaskRunner":
     return RayRunner(address, options.workers)
 
 
-def _build_text(plain: Mapping[str, Any]) -> str:
-    lines = [
-        f"atlas        {plain['atlas']}",
-        f"sheets       {plain['built']} built, {plain['unchanged']} unchanged, "
-        f"{plain['empty']} empty, {len(plain['failed'])} failed"
-        + (f", {plain['untried']} not tried" * bool(plain["untried"])),
-    ]
-    if plain["built"]:
-        lines += [
-            f"area         {plain['area_km2']:.1f} km2 in {plain['tiles']:,} tiles",
-            f"size         {plain['size_mb']:.1f} MB, {plain['mb_per_km2']:.2f} MB per km2",
-            f"time         {plain['wall_s']:.0f} s: {plain['km2_per_hour']:,.0f} km2 per hour, "
-            f"{plain['cpu_s_per_km2']:.2f} CPU s per km2",
-            f"memory       {plain['peak_mb']:.0f} MB at most in a process",
-        ]
-    return "\n".join(lines)
+def _print_rows(plain: Mapping[str, Any], *left_out: str) -> None:
+    for name, value in plain.items():
+        if name not in left_out:
+            print(f"{name:<17}{'unknown' if value is None else value}")
 
 
 def _failures(plain: Mapping[str, Any]) -> list[str]:
@@ -181,13 +166,11 @@ def _info(options: argparse.Namespace, atlas: "Atlas") -> None:
     if options.json:
         print_json(plain)
         return
-    for name, value in plain.items():
-        if name not in ("recipe", "imagery", "names"):
-            print(f"{name:<11}{'unknown' if value is None else value}")
+    _print_rows(plain, "recipe", "imagery", "names")
     recipe = ((name, value) for name, value in plain["recipe"].items() if value is not None)
-    print(f"recipe     {', '.join(f'{name} {value}' for name, value in recipe)}")
+    print(f"{'recipe':<17}{', '.join(f'{name} {value}' for name, value in recipe)}")
     for terms in plain["imagery"]:
-        print(f"imagery    {', '.join(str(value) for value in terms.values() if value)}")
+        print(f"{'imagery':<17}{', '.join(str(value) for value in terms.values() if value)}")
 
 
 def summary(atlas: "Atlas") -> dict[str, Any]:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 LEAST_SHIFT_M = 0.3
 """A pixel of the finest orthophotos of countries."""
 
+EXAMPLE = "--ortho ortho.tif --route route.kml --band-m 600 --out area.onav"
 EVERYDAY = (
     *("--other-date", "--dem"),
     *("--route", "--bounds", "--band-m"),

@@ -5,18 +5,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options, beside, counted, print_json, progress
+from orthonav.cli.common import add_options, beside, counted, print_json, progress, watched
 from orthonav.cli.source import add_source, dem_of, flight_heights, located, open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from orthonav.core.flight.recording import RecordedView
     from orthonav.core.records import ViewResult
     from orthonav.ground.recordings.calibrate_mount import MountCalibration
 
 GNSS_STD_M = 5.0
 """Standard deviation of measured positions, per axis."""
+EXAMPLE = "area.onav flight --out mount.json"
 EVERYDAY = ("--latency", "--gnss-positions", "--heading", "--camera", "--telemetry", "--json")
 
 
@@ -52,7 +50,15 @@ def run(options: argparse.Namespace) -> None:
             more = {"first": found.first, "last": found.last, "moved": found.moved}
             print_json(asdict(found.mount) | more)
             return
-        print(_table(found))
+        print(f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}")
+        for name, bias, unit in (
+            ("heading, deg", found.mount.heading_deg, 1.0),
+            ("height (or focal), %", found.mount.log_scale, 100.0),
+            ("pitch, deg", found.mount.pitch_deg, 1.0),
+            ("roll, deg", found.mount.roll_deg, 1.0),
+        ):
+            value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
+            print(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
         print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
         if not by_track:
             print("the views do not form a track: this is the mean of single views")
@@ -120,14 +126,8 @@ def _run_latency(options: argparse.Namespace) -> None:
 
     flight = open_source(options.flight, options)
     with progress(options) as shown:
-
-        def views() -> "Iterator[tuple[RecordedView, float]]":
-            for number, view in enumerate(arrivals_of(flight), 1):
-                yield view
-                if flight.expected:
-                    shown("latency", min(1.0, number / flight.expected))
-
-        found = calibrate_latency(flight.camera, views(), heading_known=options.heading == "known")
+        views = watched(arrivals_of(flight), flight.expected, "latency", shown)
+        found = calibrate_latency(flight.camera, views, heading_known=options.heading == "known")
     write_latency(options.out, found)
     with beside(options.out):
         if options.json:
@@ -135,17 +135,3 @@ def _run_latency(options: argparse.Namespace) -> None:
             return
         print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
         print(f"from {found.pairs} pairs of images; written to {options.out}")
-
-
-def _table(found: "MountCalibration") -> str:
-    lines = [f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}"]
-    rows = (
-        ("heading, deg", found.mount.heading_deg, 1.0),
-        ("height (or focal), %", found.mount.log_scale, 100.0),
-        ("pitch, deg", found.mount.pitch_deg, 1.0),
-        ("roll, deg", found.mount.roll_deg, 1.0),
-    )
-    for name, bias, unit in rows:
-        value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
-        lines.append(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
-    return "\n".join(lines)

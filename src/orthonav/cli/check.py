@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import add_options, print_json, progress
 
+EXAMPLE = "area.onav --route route.kml --agl-m 120 --out check"
 EVERYDAY = (
     *("--route", "--band-m", "--other-date", "--other-sensor", "--changes", "--camera", "--agl-m"),
     *("--dem", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
@@ -39,7 +40,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("ground")
     text = "orthophoto of another date than the map's, which improves the prediction"
     group.add_argument("--other-date", type=Path, metavar="TIF", help=text)
-    text = "ground that changed since the map was made, as written by localize or evaluate "
+    text = "ground that changed since the map was made, as written by localize "
     text += "--report-changes: the check warns of it and predicts fixes without it"
     group.add_argument("--changes", type=Path, metavar="FILE.geojson", help=text)
     _add_errors(parser.add_argument_group("camera, telemetry and motion"))

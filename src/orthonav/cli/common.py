@@ -5,24 +5,22 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
 from orthonav.core.errors import AreaError, VariantError
 
 if TYPE_CHECKING:
-    from orthonav.core.flight.recording import Flight
     from orthonav.core.localize.policy import SearchPlan
-    from orthonav.core.mapfile.reader import MapFile
     from orthonav.core.mapfile.signature import Signature
-    from orthonav.core.records import ViewResult
     from orthonav.ground.planning.area import Area
 
+T = TypeVar("T")
 MAX_THREADS = 64
 NADIR_DEG = (0.0, 0.0, 0.0)
 log = logging.getLogger(__name__)
@@ -129,12 +127,6 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "default": 15.0,
         "help": "largest error of a correct fix (default 15)",
     },
-    "--report-changes": {
-        "type": Path,
-        "metavar": "FILE.geojson",
-        "help": "write where the ground no longer looks like the map, by the confident views; "
-        "`check --changes` reads it",
-    },
     "--require-signed": {
         "type": Path,
         "metavar": "public.pem",
@@ -185,10 +177,6 @@ def area_of(options: argparse.Namespace) -> "Area":
     return Area.from_route(read_route(options.route), options.band_m)
 
 
-def add_search(parser: argparse._ActionsContainer) -> None:
-    add_options(parser, "--budget-ms", "--threads")
-
-
 def search_plan(options: argparse.Namespace) -> "SearchPlan":
     """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
     from orthonav.core.localize.policy import DEFAULT_PLAN
@@ -210,28 +198,6 @@ def checked_signature(options: argparse.Namespace) -> "Signature | None":
     if options.not_before is not None:
         raise VariantError("--not-before needs --require-signed")
     return None
-
-
-def report_changes(
-    options: argparse.Namespace,
-    opened: "MapFile",
-    flights: "Sequence[tuple[Flight, Sequence[ViewResult]]]",
-    shown: "Progress",
-) -> tuple[dict[str, Any], list[str]]:
-    """Write the changed ground that `--report-changes` asks for; JSON values and lines about it."""
-    from orthonav.ground.changes.ground import changes_of_flights
-    from orthonav.ground.changes.record import write_changes
-
-    path = options.report_changes
-    if path is None:
-        return {}, []
-    found = changes_of_flights(opened, flights, lambda share: shown("changes", share))
-    if found is None:
-        return {"changes": None}, ["changes: no view is confident; nothing was written"]
-    write_changes(path, found)
-    areas = {"seen_m2": round(found.seen_m2), "changed_m2": round(found.changed_m2)}
-    lines = [f"changes: {found.text()}; written to {path}"]
-    return {"changes": {"file": str(path), **areas}}, lines
 
 
 class Progress:
@@ -257,6 +223,14 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def watched(items: Iterable[T], expected: int | None, stage: str, shown: Progress) -> Iterator[T]:
+    """The same items; the share of those expected that were used is shown."""
+    for number, item in enumerate(items, 1):
+        yield item
+        if expected:
+            shown(stage, min(1.0, number / expected))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options, beside, print_json, progress, report_changes
+from orthonav.cli.common import add_options, beside, print_json
 from orthonav.cli.version import require_extras
 
 if TYPE_CHECKING:
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from orthonav.ground.evaluate.contact_sheet import Row
     from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
+
+EXAMPLE = "fixes.jsonl --flight flight --map area.onav --report report"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -27,23 +29,21 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "ground truth: the true positions (default: truth.csv of --flight); one for all files "
     text += "of fixes, or one for each in the same order"
     add("--truth", **each, metavar="truth.csv", help=text)
-    add_options(parser, "--radius-m", "--json", "--report-changes")
+    add_options(parser, "--radius-m", "--json")
     add("--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file")
     text = "write an HTML report with its figures as SVG and PNG"
     add("--report", type=Path, metavar="REPORT/", help=text)
     text = "map of the flight: background of the report"
     add("--map", type=Path, metavar="MAP.onav", help=text)
     text = "flight folder with the true positions, and with the images for the worst views in the "
-    text += "report (with --map and --report) and for --report-changes; one for all files of "
-    text += "fixes, or one for each in the same order"
+    text += "report (with --map and --report); one for all files of fixes, or one for each in the "
+    text += "same order"
     add("--flight", **each, metavar="FLIGHT_DIR", help=text)
     parser.set_defaults(wrong_usage=parser.error)
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.files import write_text
-    from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import read_results
     from orthonav.core.mapfile import open_map
     from orthonav.ground.evaluate.tables import (
         covariance_verdict,
@@ -60,25 +60,17 @@ def run(options: argparse.Namespace) -> None:
     whole = total(flights)
     if options.report:
         _write_report(options.report, flights, whole, opened)
-    plain, lines = flights_to_json(flights, whole), list[str]()
-    if options.report_changes and opened:
-        seen = [
-            (open_flight(folder, images_needed=False), read_results(fixes))
-            for folder, fixes in zip(options.flight, options.fixes, strict=True)
-        ]
-        with progress(options) as shown:
-            changes, lines = report_changes(options, opened, seen, shown)
-        plain |= changes
+    plain = flights_to_json(flights, whole)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    with beside(options.metrics, options.report_changes):
+    with beside(options.metrics):
         if options.json:
             print_json(plain)
-        else:
-            print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
-            print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
-            report = [f"report: {options.report / 'index.html'}"] if options.report else []
-            print(*lines, *report, sep="\n", end="\n" if lines or report else "")
+            return
+        print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
+        print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+        if options.report:
+            print(f"report: {options.report / 'index.html'}")
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -95,10 +87,6 @@ def _check_options(options: argparse.Namespace) -> None:
         raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
     if options.report:
         require_extras("evaluate --report")
-    if options.report_changes and not (options.map and options.flight):
-        raise FlightError(
-            "--report-changes compares views with the map; give --map and --flight too"
-        )
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
@@ -191,10 +179,6 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
     if options.map is None:
         return ""
     words = ["orthonav", "view", str(options.fixes[i]), "--map", str(options.map)]
-    if options.flight:
-        words += ["--flight", str(options.flight[i])]
-    if not options.flight or options.truth[i] != options.flight[i] / "truth.csv":
-        words += ["--truth", str(options.truth[i])]
-    if options.radius_m != 15.0:
-        words += ["--radius-m", f"{options.radius_m:g}"]
+    words += ["--flight", str(options.flight[i])] if options.flight else []
+    words += ["--truth", str(options.truth[i]), "--radius-m", f"{options.radius_m:g}"]
     return shlex.join(words)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from orthonav.ground.fetch.run import FetchRequest, FetchResult
 
 PACKAGE = "ign-package:"
+EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
     *("--layer", "--time", "--date", "--key-env", "--cache", "--json"),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from orthonav.cli.common import add_options
 
+EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
 EVERYDAY = (
     *("--camera", "--camera-latency-ms", "--mount", "--autopilot", "--recorded-telemetry"),
     *("--ros2", "--send", "--nmea", "--jsonl", "--accept", "--dry-run", "--heading", "--start"),

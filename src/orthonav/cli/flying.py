@@ -31,7 +31,7 @@ from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard import cameras
+from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
@@ -45,27 +45,8 @@ from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
 from orthonav.onboard.messages.mavlink_local import Origin
 from orthonav.onboard.messages.nmea import Quality
-from orthonav.onboard.outputs import (
-    KINDS,
-    LOCAL,
-    PX4_VISION_S,
-    JsonOut,
-    MessageOptions,
-    Messenger,
-    NmeaOut,
-    Publisher,
-    open_sink,
-)
 from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.run import Locator, MountCorrected, model_of
-from orthonav.onboard.state import (
-    before_the_flight,
-    boot_id,
-    learnt_biases,
-    load,
-    prior_of,
-    require_newest,
-)
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 if TYPE_CHECKING:
@@ -116,8 +97,9 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
         gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     newest = NewestImage()
+    wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
     narrator = Narrator(
-        *(console, clocks, newest, _wanted(options), link, options.autopilot),
+        *(console, clocks, newest, wanted, link, options.autopilot),
         is_live=options.ros2 or cameras.is_live(options.source),
         sends=not options.dry_run and (link is not None or graph is not None),
     )
@@ -217,16 +199,8 @@ def _opened(options: argparse.Namespace) -> MapFile:
     signature = checked_signature(options)
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
     if signature is not None and options.state is not None:
-        require_newest(options.state, signature, options.map)
+        state.require_newest(options.state, signature, options.map)
     return opened
-
-
-def _wanted(options: argparse.Namespace) -> str | None:
-    """The images that are waited for; None for those of ROS 2, whose reader says so."""
-    if options.ros2:
-        return None
-    clock = " (times of the autopilot's clock)" if options.file_clock == "autopilot" else ""
-    return f"images from {options.source}{clock}"
 
 
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
@@ -323,7 +297,7 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
             raise VariantError(
                 f"signing key: expected 32 bytes or 64 hexadecimal digits: {options.signing_key}"
             ) from None
-    saved = load(options.state) if options.state else None
+    saved = state.load(options.state) if options.state else None
     stamp = signing_timestamp(clocks.utc_ns())
     return Signing(key, max(stamp, saved.signing_timestamp_10us + 1 if saved else 0))
 
@@ -336,18 +310,15 @@ def _publisher(
     graph: "Ros2Publisher | None",
     narrator: Narrator,
     digest: str,
-) -> Publisher:
-    interval = {}
-    if options.send_rate_hz is not None:
-        if not options.send_rate_hz > 0:
-            raise VariantError("--send-rate-hz must be above 0")
-        interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
-    _warn_of_a_low_rate(options)
+) -> outputs.Publisher:
     rules = GateRules(
-        least, options.max_std_m, min_interval_s=interval, send_coasting=options.send_coasting
+        least,
+        options.max_std_m,
+        min_interval_s=_intervals_s(options),
+        send_coasting=options.send_coasting,
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
-    chosen = MessageOptions(
+    chosen = outputs.MessageOptions(
         kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
         clock=Clock(options.stamp),
         sensor_id=options.sensor_id,
@@ -360,15 +331,15 @@ def _publisher(
     )
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
-        nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
+        nmea = [outputs.NmeaOut(outputs.open_sink(url), quality=quality) for url in options.nmea]
         lines: list[Any] = [
-            JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
+            outputs.JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None if link is None else Messenger(chosen, gate, link, clocks)
-    return Publisher(
+    messenger = None if link is None else outputs.Messenger(chosen, gate, link, clocks)
+    return outputs.Publisher(
         gate,
         clocks,
         messenger=messenger,
@@ -380,16 +351,20 @@ def _publisher(
     )
 
 
-def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
-    local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
-    if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
+def _intervals_s(options: argparse.Namespace) -> dict[str, float]:
+    """Least interval of each message."""
+    rate_hz = options.send_rate_hz
+    if rate_hz is None:
+        return {}
+    if not rate_hz > 0:
+        raise VariantError("--send-rate-hz must be above 0")
+    local = [outputs.KINDS[kind] for kind in options.send or () if kind in outputs.LOCAL]
+    if local and rate_hz * outputs.PX4_VISION_S <= 1:
         log.warning(
-            "PX4 fuses %s only at more than %g Hz, got %g Hz: send global-position to PX4, or "
-            "raise the rate",
-            " and ".join(local),
-            1 / PX4_VISION_S,
-            options.send_rate_hz,
+            f"PX4 fuses {' and '.join(local)} only at more than {1 / outputs.PX4_VISION_S:g} Hz, "
+            f"got {rate_hz:g} Hz: send global-position to PX4, or raise the rate"
         )
+    return dict.fromkeys([*outputs.KINDS.values(), "NMEA", "ROS2"], 1 / rate_hz)
 
 
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
@@ -416,7 +391,7 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
     kinds = dict.fromkeys(options.send or ["global-position"])
-    sent = [KINDS[kind] for kind in kinds] if options.autopilot else []
+    sent = [outputs.KINDS[kind] for kind in kinds] if options.autopilot else []
     sent += ["ROS 2 topics"] if options.ros2 else []
     if options.dry_run and sent:
         sent = ["nothing to the autopilot (--dry-run)"]
@@ -482,12 +457,12 @@ def _learnt_before(
     stopped at most `--state-max-age-s` ago, or at an unknown time."""
     if options.state is None:
         return {}, None
-    saved = load(options.state)
+    saved = state.load(options.state)
     if saved is not None:
-        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
         if stopped_s > options.state_max_age_s:
-            return learnt_biases(options.state), None
-    return before_the_flight(options.state, digest)
+            return state.learnt_biases(options.state), None
+    return state.before_the_flight(options.state, digest)
 
 
 def start_of(
@@ -495,14 +470,14 @@ def start_of(
 ) -> Callable[[], Prior | None]:
     """Gives the first prior: a recent saved position, but once only, else `--start`, else None."""
     given = given_start(options, localizer)
-    saved = [load(options.state)] if options.state else []
+    saved = [state.load(options.state)] if options.state else []
 
     def prior() -> Prior | None:
         last = saved.pop() if saved else None
         if last is None:
             return given
-        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(last, age_s, options.state_max_age_s) or given
+        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
+        return state.prior_of(last, age_s, options.state_max_age_s) or given
 
     return prior
 

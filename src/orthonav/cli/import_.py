@@ -10,6 +10,7 @@ from orthonav.cli.source import add_source, dem_of, geoid_for, open_source
 
 log = logging.getLogger(__name__)
 
+EXAMPLE = "photos/ --out flight"
 EVERYDAY = (
     *("--kind", "--camera", "--telemetry", "--time-offset-s", "--mount-deg", "--rate-hz"),
     *("--agl-m", "--dem", "--json"),
@@ -49,12 +50,6 @@ def run(options: argparse.Namespace) -> None:
             "%d views have no height above ground: no height or no position was recorded, or it "
             "lies over a hole of the terrain, or outside it",
             over.without,
-        )
-    if done.complete < done.views:
-        log.warning(
-            "%d of %d views lack heading, pitch, roll or height",
-            done.views - done.complete,
-            done.views,
         )
     if done.radians:
         log.warning("%s", RADIANS)

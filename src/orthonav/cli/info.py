@@ -11,6 +11,8 @@ from orthonav.cli.common import add_options, beside, print_json
 if TYPE_CHECKING:
     from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 
+EXAMPLE = "area.onav"
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to describe")
@@ -75,9 +77,6 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
             for sheet in manifest.sheets
         ],
         "imagery": list(manifest.imagery),
-        "parts_mb": {
-            name: round(_part_bytes(part) / 1e6, 4) for name, part in manifest.parts.items()
-        },
     }
 
 

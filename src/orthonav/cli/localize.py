@@ -18,7 +18,6 @@ from orthonav.cli.common import (
     counted,
     print_json,
     progress,
-    report_changes,
     reporter,
     search_plan,
 )
@@ -39,6 +38,7 @@ from orthonav.cli.version import require_extras
 if TYPE_CHECKING:
     from orthonav.core.flight.fixes import Identity
     from orthonav.core.flight.mount import Mount
+    from orthonav.core.flight.recording import Flight
     from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import MapFile
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from orthonav.ground.recordings import Recording, SourceView
     from orthonav.ground.recordings.setups import Tried
 
+EXAMPLE = "area.onav flight --out fixes.jsonl"
 EVERYDAY = (
     *("--heading", "--prior", "--track", "--smooth", "--accept", "--mount", "--atlas"),
     *("--camera", "--fov-deg", "--agl-m", "--dem", "--json"),
@@ -67,7 +68,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     text += "tum (a trajectory for evo), odm-geo (OpenDroneMap's geo.txt) or exif (a table for "
     text += "`exiftool -csv=PATH FOLDER`); heights above sea need a terrain; can be repeated"
     add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
-    add_options(parser, "--report-changes", "--json")
+    text = "write where the ground no longer looks like the map, by the confident views; `check "
+    add("--report-changes", type=Path, metavar="FILE.geojson", help=f"{text}--changes` reads it")
+    add_options(parser, "--json")
     text = "if few views are confident, do not try other headings and heights to find the cause"
     add("--no-diagnosis", dest="diagnosis", action="store_false", help=text)
 
@@ -171,8 +174,31 @@ def _on_map(options: argparse.Namespace) -> None:
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = advisor.advice(results, accept, shown)
         seen_by = MountedFlight(flight, mount) if mount else flight
-        changed = report_changes(options, opened, [(seen_by, results)], shown)
+        changed = report_changes(options, opened, seen_by, results, shown)
     _print_summary(options, results, accept, advice, tried, changed)
+
+
+def report_changes(
+    options: argparse.Namespace,
+    opened: "MapFile",
+    flight: "Flight",
+    results: "Sequence[ViewResult]",
+    shown: Progress,
+) -> tuple[dict[str, Any], list[str]]:
+    """Write the changed ground that `--report-changes` asks for; JSON values and lines about it."""
+    from orthonav.ground.changes.ground import changes_of_flight
+    from orthonav.ground.changes.record import write_changes
+
+    path = options.report_changes
+    if path is None:
+        return {}, []
+    found = changes_of_flight(opened, flight, results, lambda share: shown("changes", share))
+    if found is None:
+        return {"changes": None}, ["changes: no view is confident; nothing was written"]
+    write_changes(path, found)
+    areas = {"seen_m2": round(found.seen_m2), "changed_m2": round(found.changed_m2)}
+    lines = [f"changes: {found.text()}; written to {path}"]
+    return {"changes": {"file": str(path), **areas}}, lines
 
 
 def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":

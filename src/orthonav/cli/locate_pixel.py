@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from orthonav.core.geo.camera import Camera
     from orthonav.core.mapfile.terrain import TerrainLayer
 
+EXAMPLE = "fixes.jsonl 0001.jpg 640 480 --flight flight"
 log = logging.getLogger(__name__)
 
 

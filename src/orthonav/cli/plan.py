@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import add_area, add_options, beside, counted, print_json
 from orthonav.cli.source import dem_of
 
+EXAMPLE = "--route route.kml --agl-m 120"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
     *("--out", "--json"),

@@ -8,6 +8,7 @@ from pathlib import Path
 from orthonav.cli.common import add_options, counted, print_json, progress
 from orthonav.cli.source import dem_of
 
+EXAMPLE = "--ortho other-year.tif --route route.kml --agl-m 120 --out flight"
 EVERYDAY = (
     *("--route", "--random", "--agl-m", "--spacing-m", "--airspeed-mps", "--camera"),
     *("--yaw-std-deg", "--agl-std", "--mount-std-deg", "--horizon-std-deg", "--prior-std-m"),

@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options
+from orthonav.cli.common import add_options, watched
 from orthonav.core.errors import FlightError, ImageryError
 
 if TYPE_CHECKING:
@@ -258,9 +258,8 @@ def located(
         "accept": accept,
     }
     results = []
-    for result in localize_flight(locator, flight, views=views, heights=heights, **how):
+    found = localize_flight(locator, flight, views=views, heights=heights, **how)
+    for result in watched(found, flight.expected, options.command, shown):
         results.append(result)
         take(result)
-        if flight.expected:
-            shown(options.command, min(1.0, len(results) / flight.expected))
     return results

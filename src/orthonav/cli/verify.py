@@ -5,6 +5,8 @@ from pathlib import Path
 
 from orthonav.cli.common import add_options
 
+EXAMPLE = "area.onav --public-key keys/public.pem"
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")

@@ -1,6 +1,5 @@
 """`orthonav --version`, and which extras each command needs."""
 
-import argparse
 import json
 import platform
 from collections.abc import Mapping, Sequence
@@ -45,12 +44,7 @@ def require_extras(command: str) -> None:
 
 def show_version(arguments: Sequence[str]) -> int:
     """Print what `--version`, with `--verbose` or `--json` beside it, asks for."""
-    parser = argparse.ArgumentParser(prog="orthonav", add_help=False)
-    parser.add_argument("--version", action="store_true")
-    parser.add_argument("-v", "--verbose", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args(arguments)
-    whole = options.json or options.verbose
+    whole = not {"-v", "--verbose", "--json"}.isdisjoint(arguments)
     print(json.dumps(about(), indent=1) if whole else f"orthonav {__version__}")
     return 0
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from orthonav.ground.view.server import Server
 
 log = logging.getLogger(__name__)
+EXAMPLE = "fixes.jsonl --map area.onav --flight flight"
 EVERYDAY = ("--flight", "--truth", "--live")
 LOOPBACK = "127.0.0.1"
 

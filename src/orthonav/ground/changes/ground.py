@@ -320,26 +320,23 @@ def _medians(values: Array, cells: NDArray[np.intp], count: int) -> Array:
     return found
 
 
-def changes_of_flights(
+def changes_of_flight(
     opened: MapFile,
-    flights: Sequence[tuple[Flight, Sequence[ViewResult]]],
+    flight: Flight,
+    results: Sequence[ViewResult],
     progress: Callable[[float], None],
 ) -> ChangedGround | None:
-    """Changed ground by the confident views of flights over a map; None without a confident view.
+    """Changed ground by the confident views of a flight; None without a confident view.
 
     Raises `MapFileError` for a map without a registration layer.
     """
     registration = Localizer(opened, level_ground=True).registration
     if registration is None:
         raise MapFileError(f"changes need a map with a registration layer: {opened.path}")
-    side_m = cell_side_m([(flight.camera, results) for flight, results in flights])
+    side_m = cell_side_m([(flight.camera, results)])
     if side_m is None:
         return None
     grid = ChangeGrid.of_sheet(registration.sheet, side_m)
-    views = [
-        view
-        for flight, results in flights
-        for view in views_beside_map(registration, grid, flight, results, progress)
-    ]
+    views = list(views_beside_map(registration, grid, flight, results, progress))
     digest = map_digest(opened.path)
     return changed_ground(views, grid, map_name=opened.path.name, map_sha256=digest)
