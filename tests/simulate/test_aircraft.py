@@ -167,17 +167,8 @@ def test_the_command(run, ortho, frame, tmp_path):
     lines = ["lat_deg,lon_deg", *(f"{lat},{lon}" for lat, lon in points)]
     (tmp_path / "route.csv").write_text("\n".join(lines))
     fly = ["simulate", "--ortho", ortho, "--route", tmp_path / "route.csv", "--agl-m", "100"]
-    biases = ["--yaw-bias-deg", "-3", "--agl-bias", "0.05", "--pitch-bias-deg", "1"]
-    wind = ["--wind-mps", "8", "--wind-from-deg", "200", "--turn-radius-m", "50"]
-    rest = ["--velocity-drift", "0.02", "--cloud-share", "0.2", "--roll-bias-deg", "-1"]
-    done = run(
-        *fly, *biases, *wind, *rest, "--beyond", "--spacing-m", "300", "--out", tmp_path / "f"
-    )
+    errors = ["--agl-std", "0.05", "--velocity-drift", "0.02", "--turn-radius-m", "50"]
+    done = run(*fly, *errors, "--spacing-m", "100", "--out", tmp_path / "f")
     assert done.code == 0 and "views written" in done.out
     telemetry = open_flight(tmp_path / "f").views[0].telemetry
-    assert telemetry.vel_en_mps is not None and telemetry.agl_m == pytest.approx(105)
-    done = run(*fly, "--wind-mps", "30", "--out", tmp_path / "g")
-    assert done.code == 1 and "too strong for an airspeed of 25 m/s" in done.err
-    done = run(*fly, "--wind-from-deg", "30", "--out", tmp_path / "g")
-    assert done.code == 1 and "--wind-mps" in done.err
-    assert not (tmp_path / "g").exists()
+    assert telemetry.vel_en_mps is not None and telemetry.agl_m != 100
