@@ -4,7 +4,6 @@ import contextlib
 import errno
 import hashlib
 import json
-import math
 import os
 import resource
 import shutil
@@ -187,36 +186,6 @@ def test_locate_pixel(run, map_path, short_flight, out):
     refused(run(*to, "--map", map_path), "no terrain")
 
 
-def test_localize_without_heading(run, map_path, flight_path, out):
-    telemetry = (flight_path / "telemetry.csv").read_text().splitlines()
-    frames = shutil.copytree(flight_path, out / "flight")
-    lines = [telemetry[0], *(_with(line, 2, "nan") for line in telemetry[1:4])]
-    (frames / "telemetry.csv").write_text("\n".join(lines) + "\n")
-    known = run("localize", map_path, frames, "--out", out / "a.jsonl", "--json")
-    unknown = run(
-        "localize", map_path, frames, "--out", out / "b.jsonl", "--json", "--heading", "unknown"
-    )
-    assert json.loads(known.out)["n_none"] == 3 and json.loads(unknown.out)["n_none"] == 0
-
-
-@pytest.mark.long
-def test_localize_as_a_track(run, map_path, flight_path, out):
-    """Views of places that have nothing to do with each other: each is searched for."""
-    few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
-    (few / "frames" / "0002.jpg").write_bytes(b"no picture")
-    to = ["--out", out / "fixes.jsonl", "--json", "-q"]
-    refused(run("localize", map_path, few, *to, "--track"), "0002.jpg")
-    for how in ("--track", "--smooth"):
-        done = run("localize", map_path, few, *to, how, "--skip-bad-images")
-        assert done.code == 0, done.err
-        lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
-        assert len(lines) == 4 and {line["tracked"] for line in lines} == {True}
-        assert {line["state"] for line in lines} <= {"searching", "tracking", "coasting", "lost"}
-        assert lines[0]["status"] == "fix" and "heading_bias_deg" in lines[0]["evidence"]
-    off = run("localize", map_path, few, *to, "--track", "--registration", "off")
-    refused(off, "registration layer")
-
-
 @pytest.mark.long
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out, monkeypatch):
     monkeypatch.setattr(
@@ -260,51 +229,16 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, undrawn)
 
 
 def test_a_map_of_another_area_is_named(run, map_path, flight_path, out):
-    """Nothing is tried where the recorded positions lie elsewhere; swapped ones are named."""
+    """Nothing is tried where the recorded positions lie elsewhere."""
     few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
-    truth = few / "truth.csv"
-    rows = [line.split(",") for line in truth.read_text().splitlines()]
-    for changed, said in (
-        ([[frame, str(float(lat) - 5), lon] for frame, lat, lon in rows[1:]], " km from the map; "),
-        ([[frame, lon, lat] for frame, lat, lon in rows[1:]], "seem to be swapped"),
-    ):
-        truth.write_text("\n".join(",".join(row) for row in [rows[0], *changed]) + "\n")
-        done = run(
-            *("localize", map_path, few, "--out", out / "f.jsonl", "--json"),
-            *("--accept", "confidence:0.9999999"),
-        )
-        plain = json.loads(done.out)
-        assert plain["n_confident"] == 0 and plain["setups"] == [] and said in done.err
-        assert said in plain["advice"][0] and plain["advice"][0].startswith(
-            "the recorded positions"
-        )
-
-
-@pytest.mark.long
-def test_a_wrong_heading_is_no_success(run, map_path, flight_path, out):
-    """Turned by 180 deg, and in radians."""
-    few = shorten(shutil.copytree(flight_path, out / "flight"), 5)
-    lines = (few / "telemetry.csv").read_text().splitlines()
-    yaw_deg = [float(line.split(",")[2]) for line in lines[1:]]
-    to = ["--out", out / "f.jsonl"]
-    turned = [
-        _with(line, 2, str((yaw + 180) % 360)) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
-    ]
-    (few / "telemetry.csv").write_text("\n".join([lines[0], *turned]) + "\n")
-    done = run("localize", map_path, few, *to)
-    assert done.code == 0 and "5 views: 0 confident" in done.out
-    assert "views of low confidence become confident with any heading, " in done.out
-    assert "positions of low confidence are best guesses" in done.out
-    radians = [
-        _with(line, 2, str(math.radians(yaw))) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
-    ]
-    (few / "telemetry.csv").write_text("\n".join([lines[0], *radians]) + "\n")
-    plain = json.loads(run("localize", map_path, few, *to, "--json").out)
-    assert plain["advice"][0].startswith("all headings are within -2 pi to 2 pi")
-    assert "if the headings are read as radians" in " ".join(plain["advice"])
-    assert plain["setups"][-1]["setup"] == "headings in radians"
-    imported = run("import", few, "--out", out / "imported")
-    assert imported.code == 0 and "as in radians" in imported.err
+    rows = [line.split(",") for line in (few / "truth.csv").read_text().splitlines()]
+    swapped = [rows[0], *([frame, lon, lat] for frame, lat, lon in rows[1:])]
+    (few / "truth.csv").write_text("\n".join(map(",".join, swapped)) + "\n")
+    sure = ["--accept", "confidence:0.9999999"]
+    done = run("localize", map_path, few, "--out", out / "f.jsonl", "--json", *sure)
+    plain = json.loads(done.out)
+    assert plain["n_confident"] == 0 and plain["setups"] == []
+    assert "seem to be swapped" in done.err and "seem to be swapped" in plain["advice"][0]
 
 
 def test_simulate(run, ortho, out, names_in):
@@ -383,27 +317,20 @@ def test_build_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     route.write_text("lat_deg,lon_deg\n46.0,3.0\n46.001,3.0\n")
     good, small = ["--ortho", ortho], SMALL_MAP
     refused(built("--ortho", tmp_path / "no.tif"), "does not exist", "no.tif")
-    (tmp_path / "empty").mkdir()
-    refused(built("--ortho", tmp_path / "empty"), "no usable orthophotos", str(tmp_path / "empty"))
     refused(built("--ortho", text, *small), "text.tif")
     refused(built("--ortho", cut, *small), "cut.tif")
     refused(built("--ortho", no_crs, *small), "coordinate reference system", "no_crs.tif")
     refused(built("--ortho", nothing, *small))
     refused(built(*good, "--bounds=5.0,46.0,5.01,46.01", *small), "the orthophotos cover")
     refused(built(*good, "--bounds=5.0,46.0,4.0,46.01", *small), "west < east")
-    refused(built(*good, "--bounds=nan,46.0,4.0,46.01", *small), "bounds")
     refused(built(*good, "--tile-px", "1024"), "larger than the area")
-    tiny = "--bounds=3.00259,46.49819,3.00261,46.49821"
-    refused(built(*good, tiny, *small), "larger than the area")
     refused(built(*good, "--tile-px", "100"), "multiple of 32")
     refused(built(*good, "--gsd-m", "0", *small), "ground resolution")
     refused(built(*good, "--overlap", "1.0"), "overlap")
     refused(built(*good, "--band-m", "100"), "--route")
     refused(built(*good, "--route", route), "--band-m")
-    refused(built(*good, "--route", route, "--band-m", "-5"), "wider than 0")
     refused(built(*good, "--route", route, "--band-m", "50", *small), "no imagery")
     refused(built(*good, "--route", tmp_path / "no.csv", "--band-m", "50"), "does not exist")
-    refused(built(*good, "--route", text, "--band-m", "50"), "route must be")
     refused(built(*good, "--method", "magic"), "unknown variant 'magic'")
     refused(built(*good, "--edges", "canny:low=300,high=100"), "canny")
     assert names_in(out) == []
@@ -551,12 +478,10 @@ def test_evaluate_refuses(run, fixes_path, truth_path, out, names_in, tmp_path, 
     refused(evaluated(tmp_path / "no.jsonl", truth_path), "does not exist")
     refused(evaluated(fixes_path, tmp_path / "no.csv"), "does not exist")
     refused(evaluated(broken, truth_path), "line 30")
-    refused(evaluated(truth_path, truth_path), "line 1")
     refused(evaluated(fixes_path, fixes_path), "columns are missing")
     refused(evaluated(fixes_path, other), "same flight")
     refused(evaluated(fixes_path, truth_path, "--truth", other), "give --truth once per file")
     refused(evaluated(fixes_path, truth_path, "--radius-m", "0"), "radius")
-    refused(evaluated(fixes_path, truth_path, "--radius-m", "nan"), "radius")
     (out / "file").write_text("in the way")
     refused(evaluated(fixes_path, truth_path, "--report", out / "file" / "report"), "cannot write")
     assert names_in(out) == ["file"]
@@ -570,15 +495,12 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     route.write_text("lat_deg,lon_deg\n46.498,3.002\n46.60,3.002\n")
     random, low = ["--random", "3"], ["--agl-m", "60"]
     refused(simulated(*random, "--agl-m", "9000"), "fly lower")
-    refused(simulated(*random, "--agl-m", "-5"), "height")
     refused(simulated("--random", "0"), "number of random positions")
     refused(simulated("--route", route, *low), "within the imagery")
     refused(simulated("--route", route, *low, "--spacing-m", "0"), "above 0")
     refused(simulated("--route", tmp_path / "no.csv", *low), "does not exist")
     refused(simulated(*random, *low, "--agl-std", "5"), "--agl-std must be", "0.05 is 5 %")
     refused(simulated(*random, *low, "--yaw-std-deg", "nan"), "--yaw-std-deg must be")
-    assert simulated(*random, *low, "--jpeg-quality", "500").code == 2
-    refused(simulated(*random, *low, "--camera", tmp_path / "no.json"), "does not exist")
     no_crs = make_ortho(tmp_path / "no_crs.tif", crs=None)
     refused(simulated(*random, *low, "--ortho", no_crs), "coordinate reference system")
     assert names_in(out) == []

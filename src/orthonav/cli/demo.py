@@ -111,7 +111,6 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
 
 
 def _run(options: argparse.Namespace, *words: object) -> str:
-    """Run another command; returns what it printed."""
     from orthonav import cli
 
     quiet = ["--quiet"] if options.quiet else []

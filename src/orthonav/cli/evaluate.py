@@ -147,7 +147,6 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
 
 
 def _flight_of(truth: Path) -> "FlightFolder | None":
-    """The flight folder that holds the ground truth, if any."""
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
 

@@ -352,7 +352,6 @@ def _publisher(
 
 
 def _intervals_s(options: argparse.Namespace) -> dict[str, float]:
-    """Least interval of each message."""
     rate_hz = options.send_rate_hz
     if rate_hz is None:
         return {}

@@ -100,7 +100,6 @@ def _registration(manifest: "Manifest") -> dict[str, Any] | None:
 
 
 def _bounds_deg(sheet: "SheetInfo") -> list[float]:
-    """West, south, east, north of the outer tile centres."""
     import numpy as np
 
     grid = sheet.grid

@@ -483,7 +483,6 @@ def _write_positions(
 
 
 def _position_text(result: "ViewResult") -> str:
-    """The position of one view in words, over several lines."""
     from orthonav.core.records import Fix
 
     outcome = result.outcome

@@ -101,7 +101,6 @@ def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
 
 
 def _terrain(path: Path) -> "tuple[TerrainLayer, str]":
-    """The terrain of a map, and its digest; raises `FlightError` without one."""
     from orthonav.core.errors import FlightError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer

@@ -38,7 +38,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_errors(parser: argparse.ArgumentParser) -> None:
-    """Standard deviations of what the telemetry reports; 0 where nothing else is said."""
     group = parser.add_argument_group("standard deviations of errors of the telemetry")
     number = partial(group.add_argument, type=float)
     number("--yaw-std-deg", default=0.0, help="reported heading (default 0)")

@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 
 def topic(text: str) -> tuple[str, str]:
-    """ROLE=NAME."""
     role, equals, name = text.partition("=")
     if not (role and equals and name):
         raise argparse.ArgumentTypeError(f"expected ROLE=/topic, got '{text}'")
@@ -99,12 +98,10 @@ def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str
 
 
 def far_text(what: str, far_m: float, hint: str) -> str:
-    """A sentence about positions that are far from the map."""
     return f"{what} {far_m / 1000:,.0f} km from the map; check the map and the positions{hint}"
 
 
 def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
-    """Log a warning where the first view was recorded far from the map."""
     view = next(iter(flight.views), None)
     found = None if view is None else far_from_map(view, localizer)
     if found is not None and found[0] > FAR_M:
