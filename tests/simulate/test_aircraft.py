@@ -163,12 +163,12 @@ def test_random_positions_refuse_route_options(fly, request, request_):
 
 
 def test_the_command(run, ortho, frame, tmp_path):
-    points = route_of(frame, *OUT).waypoints
+    points = route_of(frame, (0.0, 0.0), (100.0, 40.0)).waypoints
     lines = ["lat_deg,lon_deg", *(f"{lat},{lon}" for lat, lon in points)]
     (tmp_path / "route.csv").write_text("\n".join(lines))
     fly = ["simulate", "--ortho", ortho, "--route", tmp_path / "route.csv", "--agl-m", "100"]
     errors = ["--agl-std", "0.05", "--velocity-drift", "0.02", "--turn-radius-m", "50"]
-    done = run(*fly, *errors, "--spacing-m", "100", "--out", tmp_path / "f")
+    done = run(*fly, *errors, "--spacing-m", "50", "--out", tmp_path / "f")
     assert done.code == 0 and "views written" in done.out
     telemetry = open_flight(tmp_path / "f").views[0].telemetry
     assert telemetry.vel_en_mps is not None and telemetry.agl_m != 100
