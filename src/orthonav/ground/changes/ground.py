@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import OrthonavError
+from orthonav.core.errors import MapFileError, OrthonavError
 from orthonav.core.flight.recording import Flight
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.localizer import Localizer, RegistrationLocalizer
 from orthonav.core.localize.view import PreparedView, check_view
+from orthonav.core.mapfile import MapFile
+from orthonav.core.mapfile.signature import map_digest
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
 from orthonav.core.register.channels import channels_of
 from orthonav.core.register.pose import Pose
@@ -309,3 +311,25 @@ def _medians(values: Array, cells: NDArray[np.intp], count: int) -> Array:
     used, first, number = np.unique(cells[order], return_index=True, return_counts=True)
     found[used] = values[order][first + (number - 1) // 2]
     return found
+
+
+def changes_of_flight(
+    opened: MapFile,
+    flight: Flight,
+    results: Sequence[ViewResult],
+    progress: Callable[[float], None],
+) -> ChangedGround | None:
+    """Changed ground by the confident views of a flight; None without a confident view.
+
+    Raises `MapFileError` for a map without a registration layer.
+    """
+    registration = Localizer(opened, level_ground=True).registration
+    if registration is None:
+        raise MapFileError(f"changes need a map with a registration layer: {opened.path}")
+    side_m = cell_side_m([(flight.camera, results)])
+    if side_m is None:
+        return None
+    grid = ChangeGrid.of_sheet(registration.sheet, side_m)
+    views = list(views_beside_map(registration, grid, flight, results, progress))
+    digest = map_digest(opened.path)
+    return changed_ground(views, grid, map_name=opened.path.name, map_sha256=digest)
