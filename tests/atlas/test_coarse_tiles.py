@@ -12,9 +12,8 @@ from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO, CellLayout
 from orthonav.core.tiles.whitened import CellSheet, pooled_features
 from orthonav.core.variants import make_variant
-from orthonav.ground.atlas.catalog import CoarseRecipe
+from orthonav.ground.atlas.catalog import CoarseRecipe, canonical
 from orthonav.ground.atlas.coarse import POOLING, make_coarse, read_coarse, write_coarse
-from orthonav.ground.atlas.item import canonical
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.sheets import WorldSheets
 

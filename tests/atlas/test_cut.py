@@ -23,9 +23,8 @@ from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
 from orthonav.ground.atlas.cut import check_shown, cut_in_memory, cut_map, pooled_tiles
-from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.warp import Warp
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of

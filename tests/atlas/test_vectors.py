@@ -106,20 +106,6 @@ def test_same_input_same_bytes(tmp_path, vectors):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
 
-def test_retired_rows_are_not_found(folder, vectors):
-    retired = (
-        replace(SHARDS[0], parts=(replace(SHARDS[0].parts[0], retired=True), SHARDS[0].parts[1])),
-        SHARDS[1],
-    )
-    queries = seen(vectors)
-    _, before = ShardedIndex(folder.joinpath, SHARDS).search(queries, 3, 64, 400)
-    assert (before[:, 0] < 1500).any()
-    _, ids = ShardedIndex(folder.joinpath, retired).search(queries, 3, 64, 400)
-    assert ids.min() >= 1500
-    unaffected = (before >= 1500).all(axis=1)
-    np.testing.assert_array_equal(ids[unaffected], before[unaffected])
-
-
 def test_ids_lead_to_vectors_and_places(folder, vectors):
     index = ShardedIndex(folder.joinpath, SHARDS)
     assert len(index) == 6000

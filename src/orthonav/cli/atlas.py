@@ -379,7 +379,7 @@ def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
     if made is None:
         print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return
-    rows = sum(part.rows for shard in made.shards for part in shard.parts if not part.retired)
+    rows = sum(part.rows for shard in made.shards for part in shard.parts)
     size = sum(file.size_bytes for file in made.files.values())
     print(f"{rows} tiles of {len(made.sheets)} sheets, {size / 1e6:.3f} MB: {atlas.store}")
 

@@ -28,11 +28,10 @@ from orthonav.core.errors import AreaError, AtlasError, OrthonavError, OutputErr
 from orthonav.core.files import Progress, no_progress, with_paths
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe, Sheet
 from orthonav.ground.atlas.cluster import Failure, TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
-from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import digest, grid_of, rounded_gsd_m

@@ -2,39 +2,303 @@
 
 A sheet exists if and only if its item does, and the item is written last. Files are named by their
 content and never change. After a kill at any moment the finished sheets are intact; files without
-an item may remain, which `orthonav.ground.atlas.integrity` finds."""
+an item may remain, which `orthonav.ground.atlas.integrity` finds.
 
+An item is a STAC item (https://stacspec.org) in canonical JSON: the same sheet gives the same
+bytes. It is accepted only if writing the sheet read from it gives the same bytes again, so that an
+untrusted item can hold nothing that this program would not write. PySTAC is not used for it: it
+rewrites items to its own STAC version, checks no values, and takes three times as long (184 instead
+of 64 us per item, of which a country has 140,000). Tests validate items and catalogue with it."""
+
+import hashlib
+import json
+import re
+from calendar import monthrange
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import date
 from pathlib import Path
 from typing import Any, cast
 
-from orthonav.core.errors import AreaError, AtlasError, MissingFileError
+from orthonav.core.errors import AreaError, AtlasError, described
 from orthonav.core.files import Progress, no_progress
-from orthonav.ground.atlas.item import (
-    COLLECTION,
-    FILES,
-    ITEMS,
-    MAX_ITEM_BYTES,
-    SNAPSHOT,
-    STAC_VERSION,
-    Sheet,
-    StoredFile,
-    canonical,
-    file_name,
-    parsed,
-    read_items,
-    read_some,
-    reason,
-    snapshot_of,
-    split_name,
-)
 from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.sheets import WorldSheets
 
-FORMAT = "orthonav-atlas"
 SCHEMA = 1
+FORMAT = "orthonav-atlas"
+ITEMS, SNAPSHOT = "items", "items.geojson"
+MAX_ITEMS = 10**6  # a guard for memory: seven times a country at 20 cm (docs/country.md)
+_READ_AT_ONCE = 1000  # one page of a listing of S3
+STAC_VERSION = "1.0.0"
+COLLECTION = "orthonav-atlas"
+MAX_ITEM_BYTES = 2**20  # a guard for memory: 2 kB, 60 bytes more for each further orthophoto
+MAX_REVISION = 9999  # what four digits of a file name hold
+MAX_DIGITS = 20  # digits of an integer: 64 bits. Python needs quadratic time for longer ones.
+MAX_TILES = 10**9  # a guard against impossible values: tiles 1.5 m apart on a sheet of 45 km
+FILES = {  # folder, suffix and media type of the files that a sheet may have
+    "map": ("sheets", ".onav", "application/octet-stream"),
+    "coarse": ("coarse", ".safetensors", "application/octet-stream"),
+}
+_FILE_EXTENSION = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
+_SHA256_MULTIHASH = "1220"
+_SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
+_ITEM_NAME = re.compile(r"r[0-9]{6}c[0-9]{6}\.[0-9]{4}\.[0-9a-f]{12}\.json")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
+_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    name: str
+    size_bytes: int
+    sha256: str
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.size_bytes, int) and self.size_bytes >= 0):
+            raise AtlasError(f"size of a file is {self.size_bytes!r:.40}")
+        if not (isinstance(self.sha256, str) and _SHA256.fullmatch(self.sha256)):
+            raise AtlasError(f"sha256 of a file is {self.sha256!r:.80}")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
+    building, so that the same sheet is the same bytes everywhere. `imagery`: its orthophotos, as
+    the manifest of a map describes them. `files`: its files by kind: `map`, `coarse`."""
+
+    id: str  # name in the lattice, as r001526c001392
+    bounds_deg: Extent  # its box in the lattice: west, south, east, north
+    gsd_m: float  # ground resolution of its map, metres per pixel
+    tiles: int  # tiles of its map, 1 or more
+    area_km2: float  # area of its tile centres
+    dates: tuple[str, ...]  # dates of its imagery, YYYY[-MM[-DD]]
+    imagery: tuple[Mapping[str, Any], ...]
+    request: str  # digest of all that it was made from and how
+    made_by: Mapping[str, str]  # programs and versions that made it
+    revision: int = 0  # from 1; 0 for a sheet that is not in an atlas yet
+    files: Mapping[str, StoredFile] = field(default_factory=dict)
+
+    def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
+        data = canonical(replace(self, revision=revision, files=files).to_item())
+        return self.from_item(json.loads(data), data)
+
+    @property
+    def size_bytes(self) -> int:
+        return sum(file.size_bytes for file in self.files.values())
+
+    @property
+    def item_name(self) -> str:
+        digest = hashlib.sha256(canonical(self.to_item())).hexdigest()
+        return f"{self.id}.{self.revision:04d}.{digest[:12]}.json"
+
+    def to_item(self) -> dict[str, Any]:
+        west, south, east, north = map(float, self.bounds_deg)
+        ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+        return {
+            "type": "Feature",
+            "stac_version": STAC_VERSION,
+            "stac_extensions": [_FILE_EXTENSION],
+            "id": self.id,
+            "collection": COLLECTION,
+            "geometry": {"type": "Polygon", "coordinates": [ring]},
+            "bbox": [west, south, east, north],
+            "properties": {
+                **_times(self.dates),
+                "gsd": float(self.gsd_m),
+                "orthonav:sheet": {
+                    "schema": SCHEMA,
+                    "revision": self.revision,
+                    "tiles": self.tiles,
+                    "area_km2": float(self.area_km2),
+                    "dates": list(self.dates),
+                    "imagery": [dict(each) for each in self.imagery],
+                    "request": self.request,
+                    "made_by": dict(self.made_by),
+                },
+            },
+            "links": [
+                {"rel": rel, "href": "../atlas.json", "type": "application/json"}
+                for rel in ("root", "parent", "collection")
+            ],
+            "assets": {
+                key: {
+                    "href": f"../{file.name}",
+                    "type": FILES[key][2],
+                    "roles": ["data"],
+                    "file:size": file.size_bytes,
+                    "file:checksum": _SHA256_MULTIHASH + file.sha256,
+                }
+                for key, file in self.files.items()
+            },
+        }
+
+    @classmethod
+    def from_item(cls, plain: Any, data: bytes) -> "Sheet":
+        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. Writing
+        the sheet must give them, which also refuses values of another type."""
+        try:
+            properties = plain["properties"]
+            own = properties["orthonav:sheet"]
+            if own["schema"] > SCHEMA:
+                raise AtlasError(
+                    f"an item has schema {own['schema']}, this program reads up to {SCHEMA}; "
+                    "update orthonav"
+                )
+            west, south, east, north = map(float, plain["bbox"])
+            sheet = cls(
+                id=str(plain["id"]),
+                bounds_deg=(west, south, east, north),
+                gsd_m=float(properties["gsd"]),
+                tiles=int(own["tiles"]),
+                area_km2=float(own["area_km2"]),
+                dates=tuple(map(str, own["dates"])),
+                imagery=tuple(own["imagery"]),
+                request=str(own["request"]),
+                made_by={key: str(value) for key, value in own["made_by"].items()},
+                revision=int(own["revision"]),
+                files=_files(plain["assets"], plain["id"]),
+            )
+            possible = (
+                _SHEET.fullmatch(sheet.id)
+                and -180 <= west < east <= 180
+                and -90 <= south < north <= 90
+                and 1 <= sheet.revision <= MAX_REVISION
+                and sheet.gsd_m > 0
+                and 1 <= sheet.tiles <= MAX_TILES
+                and sheet.area_km2 >= 0
+            )
+            if not possible or canonical(sheet.to_item()) != data:
+                raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
+        except AtlasError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise AtlasError(f"damaged, or not an item of orthonav ({reason(error)})") from error
+        return sheet
+
+
+def reason(error: Exception) -> str:
+    if isinstance(error, TypeError | AttributeError):
+        return "a value is of another kind than expected"
+    return described(error)
+
+
+def canonical(plain: Any) -> bytes:
+    try:
+        return _ENCODER.encode(plain).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise AtlasError(f"cannot be written into the catalogue of an atlas: {error}") from error
+
+
+def parsed(data: bytes, what: str) -> Any:
+    """Plain values of JSON; raises `AtlasError` naming `what` where it is not JSON. The caller must
+    compare the bytes with the canonical ones, which also excludes repeated keys and numbers that
+    are not finite."""
+    try:
+        return json.loads(data.decode(), parse_int=_integer)
+    except (ValueError, RecursionError) as error:
+        raise AtlasError(f"damaged, not JSON ({error}): {what}") from error
+
+
+def read_item(name: str, data: bytes) -> Sheet:
+    plain = parsed(data, f"{ITEMS}/{name}")
+    try:
+        sheet = Sheet.from_item(plain, data)
+    except AtlasError as error:
+        raise AtlasError(f"{error}: {ITEMS}/{name}") from error
+    if sheet.item_name != name:
+        raise AtlasError(f"damaged or altered: {ITEMS}/{name}")
+    return sheet
+
+
+def file_name(key: str, sheet_id: str, sha256: str) -> str:
+    folder, suffix, _ = FILES[key]
+    return f"{folder}/{sheet_id}.{sha256[:12]}{suffix}"
+
+
+def sheet_of_file(name: str) -> str | None:
+    sheet = name.rpartition("/")[2].partition(".")[0]
+    return sheet if _SHEET.fullmatch(sheet) else None
+
+
+def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
+    found = {}
+    for key, entry in sorted(assets.items()):
+        if key not in FILES:
+            raise AtlasError(f"an item names an impossible file: {key:.40} {entry!r:.200}")
+        sha256 = entry["file:checksum"].removeprefix(_SHA256_MULTIHASH)
+        name = file_name(key, sheet_id, sha256)
+        found[key] = StoredFile(name, int(entry["file:size"]), sha256)
+    if "map" not in found:
+        raise AtlasError("an item names no map")
+    return found
+
+
+def _times(dates: tuple[str, ...]) -> dict[str, Any]:
+    """`datetime` and related properties, one of which STAC requires. A single day is a date; a
+    year, a month or several dates are a range; unknown dates are the epoch, marked as unknown."""
+    spans = [span for span in map(_span, dates) if span is not None]
+    if not spans:
+        return {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}
+    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    if first == last:
+        return {"datetime": f"{first}T00:00:00Z"}
+    return {
+        "datetime": None,
+        "start_datetime": f"{first}T00:00:00Z",
+        "end_datetime": f"{last}T23:59:59Z",
+    }
+
+
+def _span(text: str) -> tuple[date, date] | None:
+    if not _DATE.fullmatch(text):
+        return None
+    try:
+        first = date.fromisoformat(f"{text}-01-01"[:10])
+    except ValueError:
+        return None
+    if len(text) == len("YYYY-MM"):
+        return first, first.replace(day=monthrange(first.year, first.month)[1])
+    return first, date.fromisoformat(f"{text}-12-31"[:10])
+
+
+def _integer(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise ValueError(f"a number has {len(text)} digits")
+    return int(text)
+
+
+def read_items(store: Store, prefix: str = "") -> tuple[dict[str, Sheet], dict[str, str]]:
+    """Items by file name, and the errors of damaged items by file name. Where a sheet has several
+    items, the last in the order of names is current."""
+    names = {n: s for n, s in store.names(ITEMS, prefix).items() if _ITEM_NAME.fullmatch(n)}
+    if len(names) > MAX_ITEMS:
+        raise AtlasError(f"more than {MAX_ITEMS} items: {store}")
+    found: dict[str, Sheet] = {}
+    broken = {
+        name: f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{name}"
+        for name, size in names.items()
+        if size > MAX_ITEM_BYTES
+    }
+    wanted = [f"{ITEMS}/{name}" for name in names if name not in broken]
+    for start in range(0, len(wanted), _READ_AT_ONCE):
+        for path, data in store.read_many(wanted[start : start + _READ_AT_ONCE]).items():
+            name = path.partition("/")[2]
+            try:
+                found[name] = read_item(name, data)
+            except AtlasError as error:
+                broken[name] = str(error)
+    return found, broken
+
+
+def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
+    items = [sheet.to_item() for sheet in sheets]
+    for item in items:
+        for link in (*item["links"], *item["assets"].values()):
+            link["href"] = f"./{link['href'].removeprefix('../')}"
+    return canonical({"type": "FeatureCollection", "features": items})
 
 
 def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
@@ -107,14 +371,6 @@ class AtlasRecipe:
         except (KeyError, TypeError, ValueError) as error:
             raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
 
-    def differences(self, other: "AtlasRecipe") -> list[str]:
-        mine, theirs = self.to_plain(), other.to_plain()
-        return [
-            f"{name}: {mine[name]}, not {theirs[name]}"
-            for name in mine
-            if mine[name] != theirs[name]
-        ]
-
 
 CATALOG = "atlas.json"
 _SAME_PLACE_DEG = 1e-9  # a tenth of a millimetre: rounding only
@@ -180,42 +436,34 @@ class Atlas:
 
     def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
         """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`. Nothing is
-        written where the same files of the same request are there already. Safe with several
-        processes; after a kill the sheet is as before or as described."""
+        written where the same files of the same request are there already. After a kill the sheet
+        is as before or as described."""
         sheet_id = described.id
         stored = {key: _stored(key, sheet_id, Path(path)) for key, path in sorted(files.items())}
         there = self._revisions(sheet_id)
-        before = there.get(max(there)) if there else None
+        before = there[max(there)] if there else None
         if before and before.request == described.request and before.files == stored:
             sheet = before
         else:
-            revisions = [found[1] for found in map(split_name, there) if found]
-            revision = 1 + max(revisions, default=0)
-            sheet = described.stored(revision, stored)
+            revisions = [int(name.split(".")[1]) for name in there]
+            sheet = described.stored(1 + max(revisions, default=0), stored)
         self.require_place(sheet)
-        self._upload(sheet, files, _named_by(there))
+        for key, file in sheet.files.items():
+            if sheet is not before or self.store.size(file.name) != file.size_bytes:
+                self.store.write(file.name, Path(files[key]))
         if sheet is not before:
             self.store.write(f"{ITEMS}/{sheet.item_name}", canonical(sheet.to_item()))
-            there = self._revisions(sheet_id)
-        if len(there) > 1:
-            self._remove_items([name for name in there if name != max(there)], there)
-            there = self._revisions(sheet_id)
-        if sheet.item_name in there:
-            self._upload(sheet, files, _named_by(there))  # another process may have removed some
-        elif there:  # another process has put this sheet meanwhile, and its revision is current
-            sheet = there[max(there)] or sheet
-        if self._sheets is not None:
-            self._sheets = dict(sorted({**self._sheets, sheet_id: sheet}.items()))
-        return sheet
+            there = {sheet.item_name: sheet, **self._revisions(sheet_id)}
+        current = max(there)  # perhaps of another process that has put this sheet meanwhile
+        self.remove_items(sheet_id, {name: there[name] for name in there if name != current})
+        return there[current] or sheet
 
     def retire(self, sheet_id: str) -> None:
         """Take a sheet out: its items first, then the files that no item names."""
         there = self._revisions(sheet_id)
         if not there:
             raise AtlasError(f"the atlas has no sheet {sheet_id!r:.40}: {self.store}")
-        self._remove_items(there, there)
-        if self._sheets is not None:
-            self._sheets.pop(sheet_id, None)
+        self.remove_items(sheet_id, there)
 
     def path(self, sheet: Sheet, kind: str = "map") -> Path:
         found = sheet.files.get(kind)
@@ -227,7 +475,13 @@ class Atlas:
         self.store.write(SNAPSHOT, snapshot_of(self.sheets(refresh=True).values()))
 
     def require_recipe(self, recipe: AtlasRecipe) -> "Atlas":
-        if differences := self.recipe.differences(recipe):
+        mine, other = self.recipe.to_plain(), recipe.to_plain()
+        differences = [
+            f"{name}: {value}, not {other[name]}"
+            for name, value in mine.items()
+            if value != other[name]
+        ]
+        if differences:
             raise AtlasError(
                 "all sheets of an atlas are made alike; this one has "
                 f"{'; '.join(differences)}: {self.store}"
@@ -246,26 +500,17 @@ class Atlas:
             )
 
     def _revisions(self, sheet_id: str) -> dict[str, Sheet | None]:
-        names = self.store.names(ITEMS, f"{sheet_id}.")
-        found, broken = read_some(self.store, names)
+        """Items of a sheet by file name; None for damaged ones."""
+        found, broken = read_items(self.store, f"{sheet_id}.")
         return {**found, **dict.fromkeys(broken)}
 
-    def _upload(self, sheet: Sheet, files: Mapping[str, Path], named: set[str]) -> None:
-        """Copy missing files. Files that no item names yet may be removed at any moment, so they
-        are copied in any case."""
-        for key, file in sheet.files.items():
-            if file.name not in named or self.store.size(file.name) != file.size_bytes:
-                self.store.write(file.name, Path(files[key]))
-
-    def _remove_items(self, names: Iterable[str], there: Mapping[str, Sheet | None]) -> None:
-        names = sorted(names)
-        for name in names:
+    def remove_items(self, sheet_id: str, items: Mapping[str, Sheet | None]) -> None:
+        for name in sorted(items):
             self.store.remove(f"{ITEMS}/{name}")
-        gone = _named_by({name: there[name] for name in names})
-        if gone:
-            still = _named_by(self._revisions(names[0].partition(".")[0]))
-            for file in sorted(gone - still):
+        if gone := _named_by(items):
+            for file in sorted(gone - _named_by(self._revisions(sheet_id))):
                 self.store.remove(file)
+        self._sheets = None
 
 
 def copy_sheets(
@@ -310,15 +555,8 @@ def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:
 
 
 def _stored(key: str, sheet_id: str, path: Path) -> StoredFile:
-    if key not in FILES:
-        raise AtlasError(f"a sheet has {' and '.join(FILES)}, not {key!r:.40}")
-    try:
-        sha256, size = digest_of(path), path.stat().st_size
-    except OSError as error:
-        raise MissingFileError(
-            f"file of a sheet cannot be read ({error.strerror}): {path}"
-        ) from error
-    return StoredFile(file_name(key, sheet_id, sha256), size, sha256)
+    sha256 = digest_of(path)
+    return StoredFile(file_name(key, sheet_id, sha256), path.stat().st_size, sha256)
 
 
 def _catalog(recipe: AtlasRecipe) -> bytes:

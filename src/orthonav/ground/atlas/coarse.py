@@ -21,8 +21,7 @@ from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedRecipe, pooled_features
 from orthonav.core.variants import make_variant
-from orthonav.ground.atlas.catalog import CoarseRecipe
-from orthonav.ground.atlas.item import canonical, reason
+from orthonav.ground.atlas.catalog import CoarseRecipe, canonical, reason
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.sheet import MIN_TILE_VALID_SHARE, SheetReader
 from orthonav.ground.imagery.mosaic import Mosaic

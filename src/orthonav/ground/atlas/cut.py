@@ -50,8 +50,7 @@ from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import variant_from_recipe
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.item import Sheet
+from orthonav.ground.atlas.catalog import Atlas, Sheet
 from orthonav.ground.atlas.warp import SheetSource, Warp, joined_cells, joined_grey, outline
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
 from orthonav.ground.build.layer import GreyLayerWriter, Parts, StoredCells

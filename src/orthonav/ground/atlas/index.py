@@ -1,9 +1,9 @@
 """The index of an atlas: its coarse tiles as vectors, in shards, and the manifest of its files.
 
-Whitening and quantizers are learnt once, from tiles evenly spaced over all sheets, and shared by
-all shards. New sheets become a new shard and the rows of changed or removed sheets are retired;
-after many changes the whole index is rebuilt. The manifest is written last: an atlas without it has
-no index. It may come from an untrusted source, so every value is checked when it is read."""
+Whitening and quantizers are learnt from tiles evenly spaced over all sheets, and shared by all
+shards. The index is made anew where sheets have changed. The manifest is written last: an atlas
+without it has no index. It may come from an untrusted source, so every value is checked when it is
+read."""
 
 import hashlib
 import re
@@ -22,9 +22,8 @@ from safetensors.numpy import load_file, save
 from orthonav.core.errors import AtlasError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.tiles.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
-from orthonav.ground.atlas.catalog import Atlas
+from orthonav.ground.atlas.catalog import Atlas, Sheet, StoredFile, canonical, parsed, reason
 from orthonav.ground.atlas.coarse import POOLING, read_coarse, tile_count
-from orthonav.ground.atlas.item import Sheet, StoredFile, canonical, parsed, reason
 from orthonav.ground.atlas.store import digest_of
 from orthonav.ground.atlas.vectors import (
     MAX_TRAINING_VECTORS,
@@ -53,12 +52,7 @@ class IndexManifest:
 
     @property
     def sheets(self) -> dict[str, str]:
-        return {
-            part.sheet: part.sha256
-            for shard in self.shards
-            for part in shard.parts
-            if not part.retired
-        }
+        return {part.sheet: part.sha256 for shard in self.shards for part in shard.parts}
 
     def to_json(self) -> bytes:
         return canonical({"format": FORMAT, "schema": SCHEMA, **asdict(self)}) + b"\n"
@@ -94,8 +88,7 @@ class IndexManifest:
 def _shard(plain: Any) -> ShardInfo:
     """A shard; values of another type are converted, and differ when they are written again."""
     parts = tuple(
-        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"]), bool(part["retired"]))
-        for part in plain["parts"]
+        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"])) for part in plain["parts"]
     )
     return ShardInfo(str(plain["name"]), int(plain["base"]), parts)
 
@@ -120,10 +113,6 @@ def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list
 WHITENING_NAME = "whitening.safetensors"
 MAX_TRAINING_TILES = 40_000  # of the whitening: twice those of a map (`MAX_LEARNT_TILES`)
 SHARD_ROWS = 10_000_000  # 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)
-REBUILD_SHARE = 0.3
-FEW_ROWS = 200_000
-"""The index is rebuilt where more than this fraction of the rows is new or gone, or where it has so
-few rows that rebuilding takes seconds."""
 POWER = 0.5
 """Exponent of the whitening: full whitening (1) does not recognize a place an eighth of a tile off.
 On 2,500 generated km2 half whitening ranks the right tile first for 87 instead of 83 % of views of
@@ -131,167 +120,114 @@ another year."""
 MANY_TILES, MANY_DIMS = 3_000_000, 64  # above so many tiles, so many components
 MIN_TILES = 16  # fewer tiles than codes of a quantizer cannot train it
 BATCH_TILES = 4096
-LEARN_PASSES = 3  # mean and scatter of the features, sample of the vectors
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
-Counted = tuple[Sheet, int]  # a sheet and the number of its coarse tiles
 
 
 def make_index(
     atlas: Atlas, progress: Progress = no_progress, rebuild: bool = False
 ) -> IndexManifest | None:
     """Bring the index of an atlas up to date; None where its sheets have no coarse tiles. The same
-    sheets give the same bytes where the index is rebuilt, or built for the first time. Raises
-    `AtlasError`, `StorageError`, `MissingExtraError`."""
+    sheets give the same bytes. Raises `AtlasError`, `StorageError`, `MissingExtraError`."""
     atlas.sheets(refresh=True)
-    sheets = indexed_sheets(atlas)
+    sheets = list(indexed_sheets(atlas).values())
     if not sheets:
         return None
-    before = None
     if not rebuild:
         with suppress(AtlasError):  # a manifest that is damaged or of another schema
             before = read_manifest(atlas)
+            if before is not None and stale_sheets(atlas, before) == ([], []):
+                return before
+    counts = [tile_count(atlas.path(sheet, "coarse")) for sheet in sheets]
+    if sum(counts) < MIN_TILES:
+        raise AtlasError(
+            f"the atlas has {sum(counts)} coarse tiles with imagery, too few for an index; build "
+            "it with smaller ones (--coarse-gsd-m, --coarse-tile-px)"
+        )
     with tempfile.TemporaryDirectory(prefix="orthonav-index-") as name:
-        builder = _IndexBuilder(atlas, Path(name), progress)
-        if before is None:
-            return builder.build(list(sheets.values()))
-        new, gone = stale_sheets(atlas, before)
-        if not new and not gone:
-            return before
-        stale = {*new, *gone}
-        parts = [part for shard in before.shards for part in shard.parts]
-        lost = sum(part.rows for part in parts if part.retired or part.sheet in stale)
-        total = sum(part.rows for part in parts)
-        added = len(new) * total / max(1, len(parts))
-        if total > FEW_ROWS and lost + added <= REBUILD_SHARE * total:
-            return builder.update(before, [sheets[each] for each in new], stale)
-        return builder.build(list(sheets.values()))
+        folder = Path(name)
+        progress("learn index", 0.0)
+        embedder, quantizers = _learnt(atlas, sheets, sum(counts), folder)
+        shards: list[ShardInfo] = []
+        for group in _groups(sheets, counts):
+            base = sum(shard.rows for shard in shards)
+            progress("index", base / sum(counts))
+            shards.append(_written_shard(atlas, group, base, embedder, quantizers, folder))
+        progress("index", 1.0)
+        return _stored(atlas, IndexManifest(quantizers.recipe, tuple(shards), {}), folder)
 
 
-class _IndexBuilder:
-    def __init__(self, atlas: Atlas, folder: Path, progress: Progress) -> None:
-        self._atlas, self._folder, self._progress = atlas, folder, progress
+def _learnt(
+    atlas: Atlas, sheets: Sequence[Sheet], total: int, folder: Path
+) -> tuple[WhitenedEmbedder, Quantizers]:
+    def over_sheets(work: Work[Made], most: int = MAX_TRAINING_TILES) -> Iterator[Made]:
+        for _, features in _tiles(atlas, sheets, max(1, total // most)):
+            yield work(*features)
 
-    def build(self, sheets: Sequence[Sheet]) -> IndexManifest:
-        counted = self._counted(sheets)
-        total = sum(count for _, count in counted)
-        if total < MIN_TILES:
-            raise AtlasError(
-                f"the atlas has {total} coarse tiles with imagery, too few for an index; build it "
-                "with smaller ones (--coarse-gsd-m, --coarse-tile-px)"
-            )
-        embedder, quantizers = self._learnt(sheets, total)
-        empty = IndexManifest(quantizers.recipe, (), {})
-        return self._extended(empty, embedder, quantizers, _groups(counted))
-
-    def _learnt(self, sheets: Sequence[Sheet], total: int) -> tuple[WhitenedEmbedder, Quantizers]:
-        step = max(1, total // MAX_TRAINING_TILES)
-        dims = POOLING.dims if total <= MANY_TILES else MANY_DIMS
-        shares = _shares(LEARN_PASSES * len(sheets))
-
-        def over_sheets(work: Work[Made], step: int = step) -> Iterator[Made]:
-            for _, features in self._tiles(sheets, "learn index", shares, step):
-                yield work(*features)
-
-        embedder = _shortened(learn_in_two_passes(POOLING, over_sheets), dims)
-        (self._folder / WHITENING_NAME).write_bytes(
-            save(embedder.parts(), metadata={"orthonav": FORMAT})
-        )
-        step = max(1, total // MAX_TRAINING_VECTORS)
-        sample = over_sheets(lambda *features: vectors_of(embedder, features), step)
-        recipe = VectorRecipe.for_count(total, embedder.dims)
-        quantizers = train(np.concatenate(list(sample)), recipe)
-        quantizers.save(self._folder / QUANTIZERS_NAME)
-        return embedder, quantizers
-
-    def update(self, before: IndexManifest, new: Sequence[Sheet], stale: set[str]) -> IndexManifest:
-        embedder = load_whitening(index_file(self._atlas, before, WHITENING_NAME))
-        quantizers = Quantizers.load(index_file(self._atlas, before, QUANTIZERS_NAME))
-        shards = tuple(
-            replace(
-                shard,
-                parts=tuple(
-                    replace(part, retired=part.retired or part.sheet in stale)
-                    for part in shard.parts
-                ),
-            )
-            for shard in before.shards
-        )
-        left = replace(before, shards=shards)
-        groups = [self._counted(new)] if new else []
-        return self._extended(left, embedder, quantizers, groups)
-
-    def _extended(
-        self,
-        index: IndexManifest,
-        embedder: WhitenedEmbedder,
-        quantizers: Quantizers,
-        groups: Sequence[Sequence[Counted]],
-    ) -> IndexManifest:
-        """The index with a further shard for each group of sheets, put into the atlas: the manifest
-        after the files; then files that are not used any more are removed."""
-        shards, files, store = list(index.shards), dict(index.files), self._atlas.store
-        shares = _shares(sum(map(len, groups)))
-        for group in groups:
-            base = shards[-1].base + shards[-1].rows if shards else 0
-            digests = [sheet.files["coarse"].sha256 for sheet, _ in group]
-            content = hashlib.sha256("".join([quantizers.digest, *digests]).encode()).hexdigest()
-            name = f"shard-{base:012d}-{content[:12]}"
-            tiles = self._tiles([sheet for sheet, _ in group], "index", shares)
-            rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
-            write_shard(self._folder, name, quantizers, rows)
-            parts = [
-                Part(sheet.id, digest, count)
-                for (sheet, count), digest in zip(group, digests, strict=True)
-            ]
-            shards.append(ShardInfo(name, base, tuple(parts)))
-        for path in sorted(self._folder.iterdir()):
-            name = f"{FOLDER}/{path.name}"
-            files[path.name] = StoredFile(name, path.stat().st_size, digest_of(path))
-            store.write(name, path)
-        manifest = IndexManifest(quantizers.recipe, tuple(shards), files)
-        store.write(MANIFEST, manifest.to_json())
-        used = {MANIFEST, *(file.name for file in files.values())}
-        for name in store.names(FOLDER):
-            if f"{FOLDER}/{name}" not in used:
-                store.remove(f"{FOLDER}/{name}")
-        return manifest
-
-    def _counted(self, sheets: Sequence[Sheet]) -> list[Counted]:
-        return [(sheet, tile_count(self._atlas.path(sheet, "coarse"))) for sheet in sheets]
-
-    def _tiles(
-        self, sheets: Sequence[Sheet], stage: str, shares: Iterator[float], step: int = 1
-    ) -> Iterator[tuple[NDArray[np.float64], Features]]:
-        """Places (n, 2) and features of every `step`-th tile of sheets, some at a time. `shares`:
-        fraction of the stage that is done after each sheet."""
-        for sheet in sheets:
-            tiles = read_coarse(self._atlas.path(sheet, "coarse"))
-            for start in range(0, len(tiles.valid), step * BATCH_TILES):
-                part = slice(start, start + step * BATCH_TILES, step)
-                yield tiles.centres_latlon_deg[part], tiles.features_of(part)
-            self._progress(stage, next(shares))
-
-
-def _shares(count: int) -> Iterator[float]:
-    return (number / count for number in range(1, count + 1))
-
-
-def _groups(counted: Sequence[Counted]) -> list[list[Counted]]:
-    groups: list[list[Counted]] = [[]]
-    rows = 0
-    for sheet, count in counted:
-        if groups[-1] and rows + count > SHARD_ROWS:
-            groups.append([])
-            rows = 0
-        groups[-1].append((sheet, count))
-        rows += count
-    return groups
-
-
-def _shortened(embedder: WhitenedEmbedder, dims: int) -> WhitenedEmbedder:
-    dims = min(dims, embedder.dims)
+    embedder = learn_in_two_passes(POOLING, over_sheets)
+    dims = min(embedder.dims, POOLING.dims if total <= MANY_TILES else MANY_DIMS)
     basis = np.ascontiguousarray(embedder.basis[:, : dims - dims % 2])
-    return replace(embedder, basis=basis)
+    embedder = replace(embedder, basis=basis)
+    whitening = save(embedder.parts(), metadata={"orthonav": FORMAT})
+    (folder / WHITENING_NAME).write_bytes(whitening)
+    sample = over_sheets(lambda *features: vectors_of(embedder, features), MAX_TRAINING_VECTORS)
+    recipe = VectorRecipe.for_count(total, embedder.dims)
+    quantizers = train(np.concatenate(list(sample)), recipe)
+    quantizers.save(folder / QUANTIZERS_NAME)
+    return embedder, quantizers
+
+
+def _written_shard(
+    atlas: Atlas,
+    group: Mapping[str, int],
+    base: int,
+    embedder: WhitenedEmbedder,
+    quantizers: Quantizers,
+    folder: Path,
+) -> ShardInfo:
+    sheets = [atlas.sheets()[name] for name in group]
+    parts = tuple(Part(each.id, each.files["coarse"].sha256, group[each.id]) for each in sheets)
+    content = "".join([quantizers.digest, *(part.sha256 for part in parts)])
+    name = f"shard-{base:012d}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
+    tiles = _tiles(atlas, sheets)
+    rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
+    write_shard(folder, name, quantizers, rows)
+    return ShardInfo(name, base, parts)
+
+
+def _stored(atlas: Atlas, index: IndexManifest, folder: Path) -> IndexManifest:
+    """Put the files into the atlas, then the manifest; then remove those of the index before."""
+    files, store = {}, atlas.store
+    for path in sorted(folder.iterdir()):
+        name = f"{FOLDER}/{path.name}"
+        files[path.name] = StoredFile(name, path.stat().st_size, digest_of(path))
+        store.write(name, path)
+    manifest = replace(index, files=files)
+    store.write(MANIFEST, manifest.to_json())
+    for name in store.names(FOLDER).keys() - files:
+        if f"{FOLDER}/{name}" != MANIFEST:
+            store.remove(f"{FOLDER}/{name}")
+    return manifest
+
+
+def _tiles(
+    atlas: Atlas, sheets: Sequence[Sheet], step: int = 1
+) -> Iterator[tuple[NDArray[np.float64], Features]]:
+    """Places (n, 2) and features of every `step`-th tile of sheets, some at a time."""
+    for sheet in sheets:
+        tiles = read_coarse(atlas.path(sheet, "coarse"))
+        for start in range(0, len(tiles.valid), step * BATCH_TILES):
+            part = slice(start, start + step * BATCH_TILES, step)
+            yield tiles.centres_latlon_deg[part], tiles.features_of(part)
+
+
+def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[dict[str, int]]:
+    """Names of the sheets of each shard, with their numbers of tiles."""
+    groups: list[dict[str, int]] = [{}]
+    for sheet, count in zip(sheets, counts, strict=True):
+        if groups[-1] and sum(groups[-1].values()) + count > SHARD_ROWS:
+            groups.append({})
+        groups[-1][sheet.id] = count
+    return groups
 
 
 def vectors_of(embedder: WhitenedEmbedder, features: Features) -> NDArray[np.float32]:

@@ -232,7 +232,6 @@ def _rotation(vectors: Array, groups: int) -> Array:
 
 
 SCAN_ONE = 10  # FAISS's implementation of the scan that is fastest for one query at a time
-ADD_ROWS = 32_768
 NONE = -1  # id where fewer than k vectors were found
 
 Ids = NDArray[np.int64]
@@ -244,7 +243,7 @@ class Part:
     sheet: str  # name of the sheet
     sha256: str  # digest of its coarse tiles (hex)
     rows: int  # how many
-    retired: bool = False  # the sheet has changed or gone, and its rows are not found any more
+    retired: bool = False  # always: earlier versions stored it
 
 
 @dataclass(frozen=True)
@@ -256,16 +255,6 @@ class ShardInfo:
     @property
     def rows(self) -> int:
         return sum(part.rows for part in self.parts)
-
-    @property
-    def retired_rows(self) -> NDArray[np.int64]:
-        ends = np.cumsum([part.rows for part in self.parts]).tolist()
-        retired = [
-            np.arange(end - part.rows, end, dtype=np.int64)
-            for part, end in zip(self.parts, ends, strict=True)
-            if part.retired
-        ]
-        return np.concatenate(retired) if retired else np.empty(0, np.int64)
 
 
 def write_shard(
@@ -280,13 +269,12 @@ def write_shard(
         _write_header(out, 0, dims)
         for places, batch in batches:
             places_deg.append(places)
-            for start in range(0, len(batch), ADD_ROWS):
-                stored = np.ascontiguousarray(batch[start : start + ADD_ROWS], dtype=np.float16)
-                if not np.isfinite(stored).all():
-                    raise AtlasError("vectors of an index must be finite")
-                out.write(stored.data)
-                with one_thread():
-                    index.add(quantizers.rotated(stored.astype(np.float32)))
+            stored = np.ascontiguousarray(batch, dtype=np.float16)
+            if not np.isfinite(stored).all():
+                raise AtlasError("vectors of an index must be finite")
+            out.write(stored.data)
+            with one_thread():
+                index.add(quantizers.rotated(stored.astype(np.float32)))
         out.seek(0)
         _write_header(out, index.ntotal, dims)
     np.save(folder / f"{name}.places.npy", np.concatenate(places_deg))
@@ -353,7 +341,6 @@ class OpenShard:
         self._file = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._file)
         os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
-        self._retired = info.retired_rows
         self._index = quantizers.empty_index()
         self._map_lists(codes, codes_bytes, table, quantizers)
 
@@ -394,9 +381,6 @@ class OpenShard:
         )
         if rows.max(initial=NONE) >= self.info.rows or rows.min(initial=NONE) < NONE:
             raise AtlasError(f"codes of shard {self.info.name} are damaged; rebuild the index")
-        if len(self._retired):
-            gone = np.isin(rows, self._retired)
-            rows[gone], found[gone] = NONE, -np.inf
         return found, rows
 
     def vectors(self, rows: Ids) -> Array:

@@ -23,7 +23,7 @@ from orthonav.core.mapfile.manifest import Manifest
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.represent import HARMONICS
-from orthonav.ground.atlas.item import Sheet
+from orthonav.ground.atlas.catalog import Sheet
 from orthonav.ground.build.layer import StoredCells
 from orthonav.ground.build.sheet import Block
 from orthonav.ground.planning.area import Extent
