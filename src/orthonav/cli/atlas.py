@@ -168,12 +168,6 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
         help="build with Ray, on the cores of this machine (local) or on the cluster at HOST:PORT "
         "(default: one sheet after the other in this process)",
     )
-    cluster.add_argument(
-        "--cpu-hour-price",
-        type=float,
-        metavar="PRICE",
-        help="price of a core for an hour: the summary then shows the cost of the sheets",
-    )
 
 
 def _build(options: argparse.Namespace) -> int:
@@ -201,7 +195,7 @@ def _build(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 1
-    plain = result.to_plain(options.cpu_hour_price)
+    plain = result.to_plain()
     if options.json:
         print_json(plain)
     else:
@@ -248,10 +242,7 @@ def _build_text(plain: Mapping[str, Any]) -> str:
             f"size         {plain['size_mb']:.1f} MB, {plain['mb_per_km2']:.2f} MB per km2",
             f"time         {plain['wall_s']:.0f} s: {plain['km2_per_hour']:,.0f} km2 per hour, "
             f"{plain['cpu_s_per_km2']:.2f} CPU s per km2",
-            f"memory       {plain['peak_mb']:.0f} MB at most in a process",
         ]
-        if "cost" in plain:
-            lines.append(f"cost         {plain['cost']:.4g}, {plain['cost_per_km2']:.4g} per km2")
     return "\n".join(lines)
 
 
@@ -260,8 +251,6 @@ def _failures(plain: Mapping[str, Any]) -> list[str]:
     if len(lines) > SHOWN_FAILURES:
         more = f"and {len(lines) - SHOWN_FAILURES} more sheets, see --json"
         lines = [*lines[:SHOWN_FAILURES], more]
-    if plain["finish_error"]:
-        lines.append(f"snapshot and index could not be written: {plain['finish_error']}")
     return lines
 
 
