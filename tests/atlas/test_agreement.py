@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.atlas.agreement import (
+from orthonav.ground.atlas.locate import (
     CHANCE,
     MAX_CHAIN_LOG_ODDS,
     MIN_VIEWS,

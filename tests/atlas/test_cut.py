@@ -24,8 +24,7 @@ from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
-from orthonav.ground.atlas.cut import check_shown, cut_in_memory, cut_map, pooled_tiles
-from orthonav.ground.atlas.warp import Warp
+from orthonav.ground.atlas.cut import Warp, check_shown, cut_in_memory, cut_map, pooled_tiles
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -243,7 +242,7 @@ def test_a_missing_sheet_beside_the_route_is_a_warning(atlas, names, middle, tmp
     here = middle.en_from_latlon(*centre_of(names[0]))
     route = line(middle, 1.2 * here, 0.5 * here)
     done = cut_map(atlas, tmp_path / "o.onav", Area.from_route(route, 600), workers=1)
-    assert "the atlas lacks" in caplog.text and names[3] in caplog.text
+    assert "the atlas, which lacks" in caplog.text and names[3] in caplog.text
     sheet = done.manifest.sheets[0]
     assert sheet.tiles < 0.9 * sheet.grid.rows * sheet.grid.cols
 
@@ -264,29 +263,25 @@ def centre_of(name):
     return (south + north) / 2, (west + east) / 2
 
 
-def test_imagery_that_is_missing_under_the_route_is_an_error(middle, caplog):
+def test_imagery_that_is_missing_under_the_route_is_an_error(atlas, middle, caplog):
     area = Area.from_route(line(middle, [-150, 0], [150, 0]), 200)
     grid = grid_of(area, 1.0, 1.0, RECIPE.tile_px, RECIPE.overlap)
     cells = CellSheet(LAYOUT, grid.height_px, grid.width_px, 7)
     cells.valid[:, : cells.valid.shape[1] // 2] = 1
     with pytest.raises(AtlasError, match="of the route has no imagery"):
-        check_shown(area, grid, cells, allow_holes=False)
-    check_shown(area, grid, cells, allow_holes=True)
+        check_shown(area, grid, cells, atlas, allow_holes=False)
+    check_shown(area, grid, cells, atlas, allow_holes=True)
     assert "of the area has no imagery" in caplog.text
     cells.valid[:] = 1
-    check_shown(area, grid, cells, allow_holes=False)
+    check_shown(area, grid, cells, atlas, allow_holes=False)
 
 
 def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
         cut_map(atlas, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
-    west, south, east, north = atlas.bounds_deg
-    swapped = Area.from_bounds((south, west, north, east))
-    with pytest.raises(AreaError, match="seem to be swapped"):
-        cut_map(atlas, tmp_path / "o.onav", swapped)
     empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
-    with pytest.raises(AreaError, match="no sheets yet"):
+    with pytest.raises(AreaError, match="0 sheets"):
         cut_map(empty, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
 
 

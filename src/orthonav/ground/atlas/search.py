@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AtlasError, MapFileError
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE, RegisteredConfidence, logit
 from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import RegistrationLocalizer
@@ -37,7 +37,6 @@ from orthonav.core.register.window import GreyPyramid
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_poses
 from orthonav.core.variants import make_variant
-from orthonav.ground.atlas.agreement import Placement, nearest_m
 from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
 from orthonav.ground.atlas.coarse import EDGES
 from orthonav.ground.atlas.index import (
@@ -58,6 +57,24 @@ finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
 (`benchmarks.atlas_search` at d63ac91)."""
 APART_STRIDES = 1.5  # tiles nearer to each other are one place: the eight neighbours of a tile
 MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a view may have been taken, and from which place."""
+
+    lat_deg: float
+    lon_deg: float
+    turn_rad: float  # heading of the top of the view
+    log_scale: float  # logarithm of true over reported height
+
+    @property
+    def latlon_deg(self) -> tuple[float, float]:
+        return self.lat_deg, self.lon_deg
+
+
+def nearest_m(place: tuple[float, float], others: Sequence[tuple[float, float]]) -> float:
+    return float(distances_m([place] * len(others), others).min(initial=math.inf))
 
 
 class TileSearch:
