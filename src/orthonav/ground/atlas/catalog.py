@@ -45,6 +45,7 @@ _FILE_EXTENSION = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _SHA256_MULTIHASH = "1220"
 _SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
 _ITEM_NAME = re.compile(r"r[0-9]{6}c[0-9]{6}\.[0-9]{4}\.[0-9a-f]{12}\.json")
+_FILE_NAME = re.compile(r"([a-z]+)/(r[0-9]{6}c[0-9]{6})\.[0-9a-f]{12}\.[a-z]+")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
 _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
@@ -219,8 +220,8 @@ def file_name(key: str, sheet_id: str, sha256: str) -> str:
 
 
 def sheet_of_file(name: str) -> str | None:
-    sheet = name.rpartition("/")[2].partition(".")[0]
-    return sheet if _SHEET.fullmatch(sheet) else None
+    match = _FILE_NAME.fullmatch(name)
+    return match[2] if match and any(match[1] == each[0] for each in FILES.values()) else None
 
 
 def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
@@ -455,7 +456,7 @@ class Atlas:
             self.store.write(f"{ITEMS}/{sheet.item_name}", canonical(sheet.to_item()))
             there = {sheet.item_name: sheet, **self._revisions(sheet_id)}
         current = max(there)  # perhaps of another process that has put this sheet meanwhile
-        self.remove_items(sheet_id, {name: there[name] for name in there if name != current})
+        self._remove_items(sheet_id, {name: there[name] for name in there if name != current})
         return there[current] or sheet
 
     def retire(self, sheet_id: str) -> None:
@@ -463,7 +464,7 @@ class Atlas:
         there = self._revisions(sheet_id)
         if not there:
             raise AtlasError(f"the atlas has no sheet {sheet_id!r:.40}: {self.store}")
-        self.remove_items(sheet_id, there)
+        self._remove_items(sheet_id, there)
 
     def path(self, sheet: Sheet, kind: str = "map") -> Path:
         found = sheet.files.get(kind)
@@ -504,7 +505,7 @@ class Atlas:
         found, broken = read_items(self.store, f"{sheet_id}.")
         return {**found, **dict.fromkeys(broken)}
 
-    def remove_items(self, sheet_id: str, items: Mapping[str, Sheet | None]) -> None:
+    def _remove_items(self, sheet_id: str, items: Mapping[str, Sheet | None]) -> None:
         for name in sorted(items):
             self.store.remove(f"{ITEMS}/{name}")
         if gone := _named_by(items):

@@ -29,7 +29,6 @@ MIN_AGE_S = 24 * 3600.0
 """Younger files may belong to a running build, which writes the files of a sheet before its item:
 no sheet takes a day."""
 _TEMPORARY = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
-_SUFFIXES = {folder: suffix for folder, suffix, _ in FILES.values()}
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def check_atlas(
     changed."""
     store = atlas.store
     # Files before items: a sheet that is finished meanwhile has both.
-    folders = (*_SUFFIXES, INDEX)
+    folders = (*(folder for folder, _, _ in FILES.values()), INDEX)
     sizes = {f"{each}/{name}": size for each in folders for name, size in store.names(each).items()}
     items, broken = read_items(store)
     problems = [Problem("damaged item", f"{ITEMS}/{name}", why) for name, why in broken.items()]
@@ -68,17 +67,16 @@ def check_atlas(
         if found := list(_sheet_problems(atlas, sheet, sizes, deep)):
             incomplete.add(sheet.id)
             problems += found
-    for sheet in items.values():
-        if sheet != current[sheet.id]:
-            detail = f"revision {sheet.revision} of {sheet.id} was replaced and not removed"
-            # Where the sheet is incomplete, the old revision is all that there is.
-            removable = clean and sheet.id not in incomplete
-            if removable:
-                atlas.remove_items(sheet.id, {sheet.item_name: sheet})
-            name = f"{ITEMS}/{sheet.item_name}"
-            problems.append(Problem("second revision", name, detail, removable))
     leftovers = [
-        (name, "orphan", "no item names it") for name in _orphans(sizes, items, incomplete)
+        (f"{ITEMS}/{name}", "second revision", "was replaced and not removed")
+        for name, sheet in items.items()
+        if sheet != current[sheet.id] and sheet.id not in incomplete
+    ]
+    named = {file.name for sheet in current.values() for file in sheet.files.values()}
+    leftovers += [
+        (name, "orphan", "no item names it")
+        for name in sizes.keys() - named
+        if (sheet_id := sheet_of_file(name)) is not None and sheet_id not in incomplete
     ]
     for folder in ("", ITEMS, *folders):
         for file in filter(_TEMPORARY.fullmatch, store.names(folder)):
@@ -103,20 +101,6 @@ def _sheet_problems(
         opened = open_map if key == "map" else read_coarse
         remedy = f"build sheet {sheet.id} again"
         yield from _file_problems(atlas.store, file, sizes, deep, remedy, opened)
-
-
-def _orphans(
-    sizes: Mapping[str, int], items: Mapping[str, Sheet], incomplete: set[str]
-) -> list[str]:
-    named = {file.name for sheet in items.values() for file in sheet.files.values()}
-    return [
-        name
-        for name in sizes
-        if name not in named
-        and (sheet := sheet_of_file(name)) is not None
-        and sheet not in incomplete
-        and name.endswith(_SUFFIXES[name.partition("/")[0]])
-    ]
 
 
 def _snapshot_problems(
