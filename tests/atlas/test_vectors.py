@@ -61,8 +61,8 @@ def folder(tmp_path, vectors, quantizers):
 def write(folder, name, quantizers, vectors):
     where = places(len(vectors))
     parts = [slice(start, start + 1500) for start in range(0, len(vectors), 1500)]
-    rows = write_shard(folder, name, quantizers, ((where[part], vectors[part]) for part in parts))
-    assert rows == len(vectors)
+    info = ShardInfo(name, 0, (Part("", "", len(vectors)),))
+    write_shard(folder, info, quantizers, ((where[part], vectors[part]) for part in parts))
 
 
 def places(count):
@@ -147,5 +147,5 @@ def test_damaged_codes_are_refused(folder, vectors):
 
 def test_a_shard_of_another_size_is_refused(folder):
     other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
-    with pytest.raises(AtlasError, match="expected 1500 vectors"):
+    with pytest.raises(AtlasError, match="expected 1500 rows"):
         ShardedIndex(folder.joinpath, other)

@@ -188,10 +188,11 @@ def _written_shard(
     parts = tuple(Part(each.id, each.files["coarse"].sha256, group[each.id]) for each in sheets)
     content = "".join([quantizers.digest, *(part.sha256 for part in parts)])
     name = f"shard-{base:012d}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
+    info = ShardInfo(name, base, parts)
     tiles = _tiles(atlas, sheets)
     rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
-    write_shard(folder, name, quantizers, rows)
-    return ShardInfo(name, base, parts)
+    write_shard(folder, info, quantizers, rows)
+    return info
 
 
 def _stored(atlas: Atlas, index: IndexManifest, folder: Path) -> IndexManifest:
