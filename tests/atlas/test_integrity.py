@@ -145,14 +145,6 @@ def test_a_sheet_of_another_lattice_is_found(near):
     assert [kind for kind, _ in found(near)] == ["damaged item"]
 
 
-def test_a_stale_snapshot_is_rewritten(atlas):
-    atlas.snapshot()
-    atlas.retire(EAST)
-    assert found(atlas) == [("stale snapshot", "items.geojson")]
-    assert [each.removed for each in check_atlas(atlas, clean=True)] == [True]
-    assert found(atlas) == []
-
-
 def test_a_stale_or_damaged_index_is_found(atlas):
     asset = StoredFile("index/a.npy", 3, hashlib.sha256(b"abc").hexdigest())
     shard = ShardInfo("a", 0, (Part(HERE, "ab" * 32, 5),))

@@ -64,8 +64,9 @@ def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
     )
 
 
-def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
-    """The coarse tiles whose centres lie in a box, made from the imagery with one thread."""
+def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
+    """Write the coarse tiles whose centres lie in a box to `path`, whole or not at all; returns
+    their number. They are made from the imagery with one thread; the bytes are always the same."""
     area = Area.from_bounds(bounds_deg)
     grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
@@ -91,20 +92,13 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
         values, weights = pooled_features(POOLING, reader.cells, first_px[part])
         features[part] = values
         valid[part] = np.rint(weights[:, :: representation.channels] * FULL)
-    return CoarseTiles(recipe, bounds_deg, latlon, features, valid)
-
-
-def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
-    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number. The
-    bytes are the same every time."""
-    made = make_coarse(mosaic, bounds_deg, recipe)
     arrays: dict[str, NDArray[Any]] = {
-        "centres_latlon_deg": made.centres_latlon_deg,
-        "features": made.features,
-        "valid": made.valid,
+        "centres_latlon_deg": latlon,
+        "features": features,
+        "valid": valid,
     }
     save_tensors(path, arrays, _metadata(recipe, bounds_deg), "coarse tiles")
-    return len(made.valid)
+    return len(valid)
 
 
 def tile_count(path: Path) -> int:
@@ -155,11 +149,6 @@ def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
     if plain["schema"] != SCHEMA:
         raise AtlasError(
             f"coarse tiles of schema {plain['schema']!r:.20}, this program reads {SCHEMA}"
-        )
-    if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
-        raise AtlasError(
-            f"coarse tiles show {plain['edges']!r:.20} in {plain['cells']!r:.20} cells, this "
-            f"program compares {EDGES} in {POOLING.cells}: build the sheet again"
         )
     recipe = CoarseRecipe(**plain["recipe"])
     west, south, east, north = map(float, plain["bounds_deg"])

@@ -1,4 +1,4 @@
-"""Checking an atlas: missing, incomplete, damaged or leftover files, stale snapshot or index."""
+"""Checking an atlas: missing, incomplete, damaged or leftover files, and a stale index."""
 
 import re
 import tempfile
@@ -12,13 +12,11 @@ from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas.catalog import (
     FILES,
     ITEMS,
-    SNAPSHOT,
     Atlas,
     Sheet,
     StoredFile,
     read_items,
     sheet_of_file,
-    snapshot_of,
 )
 from orthonav.ground.atlas.coarse import read_coarse
 from orthonav.ground.atlas.index import FOLDER as INDEX
@@ -52,8 +50,7 @@ def check_atlas(
 ) -> list[Problem]:
     """All problems of an atlas by name; empty where it is whole. `deep` reads every file, verifies
     its checksum and opens it. `clean` removes leftovers older than `min_age_s` (files that no item
-    names, temporary files, replaced revisions) and rewrites a stale snapshot; nothing else is
-    changed."""
+    names, temporary files, replaced revisions); nothing else is changed."""
     store = atlas.store
     # Files before items: a sheet that is finished meanwhile has both.
     folders = (*(folder for folder, _, _ in FILES.values()), INDEX)
@@ -82,8 +79,6 @@ def check_atlas(
         for file in filter(_TEMPORARY.fullmatch, store.names(folder)):
             leftovers.append((f"{folder}/{file}".lstrip("/"), "leftover", "incomplete file"))
     problems += [_leftover(store, *each, min_age_s if clean else None) for each in leftovers]
-    if not broken:
-        problems += _snapshot_problems(store, current, clean)
     if not any(each.kind == "damaged item" for each in problems):
         atlas.sheets(refresh=True)
         problems += _index_problems(atlas, sizes, deep)
@@ -101,18 +96,6 @@ def _sheet_problems(
         opened = open_map if key == "map" else read_coarse
         remedy = f"build sheet {sheet.id} again"
         yield from _file_problems(atlas.store, file, sizes, deep, remedy, opened)
-
-
-def _snapshot_problems(
-    store: Store, current: Mapping[str, Sheet], clean: bool
-) -> Iterator[Problem]:
-    expected = snapshot_of(current[sheet_id] for sheet_id in sorted(current))
-    size = store.size(SNAPSHOT)
-    if size is None or (size == len(expected) and store.read(SNAPSHOT, size) == expected):
-        return
-    if clean:
-        store.write(SNAPSHOT, expected)
-    yield Problem("stale snapshot", SNAPSHOT, "does not show the present sheets", clean)
 
 
 def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float | None) -> Problem:

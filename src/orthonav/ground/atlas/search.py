@@ -198,12 +198,11 @@ class SheetRegistrar:
         opened = (self._sheet(name) for name in self._lattice.over(box) if name in self._usable)
         return [sheet for sheet in opened if sheet is not None]
 
-    def at(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
-        """The sheet in whose box the middle of a view is expected; where it cannot be used, its
-        neighbours within reach. Raises `StorageError` where a sheet cannot be fetched."""
+    def at(self, region: SearchRegion) -> RegistrationLocalizer | None:
+        """The sheet in whose box the middle of a view is expected, None where it cannot be used.
+        Raises `StorageError` where it cannot be fetched."""
         name = self._lattice.name_at(*region.middle_latlon_deg)
-        sheet = self._sheet(name) if name in self._usable else None
-        return self.near(region, side_m) if sheet is None else [sheet]
+        return self._sheet(name) if name in self._usable else None
 
     def _opened(self, name: str) -> RegistrationLocalizer | None:
         """A sheet, None where it is damaged (logged once)."""
@@ -231,9 +230,9 @@ class ViewRegistrar:
     def judged(self, region: SearchRegion) -> "JudgedRegion | None":
         """The best place near the middle of a region at the level where views are judged, on the
         sheet that covers it; None where there is none."""
-        parts = (self._part(each, region) for each in self._sheets.at(region, self._side_m))
-        found = [part for part in parts if part is not None and part.judged]
-        return max(found, key=lambda each: each.look, default=None)
+        sheet = self._sheets.at(region)
+        part = None if sheet is None else self._part(sheet, region)
+        return part if part is not None and part.judged else None
 
     def _part(self, sheet: RegistrationLocalizer, region: SearchRegion) -> "JudgedRegion | None":
         """The view on the part of a sheet around a region; None where it does not reach there."""
