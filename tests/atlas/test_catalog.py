@@ -204,7 +204,9 @@ def test_an_altered_catalogue_is_refused(near, change, words):
         ("overlap", 1.0),
         ("sheet_km", 1e6),
         ("method", 7),
+        ("method", "triplet:width=32"),
         ("registration", "yes"),
+        ("registration", False),
         ("coarse", {"width": 3}),
         ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
         ("coarse", 5),
@@ -212,7 +214,7 @@ def test_an_altered_catalogue_is_refused(near, change, words):
     ids=str,
 )
 def test_impossible_recipes_are_refused(name, value):
-    with pytest.raises(AtlasError, match="recipe"):
+    with pytest.raises(AtlasError, match=r"recipe|method gradient"):
         AtlasRecipe.from_plain({**RECIPE.to_plain(), name: value})
 
 

@@ -4,7 +4,6 @@ import errno
 import hashlib
 import os
 import sys
-import time
 from typing import ClassVar
 
 import fsspec
@@ -258,31 +257,9 @@ def test_local_files_are_not_copied(tmp_path):
         store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
 
 
-def test_the_least_recently_used_files_leave_the_cache(far, monkeypatch):
-    monkeypatch.setenv("ORTHONAV_CACHE_GB", "25e-9")  # three files of 8 bytes
-    monkeypatch.setattr("orthonav.ground.atlas.store.GRACE_S", 50)
-    paths = {}
-    for number, name in enumerate("bcd"):
-        data = f"map of {name}".encode()
-        far.write(f"sheets/{name}.onav", data)
-        paths[name] = far.fetch(f"sheets/{name}.onav", 8, sha256(data))
-        os.utime(paths[name], (time.time() - 1000 + number,) * 2)
-    far.fetch("sheets/b.onav", 8, sha256(b"map of b"))  # used again
-    far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
-    assert [name for name, path in paths.items() if path.exists()] == ["b", "d"]
-    monkeypatch.setenv("ORTHONAV_CACHE_GB", "1e-9")
-    far.write("sheets/e.onav", b"map of e")
-    far.fetch("sheets/e.onav", 8, sha256(b"map of e"))
-    left = [name for name, path in paths.items() if path.exists()]
-    assert left == ["b"]  # used a moment ago: somebody is about to open it
-
-
-def test_the_folder_of_the_cache(monkeypatch, tmp_path, far):
+def test_the_folder_of_the_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "own"))
     assert cache_folder() == tmp_path / "own"
     monkeypatch.delenv("ORTHONAV_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "orthonav" / "atlas"
-    monkeypatch.setenv("ORTHONAV_CACHE_GB", "much")
-    with pytest.raises(StorageError, match="must be a number, got 'much'"):
-        far.fetch("sheets/a.onav", 8, sha256(b"map of a"))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.build import add_recipe, recipe_of, reporter
+from orthonav.cli.build import add_recipe, recipe_of
 from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "check", "check whether an atlas is complete: exit 0, or 3 and a list of problems"
     )
     check.add_argument(
-        "--deep", action="store_true", help="read every file, verify its checksum and its recipe"
+        "--deep", action="store_true", help="read every file and verify its checksum"
     )
     check.add_argument(
         "--clean", action="store_true", help="remove leftovers of interrupted builds"
@@ -188,7 +188,7 @@ def _build(options: argparse.Namespace) -> int:
     )
     try:
         with _runner(options) as runner, progress(options) as shown:
-            result = build_atlas(request, runner, shown, reporter(options))
+            result = build_atlas(request, runner, shown)
     except KeyboardInterrupt:
         print(
             "orthonav: error: interrupted; finished sheets are stored, rerun to resume",

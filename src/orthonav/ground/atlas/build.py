@@ -9,7 +9,7 @@ import math
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -249,22 +249,18 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
-    sheets = [task.sheet for task in tasks if task.sheet.id in known]
-    other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
+    pairs = [(known[task.sheet.id], task.sheet) for task in tasks if task.sheet.id in known]
+    other = [(found, wanted) for found, wanted in pairs if found.request != wanted.request]
     if not other:
         return
-    why = sorted(
-        {
-            line
-            for sheet in other
-            for line in version_differences(sheet.made_by, known[sheet.id].made_by)
-            or ["their imagery has changed"]
-        }
-    )
-    named = ", ".join(sheet.id for sheet in other[:5]) + (", .." if len(other) > 5 else "")
+    why: set[str] = set()
+    for found, wanted in other:
+        differences = version_differences(wanted.made_by, found.made_by)
+        why.update(differences or ["their imagery has changed"])
+    named = ", ".join(sheet.id for sheet, _ in other[:5]) + (", .." if len(other) > 5 else "")
     raise AtlasError(
         f"{len(other)} of {len(tasks)} sheets of the atlas are of other imagery or versions "
-        f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
+        f"({'; '.join(sorted(why)[:4])}): {named}; rebuild them with --replace"
     )
 
 
@@ -338,20 +334,17 @@ def _rate(value: float, by: float) -> float | None:
 
 log = logging.getLogger(__name__)
 
-PROGRESS_EVERY_S = 10.0  # between two lines of progress
 GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
-LEARNT = ("autoencoder", "caevl", "triplet")  # methods for which a worker is given a GPU
 
 
 def build_atlas(
     request: AtlasRequest,
     runner: TaskRunner,
     progress: Progress = no_progress,
-    report: Callable[[str], None] = log.info,
 ) -> BuildReport:
     """Build the missing sheets with a runner that was entered, and report the results. A sheet that
     fails is listed in the result, and the others are built. `progress` is called with a stage and
-    its share done, `report` with lines for people. Raises `AreaError`, `ImageryError`,
+    its share done. Raises `AreaError`, `ImageryError`,
     `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
     `WorkerError` where a worker has other versions; `StorageError`."""
     started_s = time.monotonic()
@@ -373,13 +366,8 @@ def build_atlas(
             result.results.append(SheetResult(same.id, "unchanged", area_km2=same.area_km2))
         else:
             missing.append(task)
-    there = len(result.results)
-    unchanged = f", {there} are there already" if there else ""
-    report(
-        f"{len(tasks):,} sheets of at most {recipe.sheet_km:g} km at {recipe.gsd_m:g} m"
-        f"{unchanged}; {len(missing):,} to build, {runner.at_once} at a time"
-    )
-    _build_sheets(missing, recipe, runner, result, progress, report)
+    log.info("%d of %d sheets to build, %d at a time", len(missing), len(tasks), runner.at_once)
+    _build_sheets(missing, runner, result, progress)
     atlas.snapshot()
     if request.index and recipe.coarse is not None and not result.names("failed"):
         from orthonav.ground.atlas.index import make_index  # with FAISS
@@ -465,16 +453,12 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
 
 def _build_sheets(
     tasks: Sequence[SheetTask],
-    recipe: AtlasRecipe,
     runner: TaskRunner,
     result: BuildReport,
     progress: Progress,
-    report: Callable[[str], None],
 ) -> None:
-    reported_s = time.monotonic()
     not_stored = 0
-    gpu = recipe.method.partition(":")[0] in LEARNT
-    with closing(runner.run(build_sheet, tasks, gpu=gpu)) as finished:
+    with closing(runner.run(build_sheet, tasks)) as finished:
         for task, made in finished:
             if isinstance(made, Failure):
                 if made.kind == WorkerError.__name__:
@@ -488,9 +472,5 @@ def _build_sheets(
             result.results.append(made)
             progress("sheets", len(result.results) / result.total)
             if not_stored >= GIVE_UP_AFTER:
-                report(f"{not_stored} sheets in a row could not be stored: the build ends")
+                log.error("%d sheets in a row could not be stored: the build ends", not_stored)
                 return
-            if time.monotonic() - reported_s >= PROGRESS_EVERY_S:
-                reported_s = time.monotonic()
-                failed = len(result.names("failed"))
-                report(f"{len(result.results):,} of {result.total:,} sheets, {failed} failed")

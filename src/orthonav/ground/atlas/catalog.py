@@ -345,6 +345,10 @@ class AtlasRecipe:
     def __post_init__(self) -> None:
         _require_possible(self)
         WorldSheets(self.sheet_km * 1000)  # refuses impossible widths
+        if self.method.partition(":")[0] != "gradient" or not self.registration:
+            raise AtlasError(
+                "maps are cut from sheets of the method gradient with registration layers only"
+            )
 
     @property
     def sheets(self) -> WorldSheets:

@@ -42,7 +42,7 @@ class SerialRunner:
     at_once = 1  # number of items that run at the same time
 
     def run(
-        self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
+        self, work: Callable[[Item], Made], items: Sequence[Item]
     ) -> Generator[tuple[Item, Made | Failure]]:
         for item in items:
             yield item, attempted(work, item)
@@ -70,17 +70,14 @@ class RayRunner:
         return max(1, cores if self._workers is None else min(cores, self._workers))
 
     def run(
-        self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
+        self, work: Callable[[Item], Made], items: Sequence[Item]
     ) -> Generator[tuple[Item, Made | Failure]]:
         """Each item with its result, when it is finished; closing the iterator stops the others, by
-        request, so that they remove temporary files. With `gpu` each item has a GPU to itself,
-        where there are any. Items whose process died are tried again `RETRIES` times."""
+        request, so that they remove temporary files. Items whose process died are tried again
+        `RETRIES` times."""
         ray = self._ray
-        has_gpu = gpu and ray.cluster_resources().get("GPU", 0) >= 1
         # Errors of an item are returned as values: Ray tries again only where a process died.
-        task = ray.remote(attempted).options(
-            max_retries=RETRIES, num_cpus=1, num_gpus=1 if has_gpu else 0
-        )
+        task = ray.remote(attempted).options(max_retries=RETRIES, num_cpus=1)
         waiting = iter(items)
         running: dict[Any, Item] = {}
         try:

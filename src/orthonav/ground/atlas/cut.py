@@ -426,10 +426,7 @@ def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
     except VariantError as error:
         raise AtlasError(f"this program cannot use the sheets ({error})") from error
     if not isinstance(recipe, WhitenedRecipe):
-        raise AtlasError(
-            f"maps are cut from atlases of the method gradient, not {manifest.recipe.get('method')}"
-            ": every sheet of this one has its own encoder"
-        )
+        raise AtlasError(f"maps are cut from sheets of the method gradient, not of {recipe}")
     return recipe, representation
 
 

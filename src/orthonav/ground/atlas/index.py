@@ -5,7 +5,6 @@ shards. The index is made anew where sheets have changed. The manifest is writte
 without it has no index. It may come from an untrusted source, so every value is checked when it is
 read."""
 
-import hashlib
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -186,9 +185,7 @@ def _written_shard(
 ) -> ShardInfo:
     sheets = [atlas.sheets()[name] for name in group]
     parts = tuple(Part(each.id, each.files["coarse"].sha256, group[each.id]) for each in sheets)
-    content = "".join([quantizers.digest, *(part.sha256 for part in parts)])
-    name = f"shard-{base:012d}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
-    info = ShardInfo(name, base, parts)
+    info = ShardInfo(f"shard-{base:012d}", base, parts)
     tiles = _tiles(atlas, sheets)
     rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
     write_shard(folder, info, quantizers, rows)

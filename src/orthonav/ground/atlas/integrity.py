@@ -2,13 +2,12 @@
 
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthonav.core.errors import AtlasError, MapFileError
+from orthonav.core.errors import AtlasError
 from orthonav.core.files import Progress, no_progress
-from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas.catalog import (
     FILES,
     ITEMS,
@@ -18,7 +17,6 @@ from orthonav.ground.atlas.catalog import (
     read_items,
     sheet_of_file,
 )
-from orthonav.ground.atlas.coarse import read_coarse
 from orthonav.ground.atlas.index import FOLDER as INDEX
 from orthonav.ground.atlas.index import MANIFEST, read_manifest, stale_sheets
 from orthonav.ground.atlas.store import Store, digest_of
@@ -48,8 +46,8 @@ def check_atlas(
     clean: bool = False,
     min_age_s: float = MIN_AGE_S,
 ) -> list[Problem]:
-    """All problems of an atlas by name; empty where it is whole. `deep` reads every file, verifies
-    its checksum and opens it. `clean` removes leftovers older than `min_age_s` (files that no item
+    """All problems of an atlas by name; empty where it is whole. `deep` reads every file and
+    verifies its checksum. `clean` removes leftovers older than `min_age_s` (files that no item
     names, temporary files, replaced revisions); nothing else is changed."""
     store = atlas.store
     # Files before items: a sheet that is finished meanwhile has both.
@@ -92,17 +90,15 @@ def _sheet_problems(
         atlas.require_place(sheet)
     except AtlasError as error:
         yield Problem("damaged item", f"{ITEMS}/{sheet.item_name}", str(error))
-    for key, file in sheet.files.items():
-        opened = open_map if key == "map" else read_coarse
+    for file in sheet.files.values():
         remedy = f"build sheet {sheet.id} again"
-        yield from _file_problems(atlas.store, file, sizes, deep, remedy, opened)
+        yield from _file_problems(atlas.store, file, sizes, deep, remedy)
 
 
 def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float | None) -> Problem:
     if min_age_s is None:
         return Problem(kind, name, detail)
-    age_s = store.age_s(name)
-    if (age_s is None and min_age_s > 0) or (age_s or 0) < min_age_s:
+    if store.age_s(name) < min_age_s:
         return Problem(kind, name, f"{detail}; too young to be removed")
     store.remove(name)
     return Problem(kind, name, detail, removed=True)
@@ -131,10 +127,7 @@ def _file_problems(
     sizes: Mapping[str, int],
     deep: bool,
     remedy: str,
-    opened: Callable[[Path], object] = lambda path: None,
 ) -> Iterator[Problem]:
-    """The problem of a file. `opened` raises that of the content of a file whose checksum is
-    right."""
     size = sizes.get(file.name, store.size(file.name))
     if size is None:
         yield Problem("missing file", file.name, remedy)
@@ -149,8 +142,3 @@ def _file_problems(
                 store.download(file.name, path)
             if digest_of(path) != file.sha256:
                 yield Problem("wrong checksum", file.name, remedy)
-                return
-            try:
-                opened(path)
-            except (MapFileError, AtlasError) as error:
-                yield Problem("damaged file", file.name, str(error))

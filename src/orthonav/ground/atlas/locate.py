@@ -483,12 +483,6 @@ class AtlasLocator:
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
         self._atlas = registrar.atlas
-        recipe = self._atlas.recipe
-        if recipe.method.partition(":")[0] != "gradient" or not recipe.registration:
-            raise AtlasError(
-                "an aircraft is tracked on maps that are cut out of the atlas; that needs the "
-                f"method gradient and registration layers: {self._atlas.url}"
-            )
         self._heading_known = heading_known
         self._finder = PlaceFinder(registrar, search, heading_known=heading_known)
         self._track: LocalTrack | None = None

@@ -2,12 +2,13 @@
 
 A file exists completely or not at all: locally it is written to a temporary name and renamed, and
 object stores show a file when it is complete. No file outside the atlas is ever named, because the
-catalogue may come from an untrusted source. Remote files are copied to a cache and verified; that
-of fsspec neither verifies nor limits its size. Nor does a folder go through fsspec: its local file
-system neither syncs files to disk before it renames them nor refuses links that lead outside."""
+catalogue may come from an untrusted source. Remote files are copied to a cache and verified, which
+the cache of fsspec does not do. Nor does a folder go through fsspec: its local file system neither
+syncs files to disk before it renames them nor refuses links that lead outside."""
 
 import contextlib
 import errno
+import functools
 import hashlib
 import os
 import re
@@ -15,7 +16,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,6 @@ from orthonav.core.extras import needed
 from orthonav.core.files import replacing
 
 MAX_READ_BYTES = 64 * 2**20  # a guard for memory: catalogue and index manifest are smaller
-LIMIT_BYTES = 20 * 10**9  # some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)
-GRACE_S = 600.0  # files used within this time are not removed: a process may be about to open them
 _FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
 _NEEDS_OVERWRITE = {"abfs", "abfss", "az"}  # refuse to replace a file unless told
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
@@ -42,7 +41,6 @@ class Store:
         match = _PROTOCOL.match(url)
         self._protocol = match.group(1).lower() if match else "file"
         self.is_local = self._protocol in ("file", "local")
-        self._verified: set[tuple[str, int, int]] = set()
         if self.is_local:
             self._root = Path(url[match.end() :] if match else url).expanduser().absolute()
             self.url = str(self._root)
@@ -81,18 +79,13 @@ class Store:
                 return None
             return int(info["size"]) if info["type"] == "file" else None
 
-    def age_s(self, name: str) -> float | None:
+    def age_s(self, name: str) -> float:
         with storage_errors(self.shown(name), "access the atlas"):
             if self.is_local:
                 return time.time() - self._path(checked_name(name)).stat().st_mtime
             fs, remote_path = self._remote(checked_name(name))
-            try:
-                when = fs.modified(remote_path)
-            except NotImplementedError:
-                when = fs.info(remote_path).get("mtime")
-        if isinstance(when, datetime):
-            when = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-        return time.time() - when if isinstance(when, int | float) else None
+            when = fs.modified(remote_path)
+            return time.time() - (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
 
     def read(self, name: str, limit_bytes: int = MAX_READ_BYTES) -> bytes:
         size = self.size(name)
@@ -131,16 +124,14 @@ class Store:
         processes may use the cache at the same time."""
         if self.is_local:
             return self._verified_path(name, size, sha256)
-        folder, limit_bytes = cache_folder(), cache_limit_bytes()
+        folder = cache_folder()
         path = folder / sha256[:2] / f"{sha256}{Path(checked_name(name)).suffix}"
         with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
             if path.is_file() and path.stat().st_size == size:
-                os.utime(path)  # last used now
                 return path
             with replacing(path) as temporary:
                 self.download(name, temporary)
                 _require(temporary, size, sha256, self.shown(name))
-            _shrink(folder, limit_bytes, path)
         return path
 
     def download(self, name: str, path: Path) -> None:
@@ -189,10 +180,7 @@ class Store:
             path = self._path(checked_name(name))
             if not path.is_file():
                 raise StorageError(f"the atlas has no such file: {self.shown(name)}")
-            state = (sha256, path.stat().st_size, path.stat().st_mtime_ns)
-            if state not in self._verified:
-                _require(path, size, sha256, self.shown(name))
-                self._verified.add(state)
+            _require(path, size, sha256, self.shown(name))
         return path
 
     def _remote(self, name: str) -> tuple[Any, str]:
@@ -241,6 +229,13 @@ def checked_name(name: str) -> str:
 
 
 def digest_of(path: Path) -> str:
+    state = path.stat()
+    return _digest(path, state.st_size, state.st_mtime_ns)
+
+
+@functools.cache
+def _digest(path: Path, size: int, changed_ns: int) -> str:
+    """The digest of a file that has not changed is not computed again."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -262,29 +257,6 @@ def cache_folder() -> Path:
         return Path(own).expanduser()
     users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(users).expanduser() / "orthonav" / "atlas"
-
-
-def cache_limit_bytes() -> int:
-    gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
-    try:
-        return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
-    except (ValueError, OverflowError) as error:
-        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
-
-
-def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
-    files = []
-    for path in folder.glob("??/*"):
-        with contextlib.suppress(FileNotFoundError):  # removed by another process
-            state = path.stat()
-            files.append((state.st_mtime, state.st_size, path))
-    excess = sum(size for _, size, _ in files) - limit_bytes
-    for used, size, path in sorted(files):
-        if excess <= 0:
-            return
-        if path != newest and time.time() - used > GRACE_S:
-            path.unlink(missing_ok=True)
-            excess -= size
 
 
 @contextmanager

@@ -17,8 +17,6 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -103,12 +101,10 @@ class Quantizers:
     halves: Array
     codebook: Array  # (quantizers, 16, D / quantizers), codes of the residual
 
-    @cached_property
-    def digest(self) -> str:
-        return sha256(self._bytes()).hexdigest()[:16]
-
     def save(self, path: Path) -> None:
-        path.write_bytes(self._bytes())
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
+        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
+        path.write_bytes(save(arrays, metadata={FORMAT: recipe}))
 
     @classmethod
     def load(cls, path: Path) -> "Quantizers":
@@ -123,11 +119,6 @@ class Quantizers:
             if array.shape != shape or array.dtype != np.float32:
                 raise AtlasError(f"{name} of an index must be {shape}, got {array.shape}: {path}")
         return made
-
-    def _bytes(self) -> bytes:
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
-        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
-        return bytes(save(arrays, metadata={FORMAT: recipe}))
 
     def rotated(self, vectors: Array) -> Array:
         """Vectors (N, D) in the axes of lists and codes."""
