@@ -15,7 +15,6 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.confidence import Chances, LogisticConfidence, RegisteredConfidence
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
@@ -24,7 +23,7 @@ from orthonav.core.tiles.embed import embedder_of
 from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
-from orthonav.ground.atlas.cut import Warp, check_shown, cut_in_memory, cut_map, pooled_tiles
+from orthonav.ground.atlas.cut import Warp, check_shown, cut_in_memory, cut_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -358,25 +357,6 @@ def test_impossible_requests_are_refused(folder, middle, tmp_path):
     own = sheet_file(atlas, next(iter(atlas.sheets())))
     with pytest.raises(OutputError, match="replace a sheet"):
         cut_map(atlas, own, area, workers=1)
-
-
-TILES = [LogisticConfidence(-6.2, (11.0, 12.0)), LogisticConfidence(-4.2, (5.6, 21.7))]
-REGISTERED = [
-    RegisteredConfidence.usual(Chances(40.0, 18.0, 54.0)),
-    RegisteredConfidence.usual(Chances(49.0, 17.0, 60.0)),
-]
-SHARES = [0.3, 0.7]
-
-
-def test_the_confidence_of_tiles_never_exceeds_the_mean_of_the_sheets():
-    pooled = pooled_tiles(TILES, SHARES, 1.0)
-    for score in np.linspace(0.1, 1, 10):
-        for margin in np.linspace(0, min(score, 0.5), 9):
-            evidence = {"score": score, "margin": margin}
-            mean = np.average([each(evidence) for each in TILES], weights=SHARES)
-            if 0.55 < mean < 0.985:
-                assert pooled(evidence) <= mean + 0.02
-    assert pooled({"score": 0.9, "margin": 0.3}) > 0.9
 
 
 def test_the_affine_agrees_with_the_geodesy():

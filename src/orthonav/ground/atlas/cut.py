@@ -1,17 +1,14 @@
 """Cutting a flight's map out of an atlas: the content of its sheets, resampled into one plane.
 
 The imagery is not needed: the grey picture comes from the registration layers of the sheets, tiles
-are embedded from the cell means of the sheets, and confidences are pooled, not learnt again. Where
-on the map a view was taken is not known, so the confidence of a fix is the mean of the sheets'
-confidences, weighted by their shares of the map. A logistic regression cannot represent that mean
-exactly. The pooled one has the mean weights, and a bias so low that it nowhere exceeds the mean in
-the range of evidence that decides. The same atlas gives the same bytes for any number of threads.
+are embedded from the cell means of the sheets. The confidence of registered views is the usual one,
+with the scores of chance of the sheet where they are highest; tiles have none. The same atlas gives
+the same bytes for any number of threads.
 
 Within a block of a kilometre two planes differ by a shift, a rotation of less than a degree and
 millimetres, so each sheet is resampled by one affine per block. A place is taken from the sheet
 whose box holds it; where that sheet shows nothing, from neighbours that reach over their border."""
 
-import itertools
 import json
 import logging
 import math
@@ -43,7 +40,6 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import (
     CHANCES,
     Chances,
-    LogisticConfidence,
     RegisteredConfidence,
 )
 from orthonav.core.mapfile.layer import GreyLayer
@@ -73,6 +69,7 @@ from orthonav.ground.build.sheet import (
 )
 from orthonav.ground.build.terrain import TerrainParts, terrain_parts
 from orthonav.ground.planning.area import Area, Extent
+from orthonav.ground.planning.route import along_polyline_en_m
 from orthonav.ground.planning.sheets import in_box
 
 log = logging.getLogger(__name__)
@@ -333,18 +330,14 @@ def check_shown(
 ) -> None:
     """Warn where the atlas shows no imagery of an area; `AtlasError` where the route is there. With
     `allow_holes` that is a warning too."""
-    parts = {"route": _route_en_m(area, grid), "area": grid.centres_en_m(_some_tiles(area, grid))}
-    for part, points in parts.items():
+    for part, points in _checked_points(area, grid).items():
         tiles = grid.tiles_rc(points).clip(0, [grid.rows - 1, grid.cols - 1])
         bare = cells.valid_share(tiles * grid.stride_px) < MIN_TILE_VALID_SHARE
         if not bare.any():
             continue
-        places = zip(
-            *(each.tolist() for each in area.frame.latlon_from_en(points[bare])), strict=True
-        )
-        names = sorted(
-            {atlas.recipe.sheets.name_at(*place) for place in places} - {*atlas.sheets()}
-        )
+        places = np.stack(area.frame.latlon_from_en(points[bare]), axis=1).tolist()
+        under = {atlas.recipe.sheets.name_at(*place) for place in places}
+        names = sorted(under - atlas.sheets().keys())
         lacking = ", ".join(names[:NAMED]) + ", .." * (len(names) > NAMED)
         said = f"{100 * bare.mean():.3g} % of the {part} has no imagery in the atlas"
         said += f", which lacks sheets {lacking}" if names else ""
@@ -353,23 +346,17 @@ def check_shown(
         log.warning("%s", said)
 
 
-def _some_tiles(area: Area, grid: TileGrid) -> NDArray[np.intp]:
+def _checked_points(area: Area, grid: TileGrid) -> dict[str, Array]:
+    """Points (N, 2) a quarter of a tile apart along the route, and some middles of tiles."""
+    points = {}
+    if area.route is not None:
+        line = area.route.points_en_m(area.frame)
+        points["route"] = np.concatenate([along_polyline_en_m(line, grid.tile_m / 4)[0], line[-1:]])
     step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MAX_TILES))))
-    tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T.astype(np.intp)
-    inside = area.contains(grid.centres_en_m(tiles), grid.stride_m * np.sqrt(0.5))
-    return tiles[inside] if inside.any() else tiles[len(tiles) // 2 :][:1]
-
-
-def _route_en_m(area: Area, grid: TileGrid) -> Array:
-    """Points (N, 2) along the route, a quarter of a tile apart; empty without a route."""
-    if area.route is None:
-        return np.zeros((0, 2))
-    line = area.route.points_en_m(area.frame)
-    parts = [line[:1]]
-    for start, end in pairwise(line):
-        count = max(1, int(np.ceil(np.hypot(*(end - start)) / (grid.tile_m / 4))))
-        parts.append(start + (end - start) * (np.arange(count)[:, None] + 1) / count)
-    return np.concatenate(parts)
+    tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T
+    centres = grid.centres_en_m(tiles)
+    points["area"] = centres[area.contains(centres, grid.stride_m * np.sqrt(0.5))]
+    return points
 
 
 CACHE_BYTES = 24 * 2**20  # decoded chunks of each sheet: those along the border of a row of blocks
@@ -377,11 +364,6 @@ REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace
 
 GRID = "gsd_m", "tile_px", "stride_px"  # what the grids of all sheets have in common
 RECIPE = "method", "represent", "embed", "overlap"  # and their recipes
-DECIDING = 0.5, 0.99  # thresholds of acceptance lie in this range of probabilities
-SCORES = np.linspace(0.05, 1.0, 20)
-MARGINS = np.linspace(0.0, 0.6, 13)
-"""Evidence at which the pooled confidence is compared with the sheets': scores and margins of
-tiles."""
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
@@ -420,11 +402,8 @@ def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
 
 
 def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
-    try:
-        recipe = variant_from_recipe(embed.TABLE, manifest.recipe.get("embed"))
-        representation = variant_from_recipe(represent.TABLE, manifest.recipe.get("represent"))
-    except VariantError as error:
-        raise AtlasError(f"this program cannot use the sheets ({error})") from error
+    recipe = variant_from_recipe(embed.TABLE, manifest.recipe.get("embed"))
+    representation = variant_from_recipe(represent.TABLE, manifest.recipe.get("represent"))
     if not isinstance(recipe, WhitenedRecipe):
         raise AtlasError(f"maps are cut from sheets of the method gradient, not of {recipe}")
     return recipe, representation
@@ -434,13 +413,6 @@ def pooled_manifest(
     members: Sequence[SheetSource], shares: NDArray[np.float64], sheet: SheetInfo
 ) -> Manifest:
     manifests = [member.manifest for member in members]
-    tiles = float(np.average([each.sheets[0].tiles for each in manifests], weights=shares))
-    known = [
-        (LogisticConfidence.from_plain(each.confidence), share)
-        for each, share in zip(manifests, shares, strict=True)
-        if each.confidence is not None and share > 0
-    ]
-    confidence = pooled_tiles([c for c, _ in known], [s for _, s in known], sheet.tiles / tiles)
     return Manifest(
         recipe={
             **manifests[0].recipe,
@@ -453,7 +425,7 @@ def pooled_manifest(
             "min_valid_share": max(each.view["min_valid_share"] for each in manifests),
             "position_std_m": max(each.view["position_std_m"] for each in manifests),
         },
-        confidence=None if confidence is None else confidence.to_plain(),
+        confidence=None,
         radius_m=max(each.radius_m for each in manifests),
         created_by=f"orthonav {__version__}",
         registration=_registration(manifests, shares),
@@ -462,50 +434,20 @@ def pooled_manifest(
 
 def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) -> dict[str, Any]:
     layers = [each.registration or {} for each in manifests]
-    confidence = pooled_registered(
-        [
-            RegisteredConfidence.from_plain(each["confidence"])
-            for each, share in zip(layers, shares, strict=True)
-            if each.get("confidence") is not None and share > 0
-        ]
-    )
+    known = [
+        RegisteredConfidence.from_plain(each["confidence"]).chances
+        for each, share in zip(layers, shares, strict=True)
+        if each.get("confidence") is not None and share > 0
+    ]
+    confidence = None
+    if known:
+        chances = {name: max(getattr(each, name) for each in known) for name in CHANCES}
+        confidence = RegisteredConfidence.usual(Chances(**chances)).to_plain()
     return {
-        "confidence": None if confidence is None else confidence.to_plain(),
+        "confidence": confidence,
         "radius_m": max(float(each["radius_m"]) for each in layers),
         "position_floor_px": max(float(each["position_floor_px"]) for each in layers),
     }
-
-
-def pooled_tiles(
-    confidences: Sequence[LogisticConfidence], shares: Sequence[float], more_tiles: float
-) -> LogisticConfidence | None:
-    """Confidence of tile search on a map made of sheets in these shares; None without sheets.
-    `more_tiles`: tiles of the map over tiles of a sheet. As many times more tiles resemble a view
-    by chance, and the odds of the best tile are lower by that factor."""
-    if not confidences:
-        return None
-    bias = float(np.average([each.bias for each in confidences], weights=shares))
-    weights = np.average([each.weights for each in confidences], axis=0, weights=shares)
-    pooled = LogisticConfidence(bias, tuple(weights.tolist()))
-    evidence = [{"score": s, "margin": m} for s, m in itertools.product(SCORES, MARGINS) if m <= s]
-    own = np.array([pooled(each) for each in evidence])
-    theirs = np.array([[single(each) for each in evidence] for single in confidences])
-    mean = np.average(theirs, axis=0, weights=shares)
-    deciding = (own > DECIDING[0]) & (mean < DECIDING[1])
-    own, mean = (np.clip(each[deciding], 1e-9, 1 - 1e-9) for each in (own, mean))
-    excess = (np.log(own / (1 - own)) - np.log(mean / (1 - mean))).max(initial=0.0)
-    return LogisticConfidence(bias - float(excess) - math.log(max(more_tiles, 1.0)), pooled.weights)
-
-
-def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> RegisteredConfidence | None:
-    """Confidence of registered views on a map made of sheets; None without sheets. It is the usual
-    one, with the scores of chance of the sheet where they are highest."""
-    if not confidences:
-        return None
-    chances = Chances(
-        **{name: max(getattr(each.chances, name) for each in confidences) for name in CHANCES}
-    )
-    return RegisteredConfidence.usual(chances)
 
 
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
