@@ -72,11 +72,8 @@ class SheetTask:
     """A sheet to be built, with all that a worker on another machine needs."""
 
     sheet: Sheet  # its description, without tiles and area yet
-    atlas: str  # folder or URL of the atlas
-    orthos: tuple[Path, ...]  # the files and folders that may show it
+    request: AtlasRequest  # with those orthophotos that may show it
     recipe: AtlasRecipe  # how it is made
-    dem: Path | None = None
-    dem_datum: str | None = None
 
 
 def versions() -> dict[str, str]:
@@ -104,7 +101,7 @@ def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> l
     names = sorted(_names(recipe, imagery, request))
     if not names:
         raise AreaError("the area lies outside the orthophotos")
-    made_by, terrain = versions(), (request.dem, request.dem_datum)
+    made_by = versions()
     tasks = []
     for name in names:
         bounds_deg = recipe.sheets.bounds_deg(name)
@@ -118,20 +115,16 @@ def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> l
             area_km2=0.0,
             dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
             imagery=part.describe(),
-            request=request_digest(recipe, part, made_by, *terrain),
+            request=request_digest(recipe, part, made_by, request),
             made_by=made_by,
         )
-        needed = _orthos_of(request.orthos, mosaic, part)
-        tasks.append(SheetTask(sheet, request.url, needed, recipe, *terrain))
+        orthos = _orthos_of(request.orthos, mosaic, part)
+        tasks.append(SheetTask(sheet, replace(request, orthos=orthos, route=None), recipe))
     return tasks
 
 
 def request_digest(
-    recipe: AtlasRecipe,
-    part: Mosaic,
-    made_by: Mapping[str, str],
-    dem: Path | None = None,
-    dem_datum: str | None = None,
+    recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str], request: AtlasRequest
 ) -> str:
     """Each file counts with its name, size and second of change, in the order in which files cover
     each other; its folder does not count, as it may differ between machines."""
@@ -141,9 +134,9 @@ def request_digest(
         for name, size, changed_ns in source.stamp
     ]
     depends: list[Any] = [recipe.to_plain(), dict(made_by), part.common_stamp, stamps]
-    if dem is not None:
-        found = dem.stat()
-        depends.append([dem.name, found.st_size, found.st_mtime_ns // 10**9, dem_datum])
+    if request.dem is not None:
+        found, name = request.dem.stat(), request.dem.name
+        depends.append([name, found.st_size, found.st_mtime_ns // 10**9, request.dem_datum])
     return digest(depends)
 
 
@@ -271,13 +264,10 @@ Status = Literal["built", "unchanged", "empty", "failed"]
 class SheetResult:
     """`unchanged`: the sheet was there already; `empty`: there is no imagery."""
 
-    sheet: str  # name
+    sheet: Sheet
     status: Status
     error: str = ""  # why it failed
     cpu_s: float = 0.0  # processor time
-    size_bytes: int = 0
-    area_km2: float = 0.0
-    tiles: int = 0
 
 
 @dataclass
@@ -290,7 +280,7 @@ class BuildReport:
     wall_s: float = 0.0
 
     def names(self, status: Status) -> list[str]:
-        return sorted(each.sheet for each in self.results if each.status == status)
+        return sorted(each.sheet.id for each in self.results if each.status == status)
 
     @property
     def untried(self) -> int:
@@ -302,7 +292,7 @@ class BuildReport:
 
     def to_plain(self) -> dict[str, Any]:
         """Sums and rates as plain values."""
-        built = [each for each in self.results if each.status == "built"]
+        built = [each.sheet for each in self.results if each.status == "built"]
         area_km2 = sum(each.area_km2 for each in built)
         size_mb = sum(each.size_bytes for each in built) / 1e6
         cpu_s = sum(each.cpu_s for each in self.results)
@@ -312,8 +302,8 @@ class BuildReport:
             "unchanged": len(self.names("unchanged")),
             "empty": len(self.names("empty")),
             "failed": [
-                {"sheet": each.sheet, "error": each.error}
-                for each in sorted(self.results, key=lambda each: each.sheet)
+                {"sheet": each.sheet.id, "error": each.error}
+                for each in sorted(self.results, key=lambda each: each.sheet.id)
                 if each.status == "failed"
             ],
             "untried": self.untried,
@@ -338,13 +328,10 @@ GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full 
 
 
 def build_atlas(
-    request: AtlasRequest,
-    runner: TaskRunner,
-    progress: Progress = no_progress,
+    request: AtlasRequest, runner: TaskRunner, progress: Progress = no_progress
 ) -> BuildReport:
     """Build the missing sheets with a runner that was entered, and report the results. A sheet that
-    fails is listed in the result, and the others are built. `progress` is called with a stage and
-    its share done. Raises `AreaError`, `ImageryError`,
+    fails is listed in the result, and the others are built. Raises `AreaError`, `ImageryError`,
     `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
     `WorkerError` where a worker has other versions; `StorageError`."""
     started_s = time.monotonic()
@@ -363,7 +350,7 @@ def build_atlas(
     for task in tasks:
         same = known.get(task.sheet.id)
         if same is not None and same.request == task.sheet.request:
-            result.results.append(SheetResult(same.id, "unchanged", area_km2=same.area_km2))
+            result.results.append(SheetResult(same, "unchanged"))
         else:
             missing.append(task)
     log.info("%d of %d sheets to build, %d at a time", len(missing), len(tasks), runner.at_once)
@@ -405,22 +392,15 @@ def build_sheet(task: SheetTask) -> SheetResult:
             f"{platform.node()} has other versions than the machine that leads, and would make "
             f"other maps: {'; '.join(differences)}; install the same on all"
         )
-    mosaic = Imagery(Mosaic.open(task.orthos)).under(wanted.bounds_deg, margin_m(task.recipe))
-    found = request_digest(task.recipe, mosaic, wanted.made_by, task.dem, task.dem_datum)
-    if found != wanted.request:
+    mosaic = Imagery(Mosaic.open(task.request.orthos)).under(
+        wanted.bounds_deg, margin_m(task.recipe)
+    )
+    if request_digest(task.recipe, mosaic, wanted.made_by, task.request) != wanted.request:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with tempfile.TemporaryDirectory(prefix="orthonav-sheet-") as folder:
         built = _built(task, mosaic, Path(folder))
-    if built is None:
-        return SheetResult(wanted.id, "empty", cpu_s=time.process_time() - cpu_s)
-    return SheetResult(
-        wanted.id,
-        "built",
-        cpu_s=time.process_time() - cpu_s,
-        size_bytes=built.size_bytes,
-        area_km2=built.area_km2,
-        tiles=built.tiles,
-    )
+    status: Status = "empty" if built is None else "built"
+    return SheetResult(built or wanted, status, cpu_s=time.process_time() - cpu_s)
 
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
@@ -429,12 +409,12 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
     name, bounds_deg = task.sheet.id, task.sheet.bounds_deg
     files = {"map": folder / f"{name}.onav"}
     request = BuildRequest(
-        orthos=task.orthos,
+        orthos=task.request.orthos,
         out=files["map"],
         bounds_deg=bounds_deg,
         workers=1,
-        dem=task.dem,
-        dem_datum=task.dem_datum,
+        dem=task.request.dem,
+        dem_datum=task.request.dem_datum,
         dem_needed=False,
         cells=True,
         **recipe,
@@ -448,14 +428,11 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
         files["coarse"] = folder / f"{name}.safetensors"
         write_coarse(mosaic, bounds_deg, task.recipe.coarse, files["coarse"])
     described = replace(task.sheet, tiles=info.tiles, area_km2=info.area_km2)
-    return Atlas.open(task.atlas).put(files, described)
+    return Atlas.open(task.request.url).put(files, described)
 
 
 def _build_sheets(
-    tasks: Sequence[SheetTask],
-    runner: TaskRunner,
-    result: BuildReport,
-    progress: Progress,
+    tasks: Sequence[SheetTask], runner: TaskRunner, result: BuildReport, progress: Progress
 ) -> None:
     not_stored = 0
     with closing(runner.run(build_sheet, tasks)) as finished:
@@ -466,7 +443,7 @@ def _build_sheets(
                 log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
                 log.debug("%s", made.trace)
                 not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
-                made = SheetResult(task.sheet.id, "failed", f"{made.kind}: {made.text}")
+                made = SheetResult(task.sheet, "failed", f"{made.kind}: {made.text}")
             else:
                 not_stored = 0
             result.results.append(made)
