@@ -39,7 +39,7 @@ def test_one_view_alone_is_never_a_fix():
 def test_two_consistent_views_of_new_ground_agree():
     agreement = flown([seen(0, 0, 2.0)], [seen(900, 0, 2.0)])
     assert agreement.agreed
-    assert agreement.probability > 0.9
+    assert agreement.confidence > 0.9
     assert agreement.best.views >= MIN_VIEWS
 
 

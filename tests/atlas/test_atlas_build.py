@@ -83,14 +83,14 @@ def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
         assert sheet.tiles == opened.manifest.sheets[0].tiles > 0
         assert opened.manifest.recipe["overlap"] == 0.5
         coarse = read_coarse(atlas.path(sheet, "coarse"))
-        assert coarse.recipe == COARSE and len(coarse.valid) > 0
+        assert len(coarse.valid) > 0
         assert sheet.dates == ("2019-06",) and sheet.made_by == versions()
         assert sheet.imagery == mosaic.describe()
     plain = result.to_plain()
     assert plain["tiles"] == sum(sheet.tiles for sheet in sheets.values())
     size_bytes = sum(sheet.size_bytes for sheet in sheets.values())
     assert plain["size_mb"] == pytest.approx(size_bytes / 1e6, abs=1e-4)
-    assert plain["cpu_s"] > 0 and plain["km2_per_hour"] > 0 and plain["mb_per_km2"] > 0
+    assert plain["wall_s"] > 0
 
 
 def test_an_atlas_does_not_depend_on_place_and_time_of_building(built, ortho, tmp_path):
@@ -110,7 +110,6 @@ def test_present_sheets_are_unchanged_and_missing_ones_are_built(built, ortho, t
         [],
         built[1].names("built"),
     ) and again.is_complete
-    assert again.to_plain()["mb_per_km2"] is None
     lost = sorted((place / "items").iterdir())[1]
     lost.unlink()
     again = made(place, ortho)

@@ -55,7 +55,6 @@ def make_coarse(mosaic, box_deg, folder):
 
 def test_coarse_tiles_are_read_back_and_reproducible(mosaic, box_deg, stored, tmp_path):
     read = read_coarse(stored)
-    assert (read.recipe, read.bounds_deg) == (RECIPE, box_deg)
     features, weights = read.features_of(slice(None, None, 3))
     np.testing.assert_array_equal(features, read.features[::3])
     assert weights.shape == features.shape and weights.min() == 1

@@ -173,7 +173,7 @@ def test_local_files_are_whole_or_absent(tmp_path, monkeypatch, error):
     [
         (PermissionError("Access Denied"), "PermissionError: Access Denied"),
         (TimeoutError(), "TimeoutError"),
-        (OSError(errno.ENOSPC, "full"), "disk full"),
+        (OSError(errno.ENOSPC, "full"), "OSError: [Errno 28] full"),
         (RuntimeError("odd\nthing"), "RuntimeError: odd thing"),
     ],
 )

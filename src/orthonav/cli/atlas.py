@@ -239,9 +239,8 @@ def _build_text(plain: Mapping[str, Any]) -> str:
     if plain["built"]:
         lines += [
             f"area         {plain['area_km2']:.1f} km2 in {plain['tiles']:,} tiles",
-            f"size         {plain['size_mb']:.1f} MB, {plain['mb_per_km2']:.2f} MB per km2",
-            f"time         {plain['wall_s']:.0f} s: {plain['km2_per_hour']:,.0f} km2 per hour, "
-            f"{plain['cpu_s_per_km2']:.2f} CPU s per km2",
+            f"size         {plain['size_mb']:.1f} MB",
+            f"time         {plain['wall_s']:.0f} s",
         ]
     return "\n".join(lines)
 

@@ -47,21 +47,19 @@ _POINTS = 17  # points along a side of a sheet at which it is compared with a se
 class AtlasRequest:
     """What to build into an atlas. `recipe`: fields of `AtlasRecipe` that were requested, `coarse`
     with some or all of its own; the others are the atlas's, or the defaults (`gsd_m`: that of the
-    imagery). `route`, `band_m`: area: a search band around a route, in metres. Without bounds or
-    route all imagery is the area. `replace`: rebuild sheets of other imagery or program versions
-    instead of refusing them. `dem`, `dem_datum`: terrain model of which sheets get a terrain layer
-    where it has heights, and what its heights count from."""
+    imagery). Without bounds or route all imagery is the area. `replace`: rebuild sheets of other
+    imagery or program versions instead of refusing them."""
 
     url: str  # the atlas, a folder or an fsspec URL, created where it does not exist
     orthos: Sequence[Path]  # files and folders of orthophotos; the first covers the next
     recipe: Mapping[str, Any] = field(default_factory=dict)
     bounds_deg: Extent | None = None  # area: west, south, east, north
-    route: Route | None = None
+    route: Route | None = None  # area: a search band around it
     band_m: float | None = None
     replace: bool = False
     index: bool = True  # also make the index of the coarse tiles
-    dem: Path | None = None
-    dem_datum: str | None = None
+    dem: Path | None = None  # terrain model of which sheets get a terrain layer
+    dem_datum: str | None = None  # what its heights count from
 
     def __post_init__(self) -> None:
         with_paths(self, "orthos", "dem")
@@ -69,8 +67,6 @@ class AtlasRequest:
 
 @dataclass(frozen=True)
 class SheetTask:
-    """A sheet to be built, with all that a worker on another machine needs."""
-
     sheet: Sheet  # its description, without tiles and area yet
     request: AtlasRequest  # with those orthophotos that may show it
     recipe: AtlasRecipe  # how it is made
@@ -171,7 +167,6 @@ class Imagery:
 
     @cached_property
     def _boxes(self) -> NDArray[np.float64]:
-        """West, south, east, north (N, 4) in degrees; east may be above 180."""
         outlines = [source.outline_latlon_deg for source in self.mosaic.sources]
         boxes = []
         for outline in outlines:
@@ -267,7 +262,6 @@ class SheetResult:
     sheet: Sheet
     status: Status
     error: str = ""  # why it failed
-    cpu_s: float = 0.0  # processor time
 
 
 @dataclass
@@ -291,11 +285,7 @@ class BuildReport:
         return not self.names("failed") and not self.untried
 
     def to_plain(self) -> dict[str, Any]:
-        """Sums and rates as plain values."""
         built = [each.sheet for each in self.results if each.status == "built"]
-        area_km2 = sum(each.area_km2 for each in built)
-        size_mb = sum(each.size_bytes for each in built) / 1e6
-        cpu_s = sum(each.cpu_s for each in self.results)
         return {
             "atlas": self.url,
             "built": len(built),
@@ -307,19 +297,11 @@ class BuildReport:
                 if each.status == "failed"
             ],
             "untried": self.untried,
-            "area_km2": round(area_km2, 4),
+            "area_km2": round(sum(each.area_km2 for each in built), 4),
             "tiles": sum(each.tiles for each in built),
-            "size_mb": round(size_mb, 4),
+            "size_mb": round(sum(each.size_bytes for each in built) / 1e6, 4),
             "wall_s": round(self.wall_s, 3),
-            "cpu_s": round(cpu_s, 3),
-            "km2_per_hour": _rate(3600 * area_km2, self.wall_s),
-            "cpu_s_per_km2": _rate(cpu_s, area_km2),
-            "mb_per_km2": _rate(size_mb, area_km2),
         }
-
-
-def _rate(value: float, by: float) -> float | None:
-    return round(value / by, 4) if by > 0 else None
 
 
 log = logging.getLogger(__name__)
@@ -353,7 +335,7 @@ def build_atlas(
             result.results.append(SheetResult(same, "unchanged"))
         else:
             missing.append(task)
-    log.info("%d of %d sheets to build, %d at a time", len(missing), len(tasks), runner.at_once)
+    log.info("%d of %d sheets to build", len(missing), len(tasks))
     _build_sheets(missing, runner, result, progress)
     atlas.snapshot()
     if request.index and recipe.coarse is not None and not result.names("failed"):
@@ -385,7 +367,6 @@ def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, 
 
 
 def build_sheet(task: SheetTask) -> SheetResult:
-    cpu_s = time.process_time()
     wanted = task.sheet
     if differences := version_differences(wanted.made_by, versions()):
         raise WorkerError(
@@ -399,8 +380,7 @@ def build_sheet(task: SheetTask) -> SheetResult:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with tempfile.TemporaryDirectory(prefix="orthonav-sheet-") as folder:
         built = _built(task, mosaic, Path(folder))
-    status: Status = "empty" if built is None else "built"
-    return SheetResult(built or wanted, status, cpu_s=time.process_time() - cpu_s)
+    return SheetResult(wanted, "empty") if built is None else SheetResult(built, "built")
 
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:

@@ -39,8 +39,6 @@ class Failure:
 
 
 class SerialRunner:
-    at_once = 1  # number of items that run at the same time
-
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item]
     ) -> Generator[tuple[Item, Made | Failure]]:

@@ -44,8 +44,6 @@ class CoarseTiles:
     """Coarse tiles of a sheet, in rows from north to south; arrays are read-only. N is 0 where no
     tile shows enough imagery."""
 
-    recipe: CoarseRecipe  # how they were made
-    bounds_deg: Extent  # of the sheet: west, south, east, north
     centres_latlon_deg: NDArray[np.float64]  # (N, 2)
     features: NDArray[np.float16]  # (N, F) float16; F is cells x cells x channels
     valid: NDArray[np.uint8]  # (N, cells x cells) uint8; 255 where all of a cell shows imagery
@@ -118,8 +116,7 @@ def read_coarse(path: Path) -> CoarseTiles:
             if metadata is None or names != {"centres_latlon_deg", "features", "valid"}:
                 raise AtlasError(f"not coarse tiles of an atlas: {path}")
             arrays = {name: stored.get_tensor(name) for name in sorted(names)}
-        recipe, bounds_deg = _parsed(metadata)
-        return _checked(recipe, bounds_deg, arrays)
+        return _checked(_bounds_deg(metadata), arrays)
     except AtlasError as error:
         raise AtlasError(f"{error}: {path}") from error
     except (SafetensorError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
@@ -143,22 +140,17 @@ def _metadata(recipe: CoarseRecipe, bounds_deg: Extent) -> str:
     return canonical(plain).decode()
 
 
-def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
-    """What `_metadata` wrote; raises `AtlasError` unless writing it again gives the same."""
+def _bounds_deg(metadata: str) -> Extent:
     plain: Any = json.loads(metadata)
-    if plain["schema"] != SCHEMA:
-        raise AtlasError(
-            f"coarse tiles of schema {plain['schema']!r:.20}, this program reads {SCHEMA}"
-        )
     recipe = CoarseRecipe(**plain["recipe"])
     west, south, east, north = map(float, plain["bounds_deg"])
     bounds_deg = west, south, east, north
     if _metadata(recipe, bounds_deg) != metadata or recipe.tile_px % MICRO:
         raise AtlasError("altered, or not coarse tiles of an atlas")
-    return recipe, bounds_deg
+    return bounds_deg
 
 
-def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
+def _checked(bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
     centres, features, valid = (arrays[n] for n in ("centres_latlon_deg", "features", "valid"))
     count = len(valid) if valid.ndim == 2 else -1
     right = (
@@ -181,4 +173,4 @@ def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -
         raise AtlasError("coarse tiles are damaged (centres lie outside their sheet)")
     for array in (centres, features, valid):
         array.flags.writeable = False
-    return CoarseTiles(recipe, bounds_deg, centres, features, valid)
+    return CoarseTiles(centres, features, valid)

@@ -12,13 +12,13 @@ whose box holds it; where that sheet shows nothing, from neighbours that reach o
 import json
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,9 +29,6 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import (
     AreaError,
     AtlasError,
-    MapFileError,
-    MissingFileError,
-    OutputError,
     VariantError,
 )
 from orthonav.core.files import Progress, no_progress
@@ -85,14 +82,10 @@ OWN_BONUS = 0.01  # decides ties between sheets for the one whose box holds the 
 _SHIFT = 6  # fractional bits of polygon corners in OpenCV
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 Cells = tuple[NDArray[np.float32], NDArray[np.float32]]
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
 class SheetSource:
-    """A sheet that a map is cut from: its item, manifest, pixels, cells and, if it has one, terrain
-    layer."""
-
     sheet: Sheet
     manifest: Manifest
     layer: GreyLayer
@@ -146,12 +139,11 @@ class Warp:
         return mask.astype(np.bool_)
 
     def grey(self, block: Block) -> Pixels:
-        """Grey levels and validity (H, W) of a block; 0 where not valid."""
         affine = self.affine(block)
         matrix = _by_middles(affine, block, 1, 0.5)
         size = block.width, block.height
         top, left, height, width = _window(matrix, size)
-        grey, valid = self._read(lambda: self.source.layer.read(0, top, left, height, width))
+        grey, valid = self.source.layer.read(0, top, left, height, width)
         shape = block.height, block.width
         if not valid.any():
             return np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
@@ -170,12 +162,11 @@ class Warp:
         return np.where(shown, made, 0).astype(np.uint8), np.asarray(shown, np.bool_)
 
     def cells(self, block: Block, layout: CellLayout) -> Cells:
-        """Means (h, w, C) and valid shares (h, w) of the cells that begin in a block."""
         spacing, middle = layout.spacing_px, layout.micro_px / 2
         rows, cols = -(-block.height // spacing), -(-block.width // spacing)
         matrix = _by_middles(self.affine(block), block, spacing, middle)
         top, left, height, width = _window(matrix, (cols, rows))
-        means, share = self._read(lambda: self.source.cells.read(top, left, height, width))
+        means, share = self.source.cells.read(top, left, height, width)
         matrix[:, 2] -= [left, top]
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         planes = [
@@ -186,14 +177,6 @@ class Warp:
         if self.turns:
             _turn(made, math.atan2(matrix[1, 0], matrix[0, 0]))
         return made, np.asarray(planes[-1], np.float32)
-
-    def _read(self, read: Callable[[], Made]) -> Made:
-        try:
-            return read()
-        except MapFileError as error:
-            raise AtlasError(
-                f"sheet {self.source.sheet.id} is damaged, rebuild it ({error})"
-            ) from error
 
     @cached_property
     def _outline_px(self) -> Array:
@@ -229,7 +212,6 @@ def _latlon_from_px(frame: LocalFrame, grid: TileGrid, px: Array) -> tuple[Array
 
 
 def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
-    """Grey levels and validity (H, W) of a block from all sheets that reach it."""
     grey = np.zeros((block.height, block.width), dtype=np.uint8)
     valid = np.zeros(grey.shape, dtype=np.bool_)
     owners = [(warp, warp.owned(block)) for warp in warps]
@@ -256,8 +238,6 @@ def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
 
 
 def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cells:
-    """Means (h, w, C) and valid shares (h, w) of the cells that begin in a block, from one or more
-    sheets that reach it."""
     owners = [(warp, warp.owned(block, layout)) for warp in warps]
     owners.sort(key=lambda each: not each[1].any())
     means, share = owners[0][0].cells(block, layout)
@@ -347,7 +327,6 @@ def check_shown(
 
 
 def _checked_points(area: Area, grid: TileGrid) -> dict[str, Array]:
-    """Points (N, 2) a quarter of a tile apart along the route, and some middles of tiles."""
     points = {}
     if area.route is not None:
         line = area.route.points_en_m(area.frame)
@@ -369,13 +348,10 @@ RECIPE = "method", "represent", "embed", "overlap"  # and their recipes
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
     found: list[SheetSource] = []
     for sheet in sheets:
-        try:
-            opened = open_map(atlas.path(sheet))
-            first = found[0].manifest if found else opened.manifest
-            _require_alike(sheet, opened.manifest, grid, first)
-            found.append(_source(opened, sheet))
-        except (MapFileError, MissingFileError) as error:
-            raise AtlasError(f"sheet {sheet.id} is damaged, {REBUILD}: {error}") from error
+        opened = open_map(atlas.path(sheet))
+        first = found[0].manifest if found else opened.manifest
+        _require_alike(sheet, opened.manifest, grid, first)
+        found.append(_source(opened, sheet))
     return found
 
 
@@ -453,10 +429,10 @@ def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) ->
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
     sources = {json.dumps(each, sort_keys=True): each for one in manifests for each in one.imagery}
 
-    def place(key: str) -> tuple[str, str, str]:
-        return str(sources[key].get("date") or ""), str(sources[key].get("name") or ""), key
-
-    return tuple(sources[key] for key in sorted(sources, key=place))
+    dated = sorted(
+        (str(s.get("date") or ""), str(s.get("name") or ""), k) for k, s in sources.items()
+    )
+    return tuple(sources[key] for _, _, key in dated)
 
 
 def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> TerrainParts | None:
@@ -512,13 +488,10 @@ def cut_map(
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
-    if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in cutter.members):
-        raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
     progress("sheets", 1.0)
     cutter.read(progress, workers)
     check_shown(area, cutter.grid, cutter.cells, atlas, allow_holes)
     written = write_map(out, *_learnt(cutter, workers, progress))
-    progress("learn", 1.0)
     return BuildResult(written, out.stat().st_size)
 
 

@@ -61,18 +61,15 @@ class IndexManifest:
         """Inverse of `to_json`; raises `AtlasError` unless writing it again gives `data`."""
         try:
             plain: Any = parsed(data, MANIFEST)
-            if (plain["format"], plain["schema"]) != (FORMAT, SCHEMA):
-                raise ValueError(
-                    f"format {plain['format']!r:.40}, schema {plain['schema']!r:.20}, expected "
-                    f"schema {SCHEMA}; rebuild it with 'orthonav atlas index'"
-                )
             shards = tuple(map(_shard, plain["shards"]))
             files = {name: StoredFile(**file) for name, file in plain["files"].items()}
+            parts = [part for shard in shards for part in shard.parts]
             made = cls(VectorRecipe(**plain["recipe"]), shards, files)
             possible = (
                 all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
                 and all(file.name == f"{FOLDER}/{name}" for name, file in files.items())
-                and all(0 <= part.rows <= MAX_ROWS for shard in shards for part in shard.parts)
+                and all(0 <= part.rows <= MAX_ROWS for part in parts)
+                and not any(part.retired for part in parts)
                 and list(accumulate((shard.rows for shard in shards), initial=0))[:-1]
                 == [shard.base for shard in shards]
                 and made.to_json() == data
@@ -80,14 +77,17 @@ class IndexManifest:
             if not possible:
                 raise ValueError("damaged or altered")
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise AtlasError(f"index of the atlas cannot be read ({reason(error)})") from error
+            raise AtlasError(
+                f"index of the atlas cannot be read ({reason(error)}); rebuild it with 'orthonav "
+                "atlas index'"
+            ) from error
         return made
 
 
 def _shard(plain: Any) -> ShardInfo:
-    """A shard; values of another type are converted, and differ when they are written again."""
     parts = tuple(
-        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"])) for part in plain["parts"]
+        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"]), bool(part["retired"]))
+        for part in plain["parts"]
     )
     return ShardInfo(str(plain["name"]), int(plain["base"]), parts)
 
@@ -150,7 +150,11 @@ def make_index(
         for group in _groups(sheets, counts):
             base = sum(shard.rows for shard in shards)
             progress("index", base / sum(counts))
-            shards.append(_written_shard(atlas, group, base, embedder, quantizers, folder))
+            parts = [Part(each.id, each.files["coarse"].sha256, count) for each, count in group]
+            shards.append(ShardInfo(f"shard-{base:012d}", base, tuple(parts)))
+            tiles = _tiles(atlas, [each for each, _ in group])
+            rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
+            write_shard(folder, shards[-1], quantizers, rows)
         progress("index", 1.0)
         return _stored(atlas, IndexManifest(quantizers.recipe, tuple(shards), {}), folder)
 
@@ -173,23 +177,6 @@ def _learnt(
     quantizers = train(np.concatenate(list(sample)), recipe)
     quantizers.save(folder / QUANTIZERS_NAME)
     return embedder, quantizers
-
-
-def _written_shard(
-    atlas: Atlas,
-    group: Mapping[str, int],
-    base: int,
-    embedder: WhitenedEmbedder,
-    quantizers: Quantizers,
-    folder: Path,
-) -> ShardInfo:
-    sheets = [atlas.sheets()[name] for name in group]
-    parts = tuple(Part(each.id, each.files["coarse"].sha256, group[each.id]) for each in sheets)
-    info = ShardInfo(f"shard-{base:012d}", base, parts)
-    tiles = _tiles(atlas, sheets)
-    rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
-    write_shard(folder, info, quantizers, rows)
-    return info
 
 
 def _stored(atlas: Atlas, index: IndexManifest, folder: Path) -> IndexManifest:
@@ -218,13 +205,12 @@ def _tiles(
             yield tiles.centres_latlon_deg[part], tiles.features_of(part)
 
 
-def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[dict[str, int]]:
-    """Names of the sheets of each shard, with their numbers of tiles."""
-    groups: list[dict[str, int]] = [{}]
+def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[list[tuple[Sheet, int]]]:
+    groups: list[list[tuple[Sheet, int]]] = [[]]
     for sheet, count in zip(sheets, counts, strict=True):
-        if groups[-1] and sum(groups[-1].values()) + count > SHARD_ROWS:
-            groups.append({})
-        groups[-1][sheet.id] = count
+        if groups[-1] and sum(rows for _, rows in groups[-1]) + count > SHARD_ROWS:
+            groups.append([])
+        groups[-1].append((sheet, count))
     return groups
 
 
@@ -233,7 +219,6 @@ def vectors_of(embedder: WhitenedEmbedder, features: Features) -> NDArray[np.flo
 
 
 def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Embeddings (N, D) as unit vectors, whitened to the exponent `POWER` only."""
     norms = np.linalg.norm(embedder.basis.astype(np.float32), axis=0)
     weighed = embedded * (norms / norms.max()) ** (POWER - 1)
     lengths = np.linalg.norm(weighed, axis=1, keepdims=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthonav.core.errors import AtlasError
+from orthonav.core.errors import AreaError, AtlasError
 from orthonav.core.files import Progress, no_progress
 from orthonav.ground.atlas.catalog import (
     FILES,
@@ -29,9 +29,6 @@ _TEMPORARY = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem of an atlas: its kind (such as `missing file`), the file, cause or remedy, and
-    whether it was removed."""
-
     kind: str
     name: str
     detail: str
@@ -88,7 +85,7 @@ def _sheet_problems(
 ) -> Iterator[Problem]:
     try:
         atlas.require_place(sheet)
-    except AtlasError as error:
+    except (AreaError, AtlasError) as error:
         yield Problem("damaged item", f"{ITEMS}/{sheet.item_name}", str(error))
     for file in sheet.files.values():
         remedy = f"build sheet {sheet.id} again"

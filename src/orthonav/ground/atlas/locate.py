@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError, AtlasError
+from orthonav.core.errors import AreaError, AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
@@ -122,8 +122,6 @@ class Chain:
 
 
 class Agreement:
-    """The chains of one flight. Mutable; not to be shared between threads."""
-
     def __init__(self) -> None:
         self.chains: list[Chain] = []
 
@@ -158,20 +156,13 @@ class Agreement:
         return self.chains[0] if self.chains else None
 
     @property
-    def probability(self) -> float:
-        if not self.chains:
-            return 0.0
-        odds = np.array([0.0, *(each.log_odds for each in self.chains)])
-        return float(np.exp(odds[1] - np.logaddexp.reduce(odds)))
-
-    @property
     def confidence(self) -> float:
-        """Probability that the latest view is where the likeliest chain has it: at most what the
-        view itself says of the expected place."""
         best = self.best
         if best is None:
             return 0.0
-        return min(self.probability, 1 / (1 + math.exp(-best.latest_log_odds)))
+        odds = np.array([0.0, *(each.log_odds for each in self.chains)])
+        probability = float(np.exp(odds[1] - np.logaddexp.reduce(odds)))
+        return min(probability, 1 / (1 + math.exp(-best.latest_log_odds)))
 
     @property
     def agreed(self) -> bool:
@@ -250,9 +241,6 @@ class FoundPlace:
 
 
 class PlaceFinder:
-    """Finds where in an atlas the views of a flight were taken. Mutable; not to be shared between
-    threads."""
-
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
@@ -438,8 +426,6 @@ class LocalTrack:
         return True
 
     def _take(self, seen: Fix | NoFix, telemetry: Telemetry, most: float = 1.0) -> None:
-        """Keep the estimate of the tracker; it is a fix with a confidence of `most`, and of what
-        the view itself says of the place."""
         assert isinstance(seen, Fix)  # a track with a start always has an estimate
         self._time_ns, self._last = telemetry.time_ns, seen
         confidence = min(seen.confidence, seen.evidence["recognized"], most)
@@ -477,8 +463,6 @@ class LocalTrack:
 
 
 class AtlasLocator:
-    """Places the views of one flight. Mutable; not to be shared between threads."""
-
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
@@ -505,7 +489,12 @@ class AtlasLocator:
         found = self._finder.find(view)
         if isinstance(found, NoFix):
             return self._outcome(found)
-        self._begin(found)
+        try:
+            begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
+            if begun.agrees:
+                self._track = begun
+        except (AreaError, AtlasError, MapFileError) as error:
+            log.warning("no map can be cut around the place found: %s", error)
         return self._outcome()
 
     def _follow(self, take_in: Callable[[LocalTrack], bool]) -> None:
@@ -514,18 +503,9 @@ class AtlasLocator:
         try:
             if not take_in(self._track):
                 self._track = None
-        except (AreaError, AtlasError) as error:
+        except (AreaError, AtlasError, MapFileError) as error:
             log.warning("no map can be cut where the aircraft is expected: %s", error)
             self._track = None
-
-    def _begin(self, found: FoundPlace) -> None:
-        try:
-            begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
-        except (AreaError, AtlasError) as error:
-            log.warning("no map can be cut around the place found: %s", error)
-            return
-        if begun.agrees:
-            self._track = begun
 
     def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:
         if self._track is not None:

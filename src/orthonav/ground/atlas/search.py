@@ -61,8 +61,6 @@ MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
 
 @dataclass(frozen=True)
 class Placement:
-    """How a view may have been taken, and from which place."""
-
     lat_deg: float
     lon_deg: float
     turn_rad: float  # heading of the top of the view
@@ -82,14 +80,11 @@ class TileSearch:
     names the sheets that are not in the index, which are not found."""
 
     def __init__(self, atlas: Atlas) -> None:
-        if atlas.recipe.coarse is None:
-            raise AtlasError(
-                f"the atlas has no coarse tiles, so views need a prior there: {atlas.url}"
-            )
         manifest = read_manifest(atlas)
-        if manifest is None:
+        if manifest is None or atlas.recipe.coarse is None:
             raise AtlasError(
-                f"the atlas has no index: make it with 'orthonav atlas index': {atlas.url}"
+                "the atlas has no index: make it with 'orthonav atlas index', or build an atlas "
+                f"with coarse tiles: {atlas.url}"
             )
         self.atlas = atlas
         self.recipe: CoarseRecipe = atlas.recipe.coarse
@@ -146,9 +141,6 @@ class SearchRegion(Placement):
     reach_m: float  # how far from the place is searched
     turn_std_rad: float  # standard deviation of the heading
 
-    def contains(self, place: Placement) -> bool:
-        return nearest_m(self.latlon_deg, [place.latlon_deg]) <= self.reach_m
-
 
 @dataclass(frozen=True, eq=False)
 class SheetMatch(Placement):
@@ -182,8 +174,6 @@ class PyramidPart:
 
 
 class SheetRegistrar:
-    """Registers views on the sheets of an atlas. Not to be shared between threads."""
-
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
         self._lattice = atlas.recipe.sheets
@@ -205,7 +195,6 @@ class SheetRegistrar:
         return self._sheet(name) if name in self._usable else None
 
     def _opened(self, name: str) -> RegistrationLocalizer | None:
-        """A sheet, None where it is damaged (logged once)."""
         try:
             opened = open_map(self.atlas.path(self.atlas.sheets()[name]))
             return RegistrationLocalizer.of_map(opened, None, level_ground=False)
@@ -235,7 +224,6 @@ class ViewRegistrar:
         return part if part is not None and part.judged else None
 
     def _part(self, sheet: RegistrationLocalizer, region: SearchRegion) -> "JudgedRegion | None":
-        """The view on the part of a sheet around a region; None where it does not reach there."""
         view = self._prepared(sheet.grid.gsd_m, sheet.pyramid.levels)
         if isinstance(view, NoFix):
             return None
@@ -398,7 +386,9 @@ class ViewMatches:
         return bool(self.found) and self.log_odds(0) >= PROVEN
 
     def _proven_in(self, region: SearchRegion) -> bool:
-        return self._proven and region.contains(self.found[0])
+        if not self._proven:
+            return False
+        return nearest_m(region.latlon_deg, [self.found[0].latlon_deg]) <= region.reach_m
 
     def log_odds(self, number: int) -> float:
         one = self.found[number]

@@ -7,7 +7,6 @@ the cache of fsspec does not do. Nor does a folder go through fsspec: its local 
 syncs files to disk before it renames them nor refuses links that lead outside."""
 
 import contextlib
-import errno
 import functools
 import hashlib
 import os
@@ -16,11 +15,11 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from datetime import UTC
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from orthonav.core.errors import MissingExtraError, OrthonavError, StorageError
+from orthonav.core.errors import MissingExtraError, OrthonavError, StorageError, described
 from orthonav.core.extras import needed
 from orthonav.core.files import replacing
 
@@ -84,7 +83,7 @@ class Store:
             if self.is_local:
                 return time.time() - self._path(checked_name(name)).stat().st_mtime
             fs, remote_path = self._remote(checked_name(name))
-            when = fs.modified(remote_path)
+            when: datetime = fs.modified(remote_path)
             return time.time() - (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
 
     def read(self, name: str, limit_bytes: int = MAX_READ_BYTES) -> bytes:
@@ -123,7 +122,12 @@ class Store:
         """A local file with that content, verified once: the file itself or a cached copy. Several
         processes may use the cache at the same time."""
         if self.is_local:
-            return self._verified_path(name, size, sha256)
+            with storage_errors(self.shown(name), "read the atlas"):
+                path = self._path(checked_name(name))
+                if not path.is_file():
+                    raise StorageError(f"the atlas has no such file: {self.shown(name)}")
+                _require(path, size, sha256, self.shown(name))
+            return path
         folder = cache_folder()
         path = folder / sha256[:2] / f"{sha256}{Path(checked_name(name)).suffix}"
         with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
@@ -175,16 +179,7 @@ class Store:
             raise StorageError(f"a link leads out of the atlas: {path}")
         return path
 
-    def _verified_path(self, name: str, size: int, sha256: str) -> Path:
-        with storage_errors(self.shown(name), "read the atlas"):
-            path = self._path(checked_name(name))
-            if not path.is_file():
-                raise StorageError(f"the atlas has no such file: {self.shown(name)}")
-            _require(path, size, sha256, self.shown(name))
-        return path
-
     def _remote(self, name: str) -> tuple[Any, str]:
-        """The file system and a path on it. fsspec keeps one per process and thread."""
         try:
             self._fsspec.get_filesystem_class(self._protocol)
             fs, root = self._fsspec.core.url_to_fs(self.url)
@@ -270,10 +265,5 @@ def storage_errors(place: str, action: str) -> Iterator[None]:
             raise
         raise StorageError(str(error)) from error
     except Exception as error:
-        raise StorageError(f"cannot {action}: {_cause(error)}: {place}") from error
-
-
-def _cause(error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "disk full; free some space"
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        why = f"{type(error).__name__}: {described(error)}"
+        raise StorageError(f"cannot {action}: {why}: {place}") from error

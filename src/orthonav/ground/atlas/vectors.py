@@ -7,9 +7,8 @@ quantizers (`train`) and depend on nothing else, so they can be added and remove
 
 A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
 codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
-list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. FAISS maps
-neither lists of 4-bit codes nor checks the files that it reads, so this format is our own: every
-length is checked before FAISS is given the map."""
+list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. Every length
+is checked before FAISS is given the map."""
 
 import json
 import os
@@ -75,7 +74,6 @@ class VectorRecipe:
 
     @classmethod
     def for_count(cls, count: int, dims: int) -> "VectorRecipe":
-        """The recipe for `count` vectors: lists of up to 1600, 4 bits for every two components."""
         list_bits = 4
         while list_bits < 16 and count > 800 * 2 ** (list_bits + 1):
             list_bits += 2
@@ -121,7 +119,6 @@ class Quantizers:
         return made
 
     def rotated(self, vectors: Array) -> Array:
-        """Vectors (N, D) in the axes of lists and codes."""
         return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.rotation)
 
     def nearest_lists(self, rotated: Array, probes: int) -> tuple[NDArray[np.int64], Array]:
@@ -230,7 +227,7 @@ class Part:
     sheet: str  # name of the sheet
     sha256: str  # digest of its coarse tiles (hex)
     rows: int  # how many
-    retired: bool = False  # always: earlier versions stored it
+    retired: bool = False  # the sheet has gone: of earlier versions, refused
 
 
 @dataclass(frozen=True)
@@ -328,7 +325,6 @@ class OpenShard:
         self._index.referenced_objects.append(mapped)
 
     def scan(self, rotated: Array, lists: Ids, scores: Array, count: int) -> tuple[Array, Ids]:
-        """Approximate products (Q, count) and rows (Q, count), best first, of lists (Q, probes)."""
         module, index = faiss(), self._index
         found = np.empty((len(rotated), count), dtype=np.float32)
         rows = np.empty((len(rotated), count), dtype=np.int64)
@@ -350,7 +346,6 @@ class OpenShard:
         return found, rows
 
     def vectors(self, rows: Ids) -> Array:
-        """Stored vectors (N, D) of rows (N,)."""
         size, offset, file = 2 * self._dims, self._offset, self._file
         read = b"".join([os.pread(file, size, offset + size * row) for row in rows.tolist()])
         return np.frombuffer(read, dtype=np.float16).astype(np.float32).reshape(-1, self._dims)
@@ -401,7 +396,6 @@ class ShardedIndex:
         return self._compared(queries, ids, k)
 
     def vectors(self, ids: Ids) -> Array:
-        """Stored vectors (N, D) of ids (N,); zeros for ids that are in no shard."""
         out = np.zeros((len(ids), self.quantizers.recipe.dims), dtype=np.float32)
         for shard in self._shards:
             rows = ids - shard.info.base
@@ -419,8 +413,6 @@ class ShardedIndex:
         return None
 
     def _compared(self, queries: Array, ids: Ids, k: int) -> tuple[Array, Ids]:
-        """The k best of the candidates (Q, R) by their stored vectors; of equal ones the lower id
-        first."""
         out_scores = np.full((len(queries), k), -np.inf, dtype=np.float32)
         out_ids = np.full((len(queries), k), NONE, dtype=np.int64)
         for query, candidates in enumerate(ids):
