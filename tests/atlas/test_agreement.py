@@ -62,12 +62,6 @@ def test_hovering_is_no_evidence():
     assert not hovering.agreed
 
 
-def test_circling_over_the_same_ground_adds_no_evidence():
-    circle = [seen(300 * np.cos(a), 300 * np.sin(a), 3.0) for a in np.arange(0, 60, 0.5)]
-    once, often = flown(*([s] for s in circle[:13])), flown(*([s] for s in circle))
-    assert often.best.views <= once.best.views + 0.35
-
-
 def test_contradicting_views_do_not_extend_a_chain():
     rng = np.random.default_rng(3)
     agreement = flown(*([seen(100 * k, 0, 5.0)] for k in range(30)), every_s=4.0)

@@ -8,12 +8,8 @@ from safetensors.numpy import load_file, save_file
 
 from orthonav.core.errors import AtlasError, MissingFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.tiles import represent
-from orthonav.core.tiles.cells import MICRO, CellLayout
-from orthonav.core.tiles.whitened import CellSheet, pooled_features
-from orthonav.core.variants import make_variant
 from orthonav.ground.atlas.catalog import CoarseRecipe, canonical
-from orthonav.ground.atlas.coarse import POOLING, read_coarse, write_coarse
+from orthonav.ground.atlas.coarse import read_coarse, write_coarse
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.sheets import WorldSheets
 
@@ -80,33 +76,6 @@ def test_every_place_is_within_half_a_stride_of_one_centre_of_its_sheet_or_the_n
     away = np.abs(places[:, None] - centres[None]).max(axis=2).min(axis=1)
     half_m = RECIPE.tile_px * RECIPE.gsd_m * (1 - RECIPE.overlap) / 2
     assert away.max() < 1.02 * half_m, "meridians tilt, so a sheet is no exact square"
-
-
-def test_features_are_those_of_the_pixels_there(mosaic, box_deg, stored):
-    read = read_coarse(stored)
-    index = len(read.valid) // 2
-    size = RECIPE.tile_px
-    representation = make_variant(represent.TABLE, "gradient")
-    margin = representation.margin_px
-    # In the plane of the sheet: another would turn the pixels a little.
-    west, south, east, north = box_deg
-    frame = LocalFrame(round((south + north) / 2, 7), round((west + east) / 2, 7))
-    east_m, north_m = frame.en_from_latlon(*read.centres_latlon_deg[index])
-    whole = size + 2 * margin
-    with mosaic.sheet(
-        frame,
-        west_m=float(east_m) - whole / 2,
-        north_m=float(north_m) + whole / 2,
-        width_px=whole,
-        height_px=whole,
-        gsd_m=RECIPE.gsd_m,
-    ) as raster:
-        pixels = raster.read_grey(0, 0, whole, whole)
-    maps = representation(pixels.grey, pixels.valid)[:, margin:-margin, margin:-margin]
-    sheet = CellSheet(CellLayout(size // MICRO, size // MICRO), size, size, len(maps))
-    sheet.fill(0, 0, maps, np.ones((size, size), bool))
-    features, _ = pooled_features(POOLING, sheet, np.zeros((1, 2), np.intp))
-    assert np.abs(features[0] - read.features[index].astype(np.float32)).max() < 0.02
 
 
 def test_tiles_with_too_little_imagery_are_left_out(mosaic, middle, tmp_path):

@@ -10,13 +10,11 @@ import fsspec
 import pytest
 
 from orthonav.cli import main
-from orthonav.core.errors import AtlasError
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet, StoredFile, canonical
 from orthonav.ground.atlas.index import IndexManifest
 from orthonav.ground.atlas.integrity import check_atlas
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.atlas.vectors import Part, ShardInfo, VectorRecipe
-from orthonav.ground.planning.area import Area
 
 RECIPE = AtlasRecipe(gsd_m=2.5, tile_px=128, calibration_views=24, coarse=None)
 PLACES = [(46.6, 1.9), (46.6, 2.1)]
@@ -208,14 +206,6 @@ def test_info(near, capfd):
     assert all(west < lon < east and south < lat < north for lat, lon in PLACES)
 
 
-def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, capfd):
-    code, done = run(capfd, "info", tmp_path)
-    assert code == 1 and done.err.startswith("orthonav: error: no atlas")
-    Atlas.open_or_create(tmp_path / "atlas", RECIPE)
-    code, done = run(capfd, "info", tmp_path / "atlas")
-    assert code == 0 and "dates      unknown" in done.out and "sheets     0" in done.out
-
-
 def test_check(near, capfd):
     code, done = run(capfd, "check", near.url)
     assert (code, done.out) == (0, f"whole, by names and sizes: {near.url}\n")
@@ -245,28 +235,3 @@ def test_add_and_retire(near, tmp_path, capfd):
     Atlas.open_or_create(copy, replace(RECIPE, seed=1))
     code, done = run(capfd, "add", copy, near.url)
     assert code == 1 and "seed: 1, not 0" in done.err
-
-
-def test_options_reach_index_and_cut(near, capfd, monkeypatch):
-    code, done = run(capfd, "index", near.url)
-    assert code == 0 and "nothing to index" in done.out
-    asked = {}
-
-    def cut(atlas, out, area, **how):
-        asked.update(how, url=atlas.url, out=out, area=area)
-        raise AtlasError("sheets are missing")
-
-    monkeypatch.setattr("orthonav.ground.atlas.cut.cut_map", cut)
-    options = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
-    code, done = run(capfd, "cut", near.url, *options, "--band-m", "50")
-    assert code == 1 and "needs a route" in done.err
-    code, done = run(capfd, "cut", near.url, *options)
-    assert code == 1 and "sheets are missing" in done.err
-    assert asked.pop("progress") is not None
-    assert asked == {
-        "url": near.url,
-        "out": Path("MAP.onav"),
-        "area": Area.from_bounds((1.8, 46.5, 1.9, 46.6)),
-        "workers": 2,
-        "allow_holes": False,
-    }

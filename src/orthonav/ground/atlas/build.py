@@ -38,6 +38,9 @@ from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.sheets import sheets_of_route
 
+log = logging.getLogger(__name__)
+
+GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
 MARGIN_PX = 64  # pixels beyond a tile that gradients and resampling use, and some more
 TOUCH_DEG = 1e-9  # boxes that overlap by less than this only touch: a tenth of a millimetre
 _POINTS = 17  # points along a side of a sheet at which it is compared with a search band
@@ -302,11 +305,6 @@ class BuildReport:
             "size_mb": round(sum(each.size_bytes for each in built) / 1e6, 4),
             "wall_s": round(self.wall_s, 3),
         }
-
-
-log = logging.getLogger(__name__)
-
-GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
 
 
 def build_atlas(

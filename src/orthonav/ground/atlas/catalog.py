@@ -32,7 +32,6 @@ STAC_VERSION = "1.0.0"
 COLLECTION = "orthonav-atlas"
 MAX_ITEM_BYTES = 2**20  # a guard for memory: 2 kB, 60 bytes more for each further orthophoto
 MAX_REVISION = 9999  # what four digits of a file name hold
-MAX_TILES = 10**9  # a guard against impossible values: tiles 1.5 m apart on a sheet of 45 km
 FILES = {  # folder, suffix and media type of the files that a sheet may have
     "map": ("sheets", ".onav", "application/octet-stream"),
     "coarse": ("coarse", ".safetensors", "application/octet-stream"),
@@ -64,7 +63,7 @@ class StoredFile:
 class Sheet:
     """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
     building, so that the same sheet is the same bytes everywhere. `imagery`: its orthophotos, as
-    the manifest of a map describes them. `files`: its files by kind: `map`, `coarse`."""
+    the manifest of a map describes them."""
 
     id: str  # name in the lattice, as r001526c001392
     bounds_deg: Extent  # its box in the lattice: west, south, east, north
@@ -159,7 +158,7 @@ class Sheet:
                 and -90 <= south < north <= 90
                 and 1 <= sheet.revision <= MAX_REVISION
                 and sheet.gsd_m > 0
-                and 1 <= sheet.tiles <= MAX_TILES
+                and sheet.tiles >= 1
                 and sheet.area_km2 >= 0
             )
             if not possible or canonical(sheet.to_item()) != data:
@@ -185,9 +184,8 @@ def canonical(plain: Any) -> bytes:
 
 
 def parsed(data: bytes, what: str) -> Any:
-    """Plain values of JSON; raises `AtlasError` naming `what` where it is not JSON. The caller must
-    compare the bytes with the canonical ones, which also excludes repeated keys and numbers that
-    are not finite."""
+    """Plain values of JSON. The caller must compare the bytes with the canonical ones, which also
+    excludes repeated keys and numbers that are not finite."""
     try:
         return json.loads(data.decode())
     except (ValueError, RecursionError) as error:
@@ -361,7 +359,6 @@ class AtlasRecipe:
 
 
 CATALOG = "atlas.json"
-_SAME_PLACE_DEG = 1e-9  # a tenth of a millimetre: rounding only
 
 
 class Atlas:
@@ -369,13 +366,9 @@ class Atlas:
     may put sheets into it at the same time."""
 
     def __init__(self, store: Store, recipe: AtlasRecipe) -> None:
-        self.store = store
+        self.store, self.url = store, store.url
         self.recipe = recipe
         self._sheets: dict[str, Sheet] | None = None
-
-    @property
-    def url(self) -> str:
-        return self.store.url
 
     @classmethod
     def open(cls, url: str | Path) -> "Atlas":
@@ -478,7 +471,7 @@ class Atlas:
 
     def require_place(self, sheet: Sheet) -> None:
         box = self.recipe.sheets.bounds_deg(sheet.id)
-        if max(abs(a - b) for a, b in zip(box, sheet.bounds_deg, strict=True)) > _SAME_PLACE_DEG:
+        if max(abs(a - b) for a, b in zip(box, sheet.bounds_deg, strict=True)) > 1e-9:
             raise AtlasError(
                 f"sheet {sheet.id} has bounds {sheet.bounds_deg}, the lattice of the atlas has "
                 f"{box}: {self.store}"

@@ -466,9 +466,6 @@ def _heights(
     return found
 
 
-COARSER = 4  # factor by which blocks are reduced for the preview
-
-
 def cut_map(
     atlas: Atlas,
     out: Path,
@@ -488,7 +485,6 @@ def cut_map(
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
-    progress("sheets", 1.0)
     cutter.read(progress, workers)
     check_shown(area, cutter.grid, cutter.cells, atlas, allow_holes)
     written = write_map(out, *_learnt(cutter, workers, progress))
@@ -540,8 +536,8 @@ class _MapCutter:
         if not valid.any():
             return {}
         means, share = joined_cells(warps, block, self._layout)
-        # A whole factor is many times faster.
-        size = max(1, block.width // COARSER), max(1, block.height // COARSER)
+        # A whole factor, as 4, is many times faster.
+        size = max(1, block.width // 4), max(1, block.height // 4)
         coarse = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         parts: Parts = {"means": means, "share": share}
         parts["preview"] = self.preview.small(block, coarse)
@@ -566,7 +562,6 @@ def _learnt(
     tiles_px = tiles_rc * grid.stride_px
     progress("learn", 0.0)
     embedder = learn(cutter.recipe, cutter.cells, tiles_px, workers)
-    progress("learn", 0.3)
     embeddings = embedder.tiles(cutter.cells, tiles_px, workers)
     centres = grid.centres_en_m(tiles_rc)
     grey, grey_parts = cutter.layer.finish()

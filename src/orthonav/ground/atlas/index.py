@@ -22,7 +22,7 @@ from orthonav.core.errors import AtlasError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.tiles.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.ground.atlas.catalog import Atlas, Sheet, StoredFile, canonical, parsed, reason
-from orthonav.ground.atlas.coarse import POOLING, read_coarse, tile_count
+from orthonav.ground.atlas.coarse import MAX_TILES, POOLING, read_coarse, tile_count
 from orthonav.ground.atlas.store import digest_of
 from orthonav.ground.atlas.vectors import (
     MAX_TRAINING_VECTORS,
@@ -39,7 +39,6 @@ FOLDER = "index"
 MANIFEST = f"{FOLDER}/index.json"
 FORMAT = "orthonav-index"
 SCHEMA = 2  # 2: shards have no manifests of their own
-MAX_ROWS = 10**6  # rows of a sheet: `orthonav.ground.atlas.coarse.MAX_TILES`
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
 
 
@@ -68,7 +67,7 @@ class IndexManifest:
             possible = (
                 all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
                 and all(file.name == f"{FOLDER}/{name}" for name, file in files.items())
-                and all(0 <= part.rows <= MAX_ROWS for part in parts)
+                and all(0 <= part.rows <= MAX_TILES for part in parts)
                 and not any(part.retired for part in parts)
                 and list(accumulate((shard.rows for shard in shards), initial=0))[:-1]
                 == [shard.base for shard in shards]

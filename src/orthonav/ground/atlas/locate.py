@@ -45,6 +45,8 @@ from orthonav.ground.atlas.search import (
 )
 from orthonav.ground.planning.area import Area
 
+log = logging.getLogger(__name__)
+
 # Values without another source were chosen with `benchmarks.atlas_lost` at d63ac91.
 MAX_SPEED_MPS = 120.0  # faster than the aircraft that this program is for
 SLACK_M = 60.0  # errors of two registered positions, seven pixels of 8 m
@@ -246,13 +248,12 @@ class PlaceFinder:
     ) -> None:
         self._registrar, self._search = registrar, search
         self._heading_known = heading_known
-        self._agreement = Agreement()
-        self._views: dict[int, View] = {}
         self._number = 0
+        self.restart()
 
     def restart(self) -> None:
         self._agreement = Agreement()
-        self._views = {}
+        self._views: dict[int, View] = {}
 
     def find(self, view: View) -> FoundPlace | NoFix:
         recipe = self._search.recipe
@@ -364,8 +365,6 @@ def _moved(
     return float(lat), float(lon)
 
 
-log = logging.getLogger(__name__)
-
 SIGMAS = 3.0  # standard deviations of a position within which the aircraft is
 AHEAD_M = 1000.0  # a map reaches so much farther than the next view can: fewer maps are cut
 LIKELY = 0.5  # least confidence of a fix
@@ -474,7 +473,6 @@ class AtlasLocator:
 
     @property
     def state_name(self) -> str | None:
-        """That of the track: `searching` before there is one, `lost` after it has ended."""
         return self._state.value
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:

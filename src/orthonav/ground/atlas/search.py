@@ -49,6 +49,11 @@ from orthonav.ground.atlas.index import (
 )
 from orthonav.ground.atlas.vectors import ShardedIndex
 
+log = logging.getLogger(__name__)
+
+MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
+BORDER_SHARE = 0.25  # of its side that the middle of a view may lie outside the box of a sheet
+WIDEST = 1.25  # greatest scale at which all of a view lies on the part of a sheet, on level ground
 PER_POSE = 60  # tiles found for each pose; several neighbouring tiles are one place
 EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
 MOST_EFFORT = 0.085, 1500
@@ -126,13 +131,6 @@ class TileSearch:
             if len(found) == count:
                 break
         return found
-
-
-log = logging.getLogger(__name__)
-
-MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
-BORDER_SHARE = 0.25  # of its side that the middle of a view may lie outside the box of a sheet
-WIDEST = 1.25  # greatest scale at which all of a view lies on the part of a sheet, on level ground
 
 
 @dataclass(frozen=True)
