@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthonav.cli import verbosity
 from orthonav.cli.build import add_recipe, asked, recipe_of
-from orthonav.cli.common import add_area, add_options, area_of, print_json, progress, reporter
+from orthonav.cli.common import add_area, add_options, area_of, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.ground.atlas.catalog import Atlas
@@ -41,7 +41,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_options(action("info", "print the contents of an atlas"), "--json")
     text = "check whether an atlas is complete: exit 0, or 3 and a list of problems"
     check = action("check", text)
-    text = "read every file, verify its checksum and its recipe"
+    text = "read every file and verify its checksum"
     check.add_argument("--deep", action="store_true", help=text)
     text = "remove leftovers of interrupted builds that are older than 24 hours"
     check.add_argument("--clean", action="store_true", help=text)
@@ -119,7 +119,7 @@ def _build(options: argparse.Namespace) -> int:
     )
     try:
         with _runner(options) as runner, progress(options) as shown:
-            result = build_atlas(request, runner, shown, reporter(options))
+            result = build_atlas(request, runner, shown)
     except KeyboardInterrupt:
         print(
             "orthonav: error: interrupted; finished sheets are stored, rerun to resume",
@@ -130,7 +130,7 @@ def _build(options: argparse.Namespace) -> int:
     if options.json:
         print_json(plain)
     else:
-        _print_rows(plain, "failed", "finish_error")
+        _print_rows(plain, "failed")
     for line in _failures(plain):
         print(f"orthonav: error: {line}", file=sys.stderr)
     return 0 if result.is_complete else 1
@@ -156,8 +156,6 @@ def _failures(plain: Mapping[str, Any]) -> list[str]:
     if len(lines) > SHOWN_FAILURES:
         more = f"and {len(lines) - SHOWN_FAILURES} more sheets, see --json"
         lines = [*lines[:SHOWN_FAILURES], more]
-    if plain["finish_error"]:
-        lines.append(f"snapshot and index could not be written: {plain['finish_error']}")
     return lines
 
 
@@ -242,7 +240,7 @@ def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
     if made is None:
         print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return
-    rows = sum(part.rows for shard in made.shards for part in shard.parts if not part.retired)
+    rows = sum(part.rows for shard in made.shards for part in shard.parts)
     size = sum(file.size_bytes for file in made.files.values())
     print(f"{rows} tiles of {len(made.sheets)} sheets, {size / 1e6:.3f} MB: {atlas.store}")
 
