@@ -13,9 +13,8 @@ import pytest
 from made_check import EVIL, FILES, small_route
 
 from html_page import Page
-from orthonav.ground.check.outcome import CELL_VALUES
-from orthonav.ground.check.write import write_check
-from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN
+from orthonav.ground.check.records import CELL_VALUES
+from orthonav.ground.check.write import ZERO_IF_UNKNOWN, write_check
 from orthonav.ground.check.write.plain import check_to_plain
 from orthonav.ground.check.write.wording import probability_text
 from orthonav.ground.report.drawing import Drawing
@@ -42,8 +41,7 @@ def folder(opened, frame, tmp_path_factory):
         patch.setattr("orthonav.ground.report.drawing.DPI", 20)
         path = write_check(small_route(frame), opened, root / "small_route")
         assert path == root / "small_route" / "index.html"
-        for name in ("draw_axes", "draw_figure"):  # drawing takes longest
-            patch.setattr(f"orthonav.ground.check.write.figures.{name}", lambda *_: UNDRAWN)
+        patch.setattr("orthonav.ground.check.write.draw_axes", lambda *_: UNDRAWN)  # takes longest
         for kind in ("tiny", "nearly_empty"):
             write_check(getattr(made_check, kind)(frame), opened, root / kind)
         about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.changes.record import CellGrid
-from orthonav.ground.check.places import (
+from orthonav.ground.check.run import (
     FEWEST_TRIALS,
     MAX_TRIALS,
     MIN_TRIALS,

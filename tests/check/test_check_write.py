@@ -15,7 +15,7 @@ from made_check import EVIL, FILES, lost_in, made_cells, small_route
 
 from orthonav.core.errors import MissingExtraError, OutputError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.check.outcome import CELL_VALUES, Conditions
+from orthonav.ground.check.records import CELL_VALUES, Conditions
 from orthonav.ground.check.write import require_free, write_check
 from orthonav.ground.check.write.plain import check_to_plain, features, to_json
 from orthonav.ground.check.write.wording import text
@@ -38,10 +38,9 @@ def written(opened, frame, tmp_path_factory):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Figures are not drawn, which takes longest."""
+    """The map is not drawn, which takes longest."""
     nothing = Drawing(b"png", "<svg/>", (1.0, 1.0))
-    for name in ("draw_axes", "draw_figure"):
-        monkeypatch.setattr(f"orthonav.ground.check.write.figures.{name}", lambda *_: nothing)
+    monkeypatch.setattr("orthonav.ground.check.write.draw_axes", lambda *_: nothing)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from orthonav.cli.common import ROUTE_HELP, add_dem, print_json, progress
 
 EVERYDAY = (
     *("--route", "--band-m", "--other-date", "--other-sensor", "--changes", "--camera", "--agl-m"),
-    *("--dem", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
+    *("--dem", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--json"),
 )
 
 log = logging.getLogger(__name__)
@@ -26,8 +26,7 @@ _REFERENCES = {
 
 if TYPE_CHECKING:
     from orthonav.ground.changes.record import ChangedGround
-    from orthonav.ground.check.outcome import CheckedInputs
-    from orthonav.ground.check.request import CheckRequest
+    from orthonav.ground.check.records import CheckedInputs, CheckRequest
     from orthonav.ground.planning.route import Route
     from orthonav.ground.planning.spacing import LegProfile
 
@@ -141,9 +140,7 @@ def _add_effort(group: argparse._ActionsContainer) -> None:
         "confidence:0.9)",
     )
     _add_number(group, "--effort", 1.0, "factor on the number of trials", "FACTOR")
-    group.add_argument(
-        "--quick", action="store_true", help="skip the trials of other errors and other heights"
-    )
+    group.add_argument("--quick", action="store_true", help="no effect; accepted for old scripts")
     group.add_argument(
         "--workers", type=int, help="number of parallel workers: processes (default: one per core)"
     )
@@ -184,7 +181,7 @@ def _accepted(text: str) -> float:
 def _request(options: argparse.Namespace) -> "CheckRequest":
     from orthonav.core.errors import CheckError
     from orthonav.core.geo.camera_files import read_camera_file
-    from orthonav.ground.check.request import CheckRequest
+    from orthonav.ground.check.records import CheckRequest
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.planning.spacing import DEFAULT_CAMERA
 
@@ -209,7 +206,6 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         speed_mps=options.speed_mps,
         relief_m=options.relief_m,
         effort=options.effort,
-        extras=not options.quick,
         workers=options.workers,
         seed=options.seed,
         tilt_std_deg=options.tilt_std_deg,
@@ -296,7 +292,7 @@ def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "Chec
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.check.outcome import CheckedInputs
+    from orthonav.ground.check.records import CheckedInputs
 
     manifest = open_map(options.map).manifest
     terms = []

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.changes.record import lonlat
-from orthonav.ground.check.outcome import CELL_VALUES, Along, Cells, CheckResult, summarize
+from orthonav.ground.check.records import CELL_VALUES, Along, Cells, CheckResult, summarize
 from orthonav.ground.report.numbers import BY_UNIT, to_plain
 
 FORMAT, VERSION = "orthonav-check", 1
@@ -115,8 +115,6 @@ def check_to_plain(result: CheckResult) -> Plain:
         "route": _route_to_plain(result),
         "stretches": _stretches(result),
         "lookalikes": _lookalikes(result),
-        "envelope": to_plain(result.envelope, BY_UNIT),
-        "alternatives": to_plain(result.alternatives, BY_UNIT),
     }
 
 

@@ -86,9 +86,6 @@ function numbered(place, text, kind, description, chosen) {
 function addRoute(map) {
   const group = L.layerGroup().addTo(map);
   const quiet = { interactive: false, lineCap: "round", lineJoin: "round" };
-  for (const [colour, weight] of [["#fff", 4], ["#1a1a1a", 1.5]]) {
-    L.polygon(drawn.band.map((ring) => ring.map(at)), { ...quiet, color: colour, weight, fill: false }).addTo(group);
-  }
   const line = drawn.route.map(at);
   for (const [risk, first, last] of drawn.segments) {
     const { edge, width } = drawn.risks[risk];
@@ -106,7 +103,8 @@ function addRoute(map) {
     if (drawn.blind[i].length < 2) return;
     L.polyline(drawn.blind[i].map(at), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
     const middle = nearestAlong((blind.start_m + blind.end_m) / 2);
-    const description = drawn.blind_texts[i];
+    const outcome = blind.recoverable ? "recovers" : "lost";
+    const description = `Gap ${blind.number}: ${metres(blind.length_m)}, probability ${percent(blind.probability)}, ${outcome}.`;
     numbered(drawn.route[middle], String(blind.number), blind.recoverable ? "blind" : "lost", description, () => {
       selectAlong(middle, false);
       announce(description);
@@ -118,8 +116,8 @@ function addRoute(map) {
 function addLookalikes(map) {
   const group = L.layerGroup().addTo(map);
   drawn.lookalikes.forEach((ends, k) => {
-    const { number: name, within_prior: near } = data.lookalikes[k];
-    const description = drawn.lookalike_texts[k];
+    const { number: name, within_prior: near, apart_m: apart } = data.lookalikes[k];
+    const description = `Ambiguous places ${name}: ${metres(apart)} apart, ${near ? "within" : "outside"} the prior.`;
     L.polyline(ends.map(at), { color: "#8a2f63", weight: 2, dashArray: "3 6", interactive: false }).addTo(group);
     ends.forEach((place, i) => {
       const kind = near ? "twin near" : "twin";

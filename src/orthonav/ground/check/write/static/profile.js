@@ -13,7 +13,9 @@ class Profile extends Chart {
     Object.assign(this, { slider, index: -1 });
     slider.addEventListener("input", () => selectAlong(Number(slider.value)));
     listeners.push(({ index }) => { this.index = index; this.drawCursor(); });
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    for (const look of ["(prefers-color-scheme: dark)", "print"]) {
+      matchMedia(look).addEventListener("change", () => this.draw());
+    }
     this.start();
   }
 
