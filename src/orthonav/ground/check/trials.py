@@ -4,13 +4,14 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import get_context, parent_process
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import cv2
@@ -242,11 +243,11 @@ def run_trials(
     ]
     own: list[Trial] = []
     other: list[Trial] = []
-    outcomes = _run_jobs(request, conditions, jobs, workers)
-    for done, (job, trial) in enumerate(zip(jobs, outcomes, strict=True)):
-        if trial is not None:
-            (other if job[0] else own).append(trial)
-        progress((done + 1) / len(jobs))
+    with closing(_run_jobs(request, conditions, jobs, workers)) as outcomes:
+        for done, (job, trial) in enumerate(zip(jobs, outcomes, strict=True)):
+            if trial is not None:
+                (other if job[0] else own).append(trial)
+            progress((done + 1) / len(jobs))
     return own, other
 
 
@@ -256,14 +257,15 @@ _Job = tuple[bool, int, float, float]
 
 def _run_jobs(
     request: CheckRequest, conditions: Conditions, jobs: list[_Job], workers: int
-) -> Iterator[Trial | None]:
+) -> Generator[Trial | None, None, None]:
     if workers <= 1 or len(jobs) < 4 * AT_ONCE:
         with closing(Trier(request, conditions)) as trier:
             yield from map(trier, jobs)
         return
     context = get_context("spawn")  # forking a process with threads is not safe
     workers = min(workers, -(-len(jobs) // AT_ONCE))
-    with ProcessPoolExecutor(workers, context, _start_worker, (request, conditions)) as pool:
+    stop = context.Event()
+    with ProcessPoolExecutor(workers, context, _start_worker, (request, conditions, stop)) as pool:
         try:
             yield from _submit(pool, jobs)
         except BrokenProcessPool as error:
@@ -272,6 +274,7 @@ def _run_jobs(
                 "memory; try fewer (--workers)"
             ) from error
         finally:
+            stop.set()  # do not wait for submitted jobs
             pool.shutdown(cancel_futures=True)
 
 
@@ -285,12 +288,13 @@ def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[Trial | Non
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+_stop: Event
 _trier: "Trier"
 
 
-def _start_worker(request: CheckRequest, conditions: Conditions) -> None:
-    global _trier
-    _trier = Trier(request, conditions)
+def _start_worker(request: CheckRequest, conditions: Conditions, stop: Event) -> None:
+    global _stop, _trier
+    _stop, _trier = stop, Trier(request, conditions)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
@@ -304,7 +308,7 @@ def _exit_with_parent() -> None:
 
 
 def _work(job: _Job) -> Trial | None:
-    return _trier(job)
+    return None if _stop.is_set() else _trier(job)
 
 
 def registration_of(opened: MapFile) -> RegistrationLocalizer:
