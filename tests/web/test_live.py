@@ -15,9 +15,7 @@ from orthonav.core.flight.fixes import result_to_json
 from orthonav.core.flight.mount import Bias, Mount, write_mount
 from orthonav.core.records import Telemetry
 from orthonav.ground.view import feed as feed_module
-from orthonav.ground.view import logs as logs_module
-from orthonav.ground.view.feed import LineFeed
-from orthonav.ground.view.logs import LogReader
+from orthonav.ground.view.feed import LineFeed, LogReader
 from orthonav.ground.view.run import ViewRequest, open_run
 from orthonav.onboard.log import FlightLog
 
@@ -35,7 +33,7 @@ def fixes(tmp_path):
 
 @pytest.fixture(autouse=True)
 def no_waiting(monkeypatch):
-    monkeypatch.setattr(logs_module, "RESCAN_S", 0.0)
+    monkeypatch.setattr(feed_module, "RESCAN_S", 0.0)
 
 
 def test_a_file_that_grows(fixes):

@@ -210,8 +210,7 @@ class Server(ThreadingHTTPServer):
         return int(self.server_address[1])
 
     def url(self) -> str:
-        address = self._address
-        host = _own_address(address.version) if address.is_unspecified else str(address)
+        host = "localhost" if self._address.is_unspecified else str(self._address)
         return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
 
     def allows(self, host: str) -> bool:
@@ -230,22 +229,6 @@ class Server(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         log.debug("request of %s", client_address, exc_info=True)
-
-
-def _own_address(version: int) -> str:
-    """The address of this computer in its network, or the loopback without one.
-
-    Nothing is sent: connecting a datagram socket only looks up the route.
-    """
-    family, far, own = socket.AF_INET, "192.0.2.1", "127.0.0.1"
-    if version == 6:
-        family, far, own = socket.AF_INET6, "2001:db8::1", "::1"
-    try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((far, 9))
-            return str(probe.getsockname()[0])
-    except OSError:
-        return own
 
 
 def _host_name(host: str) -> str:
@@ -278,20 +261,11 @@ class Handler(BaseHTTPRequestHandler):
             return _error(HTTPStatus.FORBIDDEN, "cross-site requests are refused")
         return None
 
-    def _only_reads(self) -> None:
-        self.close_connection = True  # the body is not read
-        reply = self._refused() or _error(HTTPStatus.METHOD_NOT_ALLOWED, "this server is read-only")
-        self._send(reply)
-
-    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _only_reads  # noqa: N815 - names of http.server
-
     def _send(self, reply: Response) -> None:
         self.send_response(reply.status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         self.send_header("Cache-Control", reply.cache)
-        if reply.status == HTTPStatus.METHOD_NOT_ALLOWED:
-            self.send_header("Allow", "GET, HEAD")
         if reply.status != HTTPStatus.NO_CONTENT:
             self.send_header("Content-Type", reply.media_type)
             self.send_header("Content-Length", str(len(reply.data)))
