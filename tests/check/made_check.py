@@ -17,7 +17,7 @@ from orthonav.ground.check.records import (
     Word,
 )
 
-FILES = {"index.html", "check.json", "check.tif", "check.geojson", "figures"}
+FILES = {"index.html", "check.json", "check.tif", "check.geojson"}
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
 DIGEST = "0123456789abcdef" * 4
 CONDITIONS = Conditions(

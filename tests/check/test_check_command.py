@@ -217,7 +217,7 @@ def test_command(run, untried, half_blank, route_path, tmp_path):
     assert done.code in (0, 3, 4) and done.err == ""
     assert f"report: {out / 'index.html'}" in done.out
     names = {path.name for path in out.iterdir()}
-    assert {"index.html", "check.json", "check.tif", "check.geojson", "figures"} == names
+    assert {"index.html", "check.json", "check.tif", "check.geojson"} == names
     plain = json.loads((out / "check.json").read_text())
     assert plain["verdict"]["exit_code"] == done.code
     assert plain["about"]["other_date"] == half_blank.present.name

@@ -1,6 +1,5 @@
 """The page of a check is complete, requests nothing, and works in a real browser."""
 
-import base64
 import hashlib
 import json
 import math
@@ -14,21 +13,12 @@ from made_check import EVIL, FILES, small_route
 
 from html_page import Page
 from orthonav.ground.check.records import CELL_VALUES
-from orthonav.ground.check.write import ZERO_IF_UNKNOWN, write_check
+from orthonav.ground.check.write import write_check
 from orthonav.ground.check.write.plain import check_to_plain
 from orthonav.ground.check.write.wording import probability_text
-from orthonav.ground.report.drawing import Drawing
 from orthonav.ground.report.numbers import metres_text
 from orthonav.ground.report.page import static_text
 
-UNDRAWN = Drawing(
-    base64.b64decode(
-        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNoAAAAggCBd81ytgAAAABJRU5ErkJggg=="
-    ),
-    "<svg/>",
-    (1.0, 1.0),
-)
-"""A figure of one pixel."""
 KINDS = {"tiny", "small_route", "nearly_empty", "evil"}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 
@@ -37,15 +27,11 @@ TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 def folder(opened, frame, tmp_path_factory):
     """Checks of all kinds, and one whose names are markup, by name."""
     root = tmp_path_factory.mktemp("checks")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.report.drawing.DPI", 20)
-        path = write_check(small_route(frame), opened, root / "small_route")
-        assert path == root / "small_route" / "index.html"
-        patch.setattr("orthonav.ground.check.write.draw_axes", lambda *_: UNDRAWN)  # takes longest
-        for kind in ("tiny", "nearly_empty"):
-            write_check(getattr(made_check, kind)(frame), opened, root / kind)
-        about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)
-        write_check(small_route(frame, about=about), opened, root / "evil")
+    for kind in ("tiny", "small_route", "nearly_empty"):
+        path = write_check(getattr(made_check, kind)(frame), opened, root / kind)
+        assert path == root / kind / "index.html"
+    about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)
+    write_check(small_route(frame, about=about), opened, root / "evil")
     return root
 
 
@@ -81,7 +67,7 @@ def all_cells(cells):
     """The cells of the page as in `check.json`: unknown ones are None, or 0 of what was counted."""
     known = cells.pop("known")
     for name in CELL_VALUES:
-        grid = [0 if name in ZERO_IF_UNKNOWN else None] * (cells["rows"] * cells["cols"])
+        grid = [0 if name in ("trials", "changed") else None] * (cells["rows"] * cells["cols"])
         for number, value in zip(known, cells[name], strict=True):
             grid[number] = value
         starts = range(0, len(grid), cells["cols"])
@@ -98,7 +84,6 @@ def test_the_script_is_given_the_json_of_the_check(folder, frame):
             assert plain == json.loads(json.dumps(check_to_plain(getattr(made_check, name)(frame))))
         assert (drawn["route"] is None) == (name in ("tiny", "nearly_empty"))
         assert len(drawn["lookalikes"]) == len(plain["lookalikes"])
-        assert len(drawn["blind"]) == len(plain["stretches"])
 
 
 def test_who_signs_sees_what_was_checked(folder):
@@ -158,6 +143,17 @@ def test_the_page_comes_alive(visit, name):
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     for name in ("low", "error_m", "wrong", "persistence", ""):
         page.select_option("#layer", name)
+
+
+@pytest.mark.long
+def test_the_printed_page_has_map_and_profile(visit):
+    page = visit("small_route")
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    for part in ("#map", "#profile", ".sign"):
+        assert page.locator(part).is_visible()
+    assert not page.locator(".tools").is_visible()
+    assert page.locator("#map").bounding_box()["width"] < 700
 
 
 @pytest.mark.long

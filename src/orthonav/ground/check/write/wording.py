@@ -9,14 +9,9 @@ from orthonav.ground.report.numbers import aligned, metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
-    Word.GO: "This route can be flown with this map.",
-    Word.MARGINAL: "This route does not meet all requirements for GO; see the reasons.",
-    Word.NO_GO: "Do not rely on this map for this route; see the reasons.",
-}
-AREA_VERDICTS = {
-    Word.GO: "Views can be localized on this map.",
-    Word.MARGINAL: "Views can be localized on parts of this map; see the reasons.",
-    Word.NO_GO: "Do not rely on this map; see the reasons.",
+    Word.GO: "This {} can be flown with this map.",
+    Word.MARGINAL: "This {} does not meet all requirements for GO; see the reasons.",
+    Word.NO_GO: "Do not rely on this map for this {}; see the reasons.",
 }
 MAX_STRETCHES = 7
 _WIDTH = 100
@@ -35,10 +30,10 @@ SIMULATED = "Predicted from this map alone, with simulated ageing."
 
 
 def verdict_sentence(result: CheckResult) -> str:
-    sentences = AREA_VERDICTS if result.along is None else VERDICTS
+    sentence = VERDICTS[result.verdict.word].format("area" if result.along is None else "route")
     origin = f", {result.about.height}" if result.about.height else ""
     height = f"Checked at {result.conditions.agl_m:.0f} m above ground{origin}."
-    return f"{sentences[result.verdict.word]} {height}"
+    return f"{sentence} {height}"
 
 
 def probability_text(value: float) -> str:
