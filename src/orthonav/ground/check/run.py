@@ -58,7 +58,6 @@ MASK_PX = 2048
 """The coverage of the map is read at the finest level no larger than this."""
 _REDRAWS = 6
 _PROBES_ACROSS, _PROBES_PER_BAND, _MAX_POINTS = 400, 4, 1_000_000
-_SAMPLES_PER_CELL = 4
 
 
 def check_map(
@@ -259,7 +258,7 @@ class _Check:
             side_m = max(side_m, math.sqrt(around_m2 / MAX_CELLS_AROUND))
         grid = CellGrid.over(self.extent, side_m)
         points = grid.centres_en_m
-        here = covered = self.coverage.cell_share(grid).ravel() > MIN_COVERED
+        here = covered = self.coverage.seen_share(points, side_m) > MIN_COVERED
         if self.area is not None:
             # A band that is narrower than a cell still crosses cells.
             bands_m = self.area.route.bands_m(None) if self.area.route else None
@@ -269,19 +268,20 @@ class _Check:
         columns = {name: np.full((grid.rows, grid.cols), np.nan) for name in vars(found)}
         for name, values in vars(found).items():
             columns[name].ravel()[here] = values
-        columns["changed"] = self._changed(grid)
+        columns["changed"] = self._changed(points, side_m).reshape(grid.rows, grid.cols)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(
             west_m=grid.west_m, north_m=grid.north_m, side_m=side_m, trials=trials, **columns
         )
 
-    def _changed(self, grid: CellGrid) -> Array:
-        """Fraction (rows, cols) of every cell that changed since the map was made."""
+    def _changed(self, points: Array, side_m: float) -> Array:
+        """Fraction (N,) of squares around points (N, 2) that changed since the map was made."""
         if self.request.changes is None:
-            return np.zeros((grid.rows, grid.cols))
-        whole = self.coverage.cell_share(grid)
-        lasting = self.coverage.without(self.request.changes, self.sheet.frame).cell_share(grid)
-        return np.clip(1 - lasting / np.maximum(whole, 1e-6), 0.0, 1.0) * (whole > 0)
+            return np.zeros(len(points))
+        whole = self.coverage.seen_share(points, side_m)
+        lasting = self.coverage.without(self.request.changes, self.sheet.frame)
+        share = lasting.seen_share(points, side_m) / np.maximum(whole, 1e-6)
+        return np.clip(1 - share, 0.0, 1.0) * (whole > 0)
 
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:
@@ -320,28 +320,12 @@ class MapCoverage:
         return np.asarray((numbers >= 0) & self.valid.ravel()[numbers])
 
     def seen_share(self, points_en_m: Array, side_m: float) -> Array:
-        """Fraction (N,) of views of a side, taken over points (N, 2), that the map covers."""
+        """Fraction (N,) of squares of a side around points (N, 2) that the map covers."""
         side = max(1, round(side_m / self.pixels.side_m))
         padded = np.pad(self.valid.astype(np.float32), side)
         share = cv2.blur(padded, (side, side), borderType=cv2.BORDER_CONSTANT)
         numbers = self.pixels.numbers(points_en_m, side)
         return np.where(numbers >= 0, np.asarray(share, np.float64).ravel()[numbers], 0.0)
-
-    def cell_share(self, cells: CellGrid) -> Array:
-        """Fraction (rows, cols) of every cell that the map covers."""
-        unit_m, fine = self.pixels.side_m, _SAMPLES_PER_CELL
-        left = (cells.west_m - self.pixels.west_m) / unit_m
-        top = (self.pixels.north_m - cells.north_m) / unit_m
-        step = cells.side_m / unit_m / fine
-        matrix = np.array([[step, 0, left + step / 2 - 0.5], [0, step, top + step / 2 - 0.5]])
-        samples = cv2.warpAffine(
-            self.valid.astype(np.float32),
-            matrix,
-            (cells.cols * fine, cells.rows * fine),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        )
-        parts = np.asarray(samples).reshape(cells.rows, fine, cells.cols, fine)
-        return np.asarray(parts.mean(axis=(1, 3)), dtype=np.float64)
 
     @property
     def extent_en_m(self) -> Extent:

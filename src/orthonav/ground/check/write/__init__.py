@@ -30,7 +30,6 @@ from orthonav.ground.check.write.wording import (
     SYMBOLS,
     conditions_text,
     key_figures,
-    remedies,
     stretch_row,
     verdict_sentence,
 )
@@ -160,7 +159,6 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "max_lookalikes": MAX_LOOKALIKES,
         "radius": metres_text(result.conditions.radius_m),
         "conditions": conditions_text(result.conditions, result.band_m),
-        "remedies": remedies(result),
         "downloads": DOWNLOADS,
         "checked": _checked(result, json_sha256),
         "data": _page_data(result, box),

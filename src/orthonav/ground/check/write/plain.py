@@ -249,16 +249,12 @@ def _tags(result: CheckResult) -> dict[str, str]:
         "verdict": result.verdict.word.value,
         **vars(result.conditions),
     }
-    return {
-        "TIFFTAG_SOFTWARE": f"orthonav {result.about.version}".strip(),
-        **{
-            f"ORTHONAV_{name.upper()}": (
-                writable(value) if isinstance(value, str) else f"{value:.9g}"
-            )
-            for name, value in values.items()
-            if value not in (None, "")
-        },
+    tags = {
+        f"ORTHONAV_{name.upper()}": writable(each) if isinstance(each, str) else f"{each:.9g}"
+        for name, each in values.items()
+        if each not in (None, "")
     }
+    return {"TIFFTAG_SOFTWARE": f"orthonav {result.about.version}".strip(), **tags}
 
 
 def writable(text: str) -> str:

@@ -130,26 +130,6 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
     return [*shown, (str(len(result.lookalikes)), pairs)]
 
 
-def remedies(result: CheckResult) -> list[str]:
-    if result.verdict.word is Word.GO:
-        return []
-    found = []
-    lost = [each for each in result.stretches if not each.recoverable and not each.ends_lost]
-    if lost:
-        drift = min(each.allowed_m / each.length_m for each in lost)
-        assumed = f"{100 * result.conditions.drift:g} %"
-        found.append(
-            f"Dead reckoning that drifts by at most {100 * drift:.1f} % (assumed: {assumed}) "
-            "bridges all gaps."
-        )
-    if any(each.ends_lost and each.start_m > 0 for each in result.stretches):
-        start_km = result.stretches[-1].start_m / 1000
-        found.append(
-            f"End the route before km {start_km:.1f}, or extend it to where fixes are likely."
-        )
-    return found or ["Check another height (--agl-m), route or map."]
-
-
 def text(result: CheckResult) -> str:
     """Verdict, reasons, key figures and gaps; control characters in names are replaced."""
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
@@ -165,9 +145,6 @@ def text(result: CheckResult) -> str:
         numbered = enumerate(result.stretches, start=1)
         rows_of_gaps = [stretch_row(number, each) for number, each in numbered if each in worst]
         lines += ["", "gaps without fixes, the worst:", *aligned([GAP_COLUMNS, *rows_of_gaps])]
-    helpful = remedies(result)
-    if helpful:
-        lines += ["", "what may help:", *(line for each in helpful for line in _item(each))]
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
 
 
