@@ -16,7 +16,7 @@ from orthonav.ground.check.records import CELL_VALUES
 from orthonav.ground.check.write import write_check
 from orthonav.ground.check.write.plain import check_to_plain
 from orthonav.ground.check.write.wording import probability_text
-from orthonav.ground.report.numbers import metres_text
+from orthonav.ground.report import metres_text
 from orthonav.ground.report.page import static_text
 
 KINDS = {"tiny", "small_route", "nearly_empty", "evil"}

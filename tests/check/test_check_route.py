@@ -21,10 +21,10 @@ SIDE_M = 100.0
 CONDITIONS = replace(made_trials.CONDITIONS, width_m=SIDE_M, height_m=SIDE_M)
 
 
-def area_of(points_en_m, band_m=200.0):
+def area_of(points_en_m, bands_m=()):
     lat, lon = FRAME.latlon_from_en(np.array(points_en_m, float))
-    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
-    return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, band_m)
+    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
+    return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, 200.0)
 
 
 def of_many_flights(chances, errors_m, drift, side_m):
@@ -67,24 +67,24 @@ def test_the_worst_over_the_width_of_every_leg():
         bad |= (points[:, 0] > 1080) & (points[:, 1] > 250)
         return predicted(np.where(bad, 0.1, 0.9), np.full(len(points), 3.0))
 
-    area = area_of([[0, 0], [1000, 0], [1000, 800]])
     early = slice(4, 20)
     for bands, first, last in (
         ((200, 100), 0.1, 0.9),
         ((100, 200), 0.9, 0.1),
         ((90, 90), 0.9, 0.9),
     ):
-        along = predicted_along(area, bands, CONDITIONS, predict)
+        area = area_of([[0, 0], [1000, 0], [1000, 800]], bands)
+        along = predicted_along(area, CONDITIONS, predict)
         late = along.distance_m > 1400
         assert (along.across_low[early] == first).all() and (along.across_low[late] == last).all()
         assert (along.probability[early] == 0.9).all()
 
 
 def test_the_route_ends_at_its_last_waypoint():
-    along = predicted_along(area_of([[0, 0], [100, 0], [100, 60]]), [200.0] * 2, CONDITIONS, even)
+    along = predicted_along(area_of([[0, 0], [100, 0], [100, 60]]), CONDITIONS, even)
     assert along.distance_m == pytest.approx([0, 25, 50, 75, 100, 125, 150, 160], abs=1e-3)
     np.testing.assert_allclose(along.points_en_m[-1], [100, 60], atol=0.01)
-    whole = predicted_along(area_of([[0, 0], [100, 0]]), [200.0], CONDITIONS, even)
+    whole = predicted_along(area_of([[0, 0], [100, 0]]), CONDITIONS, even)
     assert along.drift_m.shape == (8,) and len(whole.distance_m) in (5, 6)
 
 

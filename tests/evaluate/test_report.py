@@ -21,7 +21,7 @@ from orthonav.ground.evaluate.tables import (
     table,
     total,
 )
-from orthonav.ground.report.numbers import measure_text
+from orthonav.ground.report import measure_text
 
 CENTRE = LocalFrame(48.0, -4.5)
 PICTURES_PER_FLIGHT = 6

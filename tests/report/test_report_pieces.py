@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.ground.report import measure_text, metres_text
 from orthonav.ground.report.drawing import Background, Drawing, draw_axes, draw_map, map_size_in
-from orthonav.ground.report.numbers import measure_text, metres_text
 from orthonav.ground.report.page import (
     LIST,
     Figure,

@@ -11,7 +11,7 @@ from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
 from orthonav.core.flight.fixes import result_to_json, write_results
-from orthonav.ground.report.numbers import metres_text
+from orthonav.ground.report import metres_text
 from orthonav.ground.view.run import ViewRequest, open_run
 
 pytestmark = pytest.mark.long

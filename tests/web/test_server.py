@@ -125,23 +125,6 @@ def test_the_detail_says_all(ask):
     assert as_picture(ask(f"/api/views/{NO_FIX}/raw.jpg")).shape == (240, 320)
 
 
-def test_a_click_gives_the_ground_with_an_ellipse(ask):
-    detail = as_json(ask("/api/views/0"))
-    window = detail["window"]
-    found = as_json(ask("/api/views/0/ground?x=0.6&y=0.45"))
-    moved = np.array([0.1, 0.05]) * window["side_m"] + window["offset_en_m"]
-    there = FRAME.en_from_latlon(found["lat_deg"], found["lon_deg"])
-    assert there == pytest.approx(np.array(PLACES_EN_M[0]) + moved, abs=0.01)
-    assert (
-        found["height_m"] is None
-        and found["ellipse_95"]["major_m"] >= found["ellipse_95"]["minor_m"] > 1
-    )
-    assert list(found["ellipse_95"]) == ["major_m", "minor_m", "direction_deg"]
-    assert ask("/api/views/0/ground?x=0&y=0")[0] == 404  # outside the picture
-    assert ask(f"/api/views/{NO_FIX}/ground?x=0.5&y=0.5")[0] == 404
-    assert ask("/api/views/0/ground?x=nan&y=2")[0] == 400
-
-
 @pytest.mark.parametrize(
     "path",
     [

@@ -106,17 +106,14 @@ NEGLIGIBLE = 1e-9
 
 
 def predicted_along(
-    area: Area,
-    bands_m: Sequence[float],
-    conditions: Conditions,
-    predict: Callable[[Array], Prediction],
+    area: Area, conditions: Conditions, predict: Callable[[Array], Prediction]
 ) -> Along:
     """Predictions along the route of an area.
 
-    `bands_m` is the width of the band of every leg; `predict` takes places (N, 2) and returns a
-    probability of 0 and an error of NaN beyond the map.
+    `predict` takes places (N, 2) and returns a probability of 0 and an error of NaN beyond the map.
     """
     assert area.route is not None
+    bands_m = area.route.bands_m(area.band_m) or (area.band_m,)
     line = area.route.points_en_m(area.frame)
     ends_m = np.cumsum(np.hypot(*np.diff(line, axis=0).T))
     length_m = float(ends_m[-1]) if len(ends_m) else 0.0
@@ -288,12 +285,16 @@ def _mean(found: Findings, where: str) -> Reason:
     return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
 
 
+def _word(value: float, go: float, no_go: float) -> Word:
+    if value > no_go:
+        return Word.NO_GO
+    return Word.MARGINAL if value > go else Word.GO
+
+
 def _outside(fraction: float) -> list[Reason]:
-    if fraction <= GO_OUTSIDE:
-        return []
-    word = Word.NO_GO if fraction > NO_GO_OUTSIDE else Word.MARGINAL
+    word = _word(fraction, GO_OUTSIDE, NO_GO_OUTSIDE)
     text = f"{100 * fraction:.0f} % of the route is outside the map. Limit: {100 * GO_OUTSIDE:g} %."
-    return [Reason("outside_map", text, word)]
+    return [] if word is Word.GO else [Reason("outside_map", text, word)]
 
 
 def _drift(along: Along, allowed_m: float | None) -> Reason:
@@ -303,8 +304,7 @@ def _drift(along: Along, allowed_m: float | None) -> Reason:
     text += f"at km {along.distance_m[worst] / 1000:.1f}."
     if allowed_m is not None:
         text += f" Limit: {allowed_m:.0f} m (--prior-std-m)."
-        if drift_m > allowed_m:
-            word = Word.NO_GO if drift_m > TOO_FAR * allowed_m else Word.MARGINAL
+        word = _word(drift_m, allowed_m, TOO_FAR * allowed_m)
     return Reason("drift", text, word)
 
 

@@ -37,18 +37,6 @@ class Word(Enum):
         return {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}[self]
 
 
-DEFAULT_SPEED_MPS = 20.0
-"""Cruise speed of a small fixed-wing aircraft."""
-DEFAULT_DRIFT = 0.03
-"""Dead reckoning with an airspeed sensor and a known wind is usually off by 2 to 5 %."""
-DEFAULT_RELIEF_M = 3.0
-"""Height of houses and trees in open country, one standard deviation."""
-
-DEFAULT_TILT_STD_DEG = 1.5
-"""Unreported pitch and roll: a good mount and attitude. Drones that report a level gimbal
-were tilted by up to 9 deg."""
-
-
 @dataclass(frozen=True)
 class CheckedInputs:
     """What was checked, as text for reports; empty where it does not apply.
@@ -81,11 +69,14 @@ class CheckRequest:
     `agl_std`: standard deviation of the reported height, a fraction of it, 0 to 0.5.
     `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
     `accept`: confidence that a fix needs, 0.01 to 0.999.
-    `drift`: error of dead reckoning per metre flown, 0 to 1.
-    `relief_m`: standard deviation of the height of houses and trees.
+    `speed_mps`: ground speed; 20 m/s is the cruise of a small fixed-wing aircraft.
+    `drift`: error of dead reckoning per metre flown, 0 to 1; with an airspeed sensor and a known
+    wind usually 0.02 to 0.05.
+    `relief_m`: standard deviation of the height of houses and trees; 3 m in open country.
     `effort`: factor on the number of trials, 0.05 to 50.
     `workers`: processes; None: one per core.
-    `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
+    `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20; drones
+    that report a level gimbal were tilted by up to 9 deg.
     `other_sensor`: the camera differs from the map's sensor by more than years do.
     `changes`: ground that changed since the map was made, as a flight saw it.
     """
@@ -100,13 +91,13 @@ class CheckRequest:
     agl_std: float = 0.05
     prior_std_m: float | None = DEFAULT_PRIOR_STD_M
     accept: float = CONFIDENT
-    speed_mps: float = DEFAULT_SPEED_MPS
-    drift: float = DEFAULT_DRIFT
-    relief_m: float = DEFAULT_RELIEF_M
+    speed_mps: float = 20.0
+    drift: float = 0.03
+    relief_m: float = 3.0
     effort: float = 1.0
     workers: int | None = None
     seed: int = 1
-    tilt_std_deg: float = DEFAULT_TILT_STD_DEG
+    tilt_std_deg: float = 1.5
     other_sensor: bool = False
     recalibration: Recalibration = LEARNT
     changes: ChangedGround | None = None
@@ -117,22 +108,21 @@ class CheckRequest:
         if self.other_sensor and self.other_date is not None:
             raise CheckError("--other-sensor is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {
-            "height above ground": (self.agl_m, 1.0, 50_000.0, "m"),
-            "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, "deg"),
-            "agl_std": (self.agl_std, 0.0, 0.5, "(a fraction of the height: 0.05 is 5 %)"),
-            "prior_std_m": (self.prior_std_m, 0.0, 1e6, "m"),
+            "height above ground": (self.agl_m, 1.0, 50_000.0, " m"),
+            "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, " deg"),
+            "agl_std": (self.agl_std, 0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
+            "prior_std_m": (self.prior_std_m, 0.0, 1e6, " m"),
             "accept": (self.accept, 0.01, 0.999, ""),
-            "speed_mps": (self.speed_mps, 0.1, 10_000.0, "m/s"),
-            "drift": (self.drift, 0.0, 1.0, "(metres per metre flown: 0.03 is 3 %)"),
-            "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, "deg"),
-            "relief_m": (self.relief_m, 0.0, 1000.0, "m"),
+            "speed_mps": (self.speed_mps, 0.1, 10_000.0, " m/s"),
+            "drift": (self.drift, 0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
+            "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, " deg"),
+            "relief_m": (self.relief_m, 0.0, 1000.0, " m"),
             "effort": (self.effort, 0.05, 50.0, ""),
-            "workers": (self.workers, 1, 1000, "processes"),
+            "workers": (self.workers, 1, 1000, " processes"),
             "seed": (self.seed, 0, 2**63, ""),
         }
         for name, (value, low, high, unit) in limits.items():
             if value is not None and not low <= value <= high:
-                unit = f" {unit}" if unit else ""
                 raise CheckError(f"{name} must be {low:g} to {high:g}{unit}, got {value}")
 
 
@@ -160,19 +150,13 @@ class Conditions:
     @classmethod
     def of(cls, request: CheckRequest, agl_m: float, radius_m: float) -> "Conditions":
         camera = request.camera
+        names = ("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift")
         return cls(
             width_m=agl_m * camera.width_px / camera.fx_px,
             height_m=agl_m * camera.height_px / camera.fy_px,
             agl_m=agl_m,
-            yaw_std_deg=request.yaw_std_deg,
-            agl_std=request.agl_std,
-            prior_std_m=request.prior_std_m,
-            accept=request.accept,
             radius_m=radius_m,
-            speed_mps=request.speed_mps,
-            drift=request.drift,
-            tilt_std_deg=request.tilt_std_deg,
-            other_sensor=request.other_sensor,
+            **{name: getattr(request, name) for name in (*names, "tilt_std_deg", "other_sensor")},
         )
 
     @property
@@ -206,8 +190,8 @@ class Cells(Prediction):
 
 CELL_VALUES = {
     "probability": "probability of a correct, confident fix of one view",
-    "low": "lower end of its 80 % interval",
-    "high": "upper end of its 80 % interval",
+    "low": "probability, lower end of its 80 % interval",
+    "high": "probability, upper end of its 80 % interval",
     "error_m": "expected error of such a fix, root mean square, metres",
     "wrong": "fraction of trials that were false fixes",
     "trials": "number of views tried",
@@ -333,10 +317,8 @@ def summarize(result: CheckResult) -> dict[str, Any]:
         # Length of the route (N,) that each of its points represents.
         lengths_m = np.gradient(along.distance_m) if route_m else np.ones(len(along.distance_m))
         lengths_m[[0, -1]] /= 2 if route_m else 1
-        known = np.isfinite(along.probability)
-        confident = np.where(known, along.probability, 0.0) >= CONFIDENT
-        likely = float(lengths_m[confident].sum() / lengths_m.sum()) if known.any() else math.nan
-        error_m = _rms(along.error_m, lengths_m * np.nan_to_num(along.probability))
+        likely = float(lengths_m[along.probability >= CONFIDENT].sum() / lengths_m.sum())
+        error_m = _rms(along.error_m, lengths_m * along.probability)
     longest = max(stretches, key=lambda each: each.length_m, default=None)
     return {
         "area_km2": result.area_km2,

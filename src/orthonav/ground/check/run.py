@@ -57,7 +57,7 @@ FEWEST_TRIALS = 40
 MASK_PX = 2048
 """The coverage of the map is read at the finest level no larger than this."""
 _REDRAWS = 6
-_PROBES_ACROSS, _PROBES_PER_BAND, _MAX_POINTS = 400, 4, 1_000_000
+_MAX_POINTS = 500_000
 
 
 def check_map(
@@ -96,7 +96,6 @@ class _Check:
         agl_m = request.agl_m or self.sheet.grid.tile_m / min(request.camera.extent)
         self.conditions = Conditions.of(request, agl_m, registration.radius_m)
         self._require_views()
-        self.bands_m = self._leg_bands_m()
         self.area = self._area()
         if request.other_date is not None:
             require_overlap(request.other_date, self.sheet)
@@ -116,26 +115,24 @@ class _Check:
                 f"views do not fit on the map: {footprint}; fly lower, or build a larger map"
             )
 
-    def _leg_bands_m(self) -> tuple[float, ...]:
-        route, band_m = self.request.route, self.request.band_m
-        if route is None:
-            return ()
-        if band_m is None:
-            band_m = default_band_m(self.conditions.side_m, self.request.prior_std_m)
-        Area.from_route(route, band_m)  # which raises for bands that are too narrow or too long
-        return route.bands_m(band_m) or ()
-
     def _area(self) -> Area | None:
-        route = self.request.route
-        if route is None:
+        """The bands of the route, at least half a view wide."""
+        request, side_m = self.request, self.conditions.side_m
+        if request.route is None:
             return None
-        line = route.points_en_m(self.sheet.frame)
-        least_m = MIN_BAND_VIEWS * self.conditions.side_m
-        bands_m = tuple(max(each, least_m) for each in self.bands_m)
+        band_m = request.band_m
+        if band_m is None:
+            band_m = default_band_m(side_m, request.prior_std_m)
+        Area.from_route(request.route, band_m)  # which raises for a width of 0 or a route too long
+        bands_m = tuple(
+            max(each, MIN_BAND_VIEWS * side_m) for each in request.route.bands_m(band_m) or ()
+        )
+        line = request.route.points_en_m(self.sheet.frame)
         half = max(bands_m) / 2
         (west, south), (east, north) = line.min(axis=0) - half, line.max(axis=0) + half
         extent = (float(west), float(south), float(east), float(north))
-        return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
+        route = replace(request.route, leg_bands_m=bands_m)
+        return Area(self.sheet.frame, extent, route, half * 2)
 
     def result(self) -> CheckResult:
         request, conditions, frame = self.request, self.conditions, self.sheet.frame
@@ -148,10 +145,8 @@ class _Check:
             for each in (cells.probability, cells.low, cells.changed)
         )
         stretches = () if along is None else blind_stretches(along, conditions)
+        outside = 0.0 if along is None else np.mean(~self.coverage.covers(along.points_en_m))
         lookalikes = found_lookalikes([*own, *other], frame, conditions)
-        outside = 0.0
-        if along is not None:
-            outside = float(1 - self.coverage.covers(along.points_en_m).mean())
         findings = Findings(
             along,
             stretches,
@@ -161,7 +156,7 @@ class _Check:
             calibrated=self.calibrated,
             wrong=int(predictor.wrong.sum()),
             trials=len(own) + len(other),
-            outside=outside,
+            outside=float(outside),
             changed=changed,
             allowed_m=request.prior_std_m,
             predicted_px=None if other else conditions.side_m / self.sheet.grid.gsd_m,
@@ -286,11 +281,10 @@ class _Check:
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:
             return None
-
-        def predict(points: Array) -> Prediction:
-            return self._predict(predictor, points, self.coverage.covers(points))
-
-        return predicted_along(self.area, self.bands_m, self.conditions, predict)
+        covers = self.coverage.covers
+        return predicted_along(
+            self.area, self.conditions, lambda at: self._predict(predictor, at, covers(at))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,10 +346,7 @@ def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
     if area is None:
         return coverage.area_m2
     west, south, east, north = area.extent_en_m
-    side_m = max(east - west, north - south) / _PROBES_ACROSS
-    if area.route is not None:
-        side_m = min(side_m, min(area.route.bands_m(area.band_m) or (1.0,)) / _PROBES_PER_BAND)
-    side_m = max(side_m, math.sqrt((east - west) * (north - south) / _MAX_POINTS))
+    side_m = math.sqrt((east - west) * (north - south) / _MAX_POINTS)
     points = CellGrid.over(area.extent_en_m, side_m).centres_en_m
     count = np.count_nonzero(area.contains(points) & coverage.covers(points))
     if not count:

@@ -67,24 +67,27 @@ def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArr
 
 
 def crop_around(
-    layer: GreyPyramid, grid: TileGrid, en_m: Points, size: int, level: int
+    read: Callable[[int, int, int], tuple[Grey, NDArray[np.bool_]]],
+    grid: TileGrid,
+    en_m: Points,
+    size: int,
+    gsd_m: float,
 ) -> tuple[Grey, NDArray[np.bool_], Points] | None:
     """Grey, valid and the exact centre of a square crop; None where too little of it has imagery.
 
-    The crop is `size` pixels of the level wide, plus `MARGIN_PX` on each side. `layer` is in the
-    plane of the checked map, whose tile grid is `grid`.
+    The crop is `size` pixels of `gsd_m` wide, plus `MARGIN_PX` on each side. `read` takes row,
+    column and side of a square in such pixels of the sheet, which may reach beyond it.
     """
-    unit_m = grid.gsd_m * 2**level
     whole = size + 2 * MARGIN_PX
-    col = round((en_m[0] - grid.west_m) / unit_m - whole / 2)
-    row = round((grid.north_m - en_m[1]) / unit_m - whole / 2)
-    grey, valid = layer.read(level, row, col, whole, whole)
+    col = round((en_m[0] - grid.west_m) / gsd_m - whole / 2)
+    row = round((grid.north_m - en_m[1]) / gsd_m - whole / 2)
+    grey, valid = read(row, col, whole)
     if valid[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX].mean() < MIN_VALID:
         return None
     if not valid.all():
         grey = np.where(valid, grey, np.uint8(grey[valid].mean()))
-    east = grid.west_m + (col + whole / 2) * unit_m
-    north = grid.north_m - (row + whole / 2) * unit_m
+    east = grid.west_m + (col + whole / 2) * gsd_m
+    north = grid.north_m - (row + whole / 2) * gsd_m
     return grey, valid, np.array([east, north])
 
 
@@ -100,47 +103,6 @@ def mirrored_donor(rng: np.random.Generator, layer: GreyPyramid, size: int, leve
     else:
         grey = np.where(valid, grey, np.uint8(128))
     return np.ascontiguousarray(grey[:, ::-1])
-
-
-class OrthoPyramid:
-    """Grey levels of an orthophoto in the plane and at the resolutions of a map's sheet. Not safe
-    to share between threads."""
-
-    def __init__(self, path: Path, sheet: SheetInfo, levels: int) -> None:
-        self.levels = levels
-        self._sheet, self._mosaic = sheet, Mosaic.open([path])
-        self._opened: dict[int, SheetRaster] = {}
-        self._stack = ExitStack()
-
-    def close(self) -> None:
-        self._stack.close()
-        self._opened.clear()
-
-    def shape(self, level: int) -> tuple[int, int]:
-        return level_shape(self._sheet.grid.height_px, self._sheet.grid.width_px, level)
-
-    def read(
-        self, level: int, row: int, col: int, height: int, width: int
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of a window, which may reach beyond the sheet."""
-        pixels = self._raster(level).read_grey(col, row, width, height)
-        return pixels.grey, pixels.valid
-
-    def _raster(self, level: int) -> SheetRaster:
-        if level not in self._opened:
-            grid = self._sheet.grid
-            rows, cols = self.shape(level)
-            raster = self._mosaic.sheet(
-                self._sheet.frame,
-                west_m=grid.west_m,
-                north_m=grid.north_m,
-                width_px=cols,
-                height_px=rows,
-                gsd_m=grid.gsd_m * 2**level,
-                threads=1,  # trials run in several processes
-            )
-            self._opened[level] = self._stack.enter_context(raster)
-        return self._opened[level]
 
 
 def require_overlap(path: Path, sheet: SheetInfo) -> None:
@@ -339,22 +301,47 @@ class Trier:
         return registration_of(open_map(self._request.map_path))
 
     @cached_property
-    def _other(self) -> OrthoPyramid:
-        path, registration = self._request.other_date, self._registration
+    def _final_level(self) -> int:
+        registration = self._registration
+        side_px = self._conditions.side_m / registration.grid.gsd_m
+        return Levels.of(side_px, registration.pyramid.levels).final
+
+    @property
+    def _level(self) -> int:
+        """One level finer than the final one, where ambiguous views are registered too."""
+        return max(self._final_level - 1, 0)
+
+    @cached_property
+    def _other(self) -> SheetRaster:
+        """The second date in the plane of the sheet, at the resolution of the level."""
+        grid, path = self._registration.grid, self._request.other_date
         assert path is not None
-        other = OrthoPyramid(path, registration.sheet, registration.pyramid.levels)
-        return self._files.enter_context(closing(other))
+        rows, cols = level_shape(grid.height_px, grid.width_px, self._level)
+        raster = Mosaic.open([path]).sheet(
+            self._registration.sheet.frame,
+            west_m=grid.west_m,
+            north_m=grid.north_m,
+            width_px=cols,
+            height_px=rows,
+            gsd_m=grid.gsd_m * 2**self._level,
+            threads=1,  # trials run in several processes
+        )
+        return self._files.enter_context(raster)
+
+    def _read_own(self, row: int, col: int, side: int) -> tuple[Grey, NDArray[np.bool_]]:
+        return self._registration.pyramid.read(self._level, row, col, side, side)
+
+    def _read_other(self, row: int, col: int, side: int) -> tuple[Grey, NDArray[np.bool_]]:
+        pixels = self._other.read_grey(col, row, side, side)
+        return pixels.grey, pixels.valid
 
     def _trial(self, rng: np.random.Generator, second_date: bool, en_m: Points) -> Trial | None:
         registration, request, conditions = self._registration, self._request, self._conditions
-        grid = registration.grid
-        # One level finer than the final one, where ambiguous views are registered too.
-        final = Levels.of(conditions.side_m / grid.gsd_m, registration.pyramid.levels).final
-        level = max(final - 1, 0)
-        gsd_m = grid.gsd_m * 2**level
+        level = self._level
+        gsd_m = registration.grid.gsd_m * 2**level
         size = math.ceil(math.hypot(conditions.width_m, conditions.height_m) / gsd_m) + 4
-        layer = self._other if second_date else registration.pyramid
-        crop = crop_around(layer, grid, en_m, size, level)
+        read = self._read_other if second_date else self._read_own
+        crop = crop_around(read, registration.grid, en_m, size, gsd_m)
         if crop is None:
             return None
         grey, valid, place = crop
@@ -368,7 +355,9 @@ class Trier:
         picture = np.where(lasting, grey[inner], donor)
         expected = math.nan
         if not second_date:
-            maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
+            maps = [
+                each[inner] for each in reported_persistence(grey, gsd_m, self._final_level - level)
+            ]
             expected = float(np.mean([each.mean() for each in maps[:2]]))
             picture = another_year(rng, picture, donor, maps)
         if request.relief_m > 0:

@@ -28,7 +28,7 @@ from orthonav.ground.evaluate.tables import (
     verdict,
     wrong_bound_text,
 )
-from orthonav.ground.report.numbers import measure_text, percent_text, plain_text
+from orthonav.ground.report import measure_text, percent_text, plain_text
 from orthonav.ground.report.page import Figure, file_names, render, write_page
 
 _N_WORST = 10

@@ -25,8 +25,8 @@ from orthonav.ground.evaluate.metrics import (
     wrong_key,
 )
 from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
+from orthonav.ground.report import aligned, measure_text, percent_text, plain_text, to_plain
 from orthonav.ground.report.drawing import Background
-from orthonav.ground.report.numbers import aligned, measure_text, percent_text, plain_text, to_plain
 
 Plain = dict[str, Any]
 _COLUMNS = (

@@ -16,15 +16,12 @@ from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.geo.camera import (
     Camera,
     axis_on_ground_en_m,
-    enu_from_camera,
     footprint_en_m,
-    seen_px,
 )
 from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
 from orthonav.core.localize.view import check_telemetry
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View, ViewResult
 
 MIN_PX, MAX_PX = 256, 1024
@@ -95,20 +92,6 @@ def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindo
     return GroundWindow(side_m, size_px, axis)
 
 
-def image_px(
-    telemetry: Telemetry, camera: Camera, window: GroundWindow, place: tuple[float, float]
-) -> tuple[float, float]:
-    """The image point of a place in the window of a view, shares from the left and the top; the
-    inverse of `rectified`. Raises `FlightError` where the view does not show it."""
-    east = window.offset_en_m[0] + (place[0] - 0.5) * window.side_m
-    north = window.offset_en_m[1] + (0.5 - place[1]) * window.side_m
-    down = enu_from_camera(telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg)
-    x, y = seen_px(camera, np.array([east, north, -telemetry.agl_m]) @ down).tolist()
-    if not (0 <= x <= camera.width_px and 0 <= y <= camera.height_px):  # also where it is NaN
-        raise FlightError("the view does not show this place")
-    return x, y
-
-
 def rectified(
     grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow
 ) -> tuple[Grey, Mask]:
@@ -148,7 +131,6 @@ class SheetImagery:
     def __init__(self, opened: MapFile) -> None:
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
-        self.terrain = TerrainLayer.of(opened)
         self._layer = GreyLayer.of(opened)
         self.preview = b""
         drawn = "preview_jpeg" if self._layer is None else "grey/bytes"

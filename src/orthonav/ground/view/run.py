@@ -9,6 +9,7 @@ import math
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +29,17 @@ from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult, error_ellipse
 from orthonav.ground.evaluate.metrics import FAR_M, check_truth, warn_of_another_run
 from orthonav.ground.recordings.flightlog import is_flight_log
-from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
+from orthonav.ground.report import to_plain
 from orthonav.ground.report.imagery import (
     GroundWindow,
     SheetImagery,
     as_fixed,
-    image_px,
     jpeg,
     png,
     rectified,
     shrunk,
     window_of,
 )
-from orthonav.ground.report.numbers import to_plain
 from orthonav.ground.view.feed import Batch, LineFeed, LogReader, Shot
 
 Array = NDArray[np.float64]
@@ -143,7 +142,7 @@ class Run:
         found: dict[str, Any] = {
             "index": index,
             "frame": result.frame,
-            "time_s": _seconds(result.time_ns),
+            "time_s": str(Decimal(result.time_ns).scaleb(-9)),  # JavaScript rounds numbers
             "state": result.state,
             "evidence": {str(name): value for name, value in outcome.evidence.items()},
         }
@@ -183,22 +182,6 @@ class Run:
         window = self._placed(result)[2]
         box = window.box_at(np.asarray(self.sheet.frame.en_from_latlon(*place)))
         return png(*self.sheet.crop(box, (window.size_px, window.size_px)))
-
-    def ground(self, index: int, x: float, y: float) -> dict[str, Any]:
-        result = self._result(index)
-        fix = result.outcome
-        if not isinstance(fix, Fix):
-            raise FlightError(f"view {result.frame} has no position")
-        shot, telemetry, window = self._placed(result)
-        px = image_px(telemetry, shot.camera, window, (x, y))
-        found = locate_pixel(shot.camera, shot.telemetry, fix, px, self.sheet.terrain)
-        return {
-            "lat_deg": found.lat_deg,
-            "lon_deg": found.lon_deg,
-            "height_m": to_plain(found.height_m),
-            "ellipse_95": ellipse_95(found.cov_en_m2),
-            "confident": result.is_confident,
-        }
 
     def _result(self, index: int) -> ViewResult:
         with self._lock:
@@ -351,12 +334,6 @@ def _ellipses(fixes: Sequence[Fix | None]) -> Array:
     unknown = np.full((2, 2), math.nan)
     found = [error_ellipse(unknown if fix is None else fix.cov_en_m2) for fix in fixes]
     return np.array(found, np.float64).reshape(-1, 3)
-
-
-def _seconds(time_ns: int) -> str:
-    """Decimal seconds with all nanoseconds, as text: JavaScript's numbers cannot hold them."""
-    whole, rest = divmod(abs(time_ns), 10**9)
-    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
 
 
 def open_run(request: ViewRequest) -> Run:

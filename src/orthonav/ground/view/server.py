@@ -11,7 +11,7 @@ import logging
 import re
 import socket
 import socketserver
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -90,19 +90,14 @@ class Pages:
     def __init__(self, run: Run, assets: dict[str, Response]) -> None:
         self._run, self._assets = run, assets
 
-        def png(data: bytes) -> Response:
-            return Response(HTTPStatus.OK, data, "image/png")
-
-        def raw(data: bytes) -> Response:
-            return Response(HTTPStatus.OK, data, "image/jpeg")
-
+        png = partial(Response, HTTPStatus.OK, media_type="image/png")
+        raw = partial(Response, HTTPStatus.OK, media_type="image/jpeg")
         number = r"(\d{1,9})"
         view = rf"/api/views/{number}"
         self._routes: dict[str, Callable[..., Response]] = {
             r"/api/run": lambda query: _json(run.summary()),
             r"/api/news": self._news,
             view: lambda i, query: _json(run.detail(int(i))),
-            rf"{view}/ground": self._ground,
             rf"{view}/view\.png": lambda i, query: png(run.view_png(int(i))),
             rf"{view}/raw\.jpg": lambda i, query: raw(run.raw_jpeg(int(i))),
             rf"{view}/map-(fix|truth)\.png": lambda i, at, query: png(run.map_png(int(i), at)),
@@ -134,14 +129,11 @@ class Pages:
             return _error(HTTPStatus.BAD_REQUEST, str(error))
 
     def _news(self, query: str) -> Response:
-        names = ("generation", "views", "health")
-        asked = _fields(query, names, r"\d{1,9}", "0", "generation, views and health are numbers")
+        fields = parse_qs(query, max_num_fields=10)
+        asked = [fields.get(name, ["0"])[0] for name in ("generation", "views", "health")]
+        if not all(re.fullmatch(r"\d{1,9}", each) for each in asked):
+            raise ValueError("generation, views and health are numbers")
         return _json(self._run.news(*map(int, asked)))
-
-    def _ground(self, index: str, query: str) -> Response:
-        share = r"0(\.\d{1,9})?|1(\.0{1,9})?"
-        asked = _fields(query, ("x", "y"), share, "", "x and y must be fractions, 0 to 1")
-        return _json(self._run.ground(int(index), *map(float, asked)))
 
     def _tile(self, level: str, col: str, row: str, query: str) -> Response:
         found = self._run.sheet.tile(int(level), int(col), int(row))
@@ -153,16 +145,6 @@ class Pages:
         if not self._run.sheet.preview:
             return _error(HTTPStatus.NOT_FOUND, "the map has tiles")
         return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg", _CACHED)
-
-
-def _fields(
-    query: str, names: Sequence[str], pattern: str, default: str, expected: str
-) -> list[str]:
-    fields = parse_qs(query, max_num_fields=10)
-    asked = [fields.get(name, [default])[0] for name in names]
-    if not all(re.fullmatch(pattern, each) for each in asked):
-        raise ValueError(expected)
-    return asked
 
 
 def _json(plain: Any) -> Response:

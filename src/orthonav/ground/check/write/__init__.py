@@ -5,7 +5,6 @@ self-contained file, also for print; without JavaScript it lacks map and profile
 """
 
 import json
-import math
 from hashlib import sha256
 from pathlib import Path
 
@@ -33,8 +32,8 @@ from orthonav.ground.check.write.wording import (
     stretch_row,
     verdict_sentence,
 )
+from orthonav.ground.report import BY_UNIT, metres_text, to_plain
 from orthonav.ground.report.imagery import Box, Grey, SheetImagery, jpeg
-from orthonav.ground.report.numbers import BY_UNIT, metres_text, to_plain
 from orthonav.ground.report.page import (
     FOLDER,
     LIST,
@@ -65,21 +64,14 @@ _SCRIPTS = ("data.js", "map.js", "profile.js", "page.js")
 MAX_ROWS = 200
 MAX_LOOKALIKES = 20
 """Shown on map and page, the most similar ones; the files hold all."""
-LAYERS = {
-    "probability": "probability of a fix",
-    "low": "probability, lower end of its interval",
-    "error_m": "expected error of a fix",
-    "wrong": "rate of false fixes",
-    "persistence": "expected persistence of the ground",
-    "changed": "changed since the map was made",
-}
+LAYERS = ("probability", "low", "error_m", "wrong", "persistence", "changed")
 DOWNLOADS = {
     "check.geojson": "GeoJSON: route, gaps, cells, ambiguous places",
     "check.tif": "GeoTIFF: a band per layer of the map",
     "check.json": "JSON: all results and conditions",
 }
-MAX_SIDE_PX, MAX_AREA_PX = 2000, 2_000_000
-"""Limits of the image: its longer side, and its area."""
+MAX_SIDE_PX = 1500
+"""Of the image of the map: 0.5 to 1.5 MB."""
 _MARGIN = 0.04
 _EMPTY = 226
 """Grey level without imagery, as light as a light page."""
@@ -140,7 +132,7 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
     about = result.about
     script, style = load_leaflet()
     scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
-    grey, box = map_image(opened, visible_box(result.cells))
+    image = map_image(opened, visible_box(result.cells))
     values = {
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
         "kind": "Check before take-off",
@@ -149,7 +141,7 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "sentence": verdict_sentence(result),
         "cards": key_figures(result),
         "note": "" if result.second_date else SIMULATED,
-        "layers": LAYERS,
+        "layers": {name: CELL_VALUES[name] for name in LAYERS},
         "gap_columns": GAP_COLUMNS,
         "stretches": [
             stretch_row(number, each) for number, each in enumerate(result.stretches, start=1)
@@ -161,8 +153,8 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "conditions": conditions_text(result.conditions, result.band_m),
         "downloads": DOWNLOADS,
         "checked": _checked(result, json_sha256),
-        "data": _page_data(result, box),
-        "image": data_url(jpeg(grey, _QUALITY), "image/jpeg"),
+        "data": _page_data(result),
+        "image": data_url(jpeg(image, _QUALITY), "image/jpeg"),
     }
     style += static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
@@ -198,7 +190,7 @@ def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
     ]
 
 
-def _page_data(result: CheckResult, image_box: Box) -> str:
+def _page_data(result: CheckResult) -> str:
     """JSON for the scripts: `check.json`, and under `drawn` positions in metres. Of the cells, only
     those of which something is known, by number (row after row).
 
@@ -211,7 +203,6 @@ def _page_data(result: CheckResult, image_box: Box) -> str:
     most_wrong = float(np.nanmax(cells.wrong, initial=0.0, where=np.isfinite(cells.wrong)))
     drawn = {
         "box": visible_box(cells),
-        "image": image_box,
         "values": list(CELL_VALUES),
         "most": {
             "error_m": float(f"{max(most_m, 1.0):.2g}"),
@@ -245,19 +236,12 @@ def visible_box(cells: Cells) -> Box:
     )
 
 
-def map_image(opened: MapFile, box: Box) -> tuple[Grey, Box]:
-    """The imagery of the map within a box, and the part of the box that it covers."""
+def map_image(opened: MapFile, box: Box) -> Grey:
+    """The imagery of the map within a box, north up."""
     sheet = SheetImagery(opened)
-    limits = np.array(sheet.grid.extent_en_m)
-    low, high = np.tile(limits[:2], 2), np.tile(limits[2:], 2)
-    west, south, east, north = (float(edge) for edge in np.clip(box, low, high))
-    width_m, height_m = east - west, north - south
-    gsd_m = max(
-        sheet.grid.gsd_m,
-        max(width_m, height_m) / MAX_SIDE_PX,
-        math.sqrt(width_m * height_m / MAX_AREA_PX),
-    )
-    size = max(1, round(width_m / gsd_m)), max(1, round(height_m / gsd_m))
-    grey, valid = sheet.crop((west, south, east, north), size)
+    west, south, east, north = box
+    gsd_m = max(sheet.grid.gsd_m, max(east - west, north - south) / MAX_SIDE_PX)
+    size = max(1, round((east - west) / gsd_m)), max(1, round((north - south) / gsd_m))
+    grey, valid = sheet.crop(box, size)
     grey[~valid] = _EMPTY
-    return grey, (west, south, east, north)
+    return grey

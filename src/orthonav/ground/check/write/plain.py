@@ -15,12 +15,10 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.changes.record import lonlat
 from orthonav.ground.check.records import CELL_VALUES, Along, Cells, CheckResult, summarize
-from orthonav.ground.report.numbers import BY_UNIT, to_plain
+from orthonav.ground.report import BY_UNIT, to_plain
 
 FORMAT, VERSION = "orthonav-check", 1
 _LATLON_DIGITS = 7
-_STEP_M = 1000.0
-"""Legs get a vertex at least this often: they are straight in the plane, not in degrees."""
 
 Array = NDArray[np.float64]
 Plain = dict[str, Any]
@@ -95,23 +93,22 @@ def _cells_to_plain(frame: LocalFrame, cells: Cells) -> Plain:
 
 def _route_to_plain(result: CheckResult) -> Plain | None:
     along = result.along
-    if along is None and result.route_en_m is None:
+    if along is None or result.route_en_m is None:
         return None
-    found: Plain = to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT)
-    if result.route_en_m is not None:
-        found["waypoints_latlon_deg"] = _latlon_deg(result.frame, result.route_en_m)
-    if along is not None:
-        lat, lon = result.frame.latlon_from_en(along.points_en_m)
-        names = ("probability", "low", "high", "across_low", "error_m", "drift_m")
-        points = {
-            "distance_m": along.distance_m,
-            "time_s": along.distance_m / result.conditions.speed_mps,
-            "lat_deg": lat,
-            "lon_deg": lon,
-            **{name: getattr(along, name) for name in names},
-        }
-        found["points"] = to_plain(points, BY_UNIT)
-    return found
+    lat, lon = result.frame.latlon_from_en(along.points_en_m)
+    names = ("probability", "low", "high", "across_low", "error_m", "drift_m")
+    points = {
+        "distance_m": along.distance_m,
+        "time_s": along.distance_m / result.conditions.speed_mps,
+        "lat_deg": lat,
+        "lon_deg": lon,
+        **{name: getattr(along, name) for name in names},
+    }
+    return {
+        **to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT),
+        "waypoints_latlon_deg": _latlon_deg(result.frame, result.route_en_m),
+        "points": to_plain(points, BY_UNIT),
+    }
 
 
 def _latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
@@ -142,7 +139,10 @@ def features(result: CheckResult) -> Iterator[Plain]:
         geometry = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in ends]}
         yield _as_feature("lookalikes", geometry, properties)
     if result.route_en_m is not None:
-        yield from _plan_features(frame, result.route_en_m)
+        legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
+        for i, point in enumerate(result.route_en_m):
+            properties = {"number": i + 1, "distance_m": round(float(legs_m[:i].sum()), 2)}
+            yield _feature(frame, "waypoints", "Point", point[None], properties)
 
 
 def _cell_features(result: CheckResult) -> Iterator[Plain]:
@@ -173,23 +173,6 @@ def _route_features(result: CheckResult, along: Along) -> Iterator[Plain]:
         }
         line = along.points_en_m[pair]
         yield _feature(result.frame, "route", "LineString", line, to_plain(properties, BY_UNIT))
-
-
-def _plan_features(frame: LocalFrame, waypoints: Array) -> Iterator[Plain]:
-    steps = np.diff(waypoints, axis=0)
-    lengths_m = np.hypot(*steps.T)
-    for i, (start, step, length_m) in enumerate(zip(waypoints, steps, lengths_m, strict=False)):
-        at = np.linspace(0, 1, max(2, int(np.ceil(length_m / _STEP_M)) + 1))
-        bearing_deg = float(np.degrees(np.arctan2(*step)) % 360)
-        properties = {
-            "number": i + 1,
-            "length_m": round(float(length_m), 2),
-            "bearing_deg": round(bearing_deg, 1),
-        }
-        yield _feature(frame, "legs", "LineString", start + at[:, None] * step, properties)
-    for i, point in enumerate(waypoints):
-        properties = {"number": i + 1, "distance_m": round(float(lengths_m[:i].sum()), 2)}
-        yield _feature(frame, "waypoints", "Point", point[None], properties)
 
 
 def _feature(

@@ -5,7 +5,7 @@ import textwrap
 
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.records import BlindStretch, CheckResult, Conditions, Word, summarize
-from orthonav.ground.report.numbers import aligned, metres_text
+from orthonav.ground.report import aligned, metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -13,8 +13,6 @@ VERDICTS = {
     Word.MARGINAL: "This {} does not meet all requirements for GO; see the reasons.",
     Word.NO_GO: "Do not rely on this map for this {}; see the reasons.",
 }
-MAX_STRETCHES = 7
-_WIDTH = 100
 GAP_COLUMNS = (
     "no.",
     "from",
@@ -141,7 +139,7 @@ def text(result: CheckResult) -> str:
         lines += ["", SIMULATED]
     if result.stretches:
         worst_first = sorted(result.stretches, key=lambda each: (each.recoverable, -each.length_m))
-        worst = worst_first[:MAX_STRETCHES]
+        worst = worst_first[:7]
         numbered = enumerate(result.stretches, start=1)
         rows_of_gaps = [stretch_row(number, each) for number, each in numbered if each in worst]
         lines += ["", "gaps without fixes, the worst:", *aligned([GAP_COLUMNS, *rows_of_gaps])]
@@ -151,5 +149,5 @@ def text(result: CheckResult) -> str:
 def _item(sentence: str) -> list[str]:
     """A sentence as an item of a list; "%" stays with its number."""
     joined = sentence.replace(" %", "\N{NO-BREAK SPACE}%")
-    wrapped = textwrap.wrap(joined, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    wrapped = textwrap.wrap(joined, 100, initial_indent="  - ", subsequent_indent="    ")
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in wrapped]

@@ -17,7 +17,7 @@ function makeMap() {
   map.setMaxBounds(whole.pad(0.6));
   for (const [name, order] of [["image", 200], ["cells", 250]]) map.createPane(name).style.zIndex = order;
   const image = document.getElementById("check-image");
-  L.imageOverlay(image.src, boundsOf(drawn.image), { pane: "image", alt: "" }).addTo(map);
+  L.imageOverlay(image.src, whole, { pane: "image", alt: "" }).addTo(map);
   const north = L.control({ position: "topright" });
   north.onAdd = () => {
     const arrow = make("div", "N");
