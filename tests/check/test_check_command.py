@@ -1,7 +1,6 @@
 """The whole check of a small map with real and synthetic trials, and as a command."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -145,28 +144,6 @@ def test_odd_routes(checked, frame, points, changed):
     assert (along.across_low <= along.probability).all()
     assert cells.probability.size < 300_000
     json.loads(to_json(result))
-
-
-def test_holes_of_the_map_are_unknown(untried, half_blank, opened, tmp_path, monkeypatch):
-    """The map covers a strip: around it nothing is known, and in a band the probability is 0."""
-    whole = check_run.MapCoverage.of
-
-    def holed(layer, grid):
-        ground = whole(layer, grid)
-        valid = ground.valid.copy()
-        valid[: len(valid) // 2] = False
-        return replace(ground, valid=valid)
-
-    monkeypatch.setattr(check_run.MapCoverage, "of", holed)
-    request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, prior_std_m=50.0)
-    cells = check_map(request)[0].cells
-    assert cells.north_m < 30 and np.nanmax(cells.probability) > 0.8
-    frame = opened.manifest.sheets[0].frame
-    banded = replace(request, route=route_of(frame, [[-200, -200], [-200, 200]]), band_m=100.0)
-    result = check_map(banded)[0]
-    assert result.along.probability[0] > 0.8 and result.along.probability[-1] == 0
-    middle = result.cells.probability[:, result.cells.probability.shape[1] // 2]
-    assert (middle[:4] == 0).all() and (middle[-4:] > 0.5).all()
 
 
 def test_views_that_fit_on_no_map(checked, frame):

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import re
 from dataclasses import replace
 
@@ -15,12 +14,8 @@ from html_page import Page
 from orthonav.ground.check.records import CELL_VALUES
 from orthonav.ground.check.write import write_check
 from orthonav.ground.check.write.plain import check_to_plain
-from orthonav.ground.check.write.wording import probability_text
-from orthonav.ground.report import metres_text
-from orthonav.ground.report.page import static_text
 
 KINDS = {"tiny", "small_route", "nearly_empty", "evil"}
-TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 
 
 @pytest.fixture(scope="module")
@@ -156,30 +151,6 @@ def test_the_printed_page_has_map_and_profile(visit):
     assert page.locator("#map").bounding_box()["width"] < 700
 
 
-@pytest.mark.long
-def test_profile_and_map_are_linked(visit):
-    page = visit("small_route")
-    page.locator("#profile").scroll_into_view_if_needed()
-    box = page.locator("#profile").bounding_box()
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
-    assert "along the route" in page.locator("#figures").inner_text()
-    assert page.locator("#announcement").inner_text() == ""  # hovering is not announced
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 50)
-    assert "along the route" in page.locator("#announcement").inner_text()
-    before = page.locator("#along").input_value()
-    page.locator("#along").press("ArrowRight")
-    assert int(page.locator("#along").input_value()) == int(before) + 1
-    assert "probability" in page.locator("#along").get_attribute("aria-valuetext")
-    # And from the map to the profile.
-    page.locator("#map").scroll_into_view_if_needed()
-    dot = page.locator("#map path[fill='#1a1a1a']").bounding_box()
-    there = page.locator("#along").input_value()
-    page.locator("#along").fill("0")
-    page.locator("#map").scroll_into_view_if_needed()
-    page.mouse.move(dot["x"] + dot["width"] / 2, dot["y"] + dot["height"] / 2)
-    assert abs(int(page.locator("#along").input_value()) - int(there)) <= 1
-
-
 def test_the_panel_says_what_is_in_the_cell(visit, frame):
     page = visit("tiny")
     page.focus("#map")
@@ -191,31 +162,6 @@ def test_the_panel_says_what_is_in_the_cell(visit, frame):
     assert np.abs(middle - shown).min() < 0.008
     lat, lon = map(float, re.search(r"place: ([-\d.]+), ([-\d.]+)", said).groups())
     assert np.abs(frame.en_from_latlon(lat, lon)).max() < 15
-
-
-@pytest.mark.parametrize(
-    "options",
-    [TABLET, pytest.param({"viewport": {"width": 390, "height": 800}}, marks=pytest.mark.slow)],
-    ids=["tablet", "phone"],
-)
-def test_other_screens(visit, options):
-    page = visit("small_route", **options)
-    assert page.locator("html.live").count() == 1
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_scripts_write_numbers_as_python_does(browser):
-    numbers = [0, 0.04, 3.26, 9.96, 35, 50.04, 99.94, 99.97, 120.4, 9999.6, 12_345, -7.5, math.nan]
-    script = static_text("format.js").replace("export ", "")
-    page = browser.new_page()
-    texts = page.evaluate(f"() => {{ {script}; return {json.dumps(numbers)}.map(metres); }}")
-    shares = [0, 0.004, 0.126, 0.996, 0.9996, 1]
-    percents = page.evaluate(f"() => {{ {script}; return {shares}.map(percent); }}")
-    page.close()
-    assert [text.replace("\N{EN DASH}", "-") for text in texts] == [
-        metres_text(each) for each in numbers
-    ]
-    assert percents == [probability_text(each) for each in shares]
 
 
 @pytest.mark.long

@@ -82,18 +82,6 @@ def test_a_tile_is_the_chunk_of_its_place(ask):
         assert seen.any() and np.mean(off) < 6 + 3 * level
 
 
-def test_tiles_at_the_border_and_without_imagery(ask):
-    full = ask("/tiles/0/0/0")
-    assert full[1]["content-type"] == "image/jpeg" and "max-age" in full[1]["cache-control"]
-    edge = as_picture(ask("/tiles/0/2/1"))
-    assert edge.shape[:2] == (256, 700 - 512)
-    masked = ask("/tiles/0/2/2")
-    assert masked[1]["content-type"] == "image/png"
-    alpha = as_picture(masked)[..., 3]
-    assert alpha.shape == (620 - 512, 700 - 512)
-    assert alpha[:8].min() == 255 and alpha[-100:, -150:].max() == 0
-
-
 def test_a_view_lies_on_the_map_where_its_fix_has_it(ask):
     """Turned by the heading and tilted, a right one shows the ground of the map, a wrong not."""
     for i in (0, WRONG):
