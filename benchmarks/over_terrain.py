@@ -28,7 +28,7 @@ from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.render import Raster
 
 NAME = "over_terrain"
 PARTS = ("slopes", "wrong", "oblique")

@@ -92,7 +92,7 @@ def undrawn(monkeypatch):
     """Reports have no pictures, which take longest."""
     nothing = Drawing(b"", "", (1.0, 1.0))
     for name in ("draw_axes", "draw_figure"):
-        monkeypatch.setattr(f"orthonav.ground.evaluate.plots.{name}", lambda *_: nothing)
+        monkeypatch.setattr(f"orthonav.ground.evaluate.report.{name}", lambda *_: nothing)
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +269,7 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, undrawn)
     assert (done.code, done.err) == (0, "") and "fixes" in done.out and "index.html" in done.out
     names = [name for name in names_in(out) if not name.startswith("report/figures/")]
     assert names == ["metrics.json", "report", "report/figures", "report/index.html"]
-    assert (out / "report" / "figures" / "error-curve.svg").is_file()
+    assert (out / "report" / "figures" / "reliability.svg").is_file()
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["n_views"] == 30 and metrics["radius_m"] == 40
     assert metrics["acc_at_15m"] <= metrics["acc_at_40m"] and metrics["acc_at_40m"] >= 0.9

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from orthonav.core.flight import FlightFolder
     from orthonav.core.mapfile.reader import MapFile
     from orthonav.ground.changes.record import ChangedGround
-    from orthonav.ground.evaluate.contact_sheet import Row
     from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
 
@@ -62,9 +61,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FLIGHT_DIR",
-        help="flight folder with the true positions, and with the images for the worst views in "
-        "the report (with --map and --report) and for --report-changes; one for all files of "
-        "fixes, or one for each in the same order",
+        help="flight folder with the true positions, and with the images for --report-changes; one "
+        "for all files of fixes, or one for each in the same order",
     )
     add_report_changes(parser)
     parser.set_defaults(wrong_usage=parser.error)
@@ -154,18 +152,15 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
     from orthonav.core.mapfile.layer import preview
-    from orthonav.ground.evaluate.contact_sheet import worst_rows
     from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.evaluate.track import measure_gnss, measure_track
     from orthonav.ground.report.drawing import Background
-    from orthonav.ground.report.imagery import SheetImagery
 
-    sheet = SheetImagery(opened) if opened else None
-    local = sheet.frame if sheet else None
-    background = None
+    local, background = None, None
     if opened:
-        background = Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)
+        sheet = opened.manifest.sheets[0]
+        local, background = sheet.frame, Background(preview(opened), sheet.grid.extent_en_m)
     folders = [open_flight(path, images_needed=False) for path in options.flight]
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
@@ -174,9 +169,6 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         comparison = compare(known, results, local)
         check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
         warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
-        worst: tuple[Row, ...] = ()
-        if sheet and folders and options.report:
-            worst = tuple(worst_rows(comparison, results, folders[i], sheet))
         metrics = measure(comparison, options.radius_m)
         flights.append(
             FlightReport(
@@ -185,7 +177,6 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
                 metrics,
                 background,
                 measure_track(comparison, results, options.radius_m),
-                worst,
                 measure_gnss(comparison, results),
                 _view_command(options, i),
             )

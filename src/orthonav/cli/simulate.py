@@ -50,17 +50,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=0.0,
         help="radius of the arcs at the corners of the route (default 0: sharp corners)",
     )
-    number(
-        "--wind-mps",
-        help="speed of the mean wind, with gusts; the aircraft crabs along its route (default: no "
-        "wind)",
-    )
-    number("--wind-from-deg", help="direction the wind comes from (default 270, west)")
-    parser.add_argument(
-        "--beyond",
-        action="store_true",
-        help="let the route leave the imagery, which is mirrored at its border",
-    )
     parser.add_argument(
         "--camera",
         type=Path,
@@ -155,7 +144,6 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import FlightError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.simulate.flight import (
@@ -164,13 +152,9 @@ def run(options: argparse.Namespace) -> None:
         SimulateRequest,
         simulate_flight,
     )
-    from orthonav.ground.simulate.motion import Wind
     from orthonav.ground.simulate.receiver import receiver_of
     from orthonav.ground.simulate.render import ViewEffects
 
-    if options.wind_from_deg is not None and options.wind_mps is None:
-        raise FlightError("--wind-from-deg needs the speed of the wind (--wind-mps)")
-    from_deg = 270.0 if options.wind_from_deg is None else options.wind_from_deg
     dem = dem_of(options)
     request = SimulateRequest(
         orthos=options.ortho,
@@ -184,13 +168,11 @@ def run(options: argparse.Namespace) -> None:
         errors=Errors(**{each.name: getattr(options, each.name) for each in fields(Errors)}),
         effects=ViewEffects(jpeg_quality=options.jpeg_quality),
         seed=options.seed,
-        wind=None if options.wind_mps is None else Wind(options.wind_mps, from_deg),
         turn_radius_m=options.turn_radius_m,
         cloud_share=options.cloud_share,
         terrain=dem,
         terrain_posting_m=1.0 if dem is None else dem.gsd_m,
         camera_pitch_deg=options.camera_pitch_deg,
-        beyond=options.beyond,
         gnss=receiver_of(options.receiver) if options.receiver else None,
     )
     with progress(options) as shown:

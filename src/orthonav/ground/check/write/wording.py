@@ -113,7 +113,7 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
     else:
         likely = probability_text(summary["route_share_from_0_9"])
         route = f"of {metres_text(summary['route_m'])} at a probability of {CONFIDENT:g} or more"
-        worst_m, gaps = float(along.drift_m.max()), result.stretches
+        gaps = result.stretches
         longest_m = max((each.length_m for each in gaps), default=0.0)
         shown += [
             (likely, route),
@@ -121,7 +121,7 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
             if gaps
             else ("0", "gaps without fixes along the route"),
             error,
-            (metres_text(worst_m), "largest predicted position error along the route"),
+            (metres_text(along.drift_m.max()), "largest predicted position error along the route"),
         ]
     near = sum(each.within_prior for each in result.lookalikes)
     pairs = f"pairs of ambiguous places, {near} within the prior"
