@@ -117,9 +117,7 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
         longest_m = max((each.length_m for each in gaps), default=0.0)
         shown += [
             (likely, route),
-            (metres_text(longest_m), f"longest gap without fixes, of {len(gaps)}")
-            if gaps
-            else ("0", "gaps without fixes along the route"),
+            (metres_text(longest_m), f"longest gap without fixes, of {len(gaps)}"),
             error,
             (metres_text(along.drift_m.max()), "largest predicted position error along the route"),
         ]
