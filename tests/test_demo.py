@@ -19,7 +19,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 200.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
-    monkeypatch.setattr("orthonav.ground.check.places.FEWEST_TRIALS", 24)
+    monkeypatch.setattr("orthonav.ground.check.run.FEWEST_TRIALS", 24)
     monkeypatch.setattr("orthonav.ground.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.ground.report.drawing.DPI", 30)
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)

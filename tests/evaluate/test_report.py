@@ -22,7 +22,7 @@ from orthonav.ground.evaluate.tables import (
     table,
     total,
 )
-from orthonav.ground.report.numbers import measure_text
+from orthonav.ground.report import measure_text
 from orthonav.ground.report.page import LIST
 
 CENTRE = LocalFrame(48.0, -4.5)

@@ -21,8 +21,7 @@ log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from orthonav.ground.changes.record import ChangedGround
-    from orthonav.ground.check.outcome import CheckedInputs
-    from orthonav.ground.check.request import CheckRequest
+    from orthonav.ground.check.records import CheckedInputs, CheckRequest
     from orthonav.ground.planning.route import Route
 
 
@@ -47,8 +46,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("trials")
     text = "factor on the number of trials (default 1)"
     group.add_argument("--effort", type=float, default=1.0, metavar="FACTOR", help=text)
-    text = "skip the trials of other errors and other heights"
-    group.add_argument("--quick", action="store_true", help=text)
+    text = "a quarter of the trials, as --effort 0.25"
+    group.add_argument("--quick", dest="effort", action="store_const", const=0.25, help=text)
     add_options(group, "--workers")
 
 
@@ -95,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
 def _request(options: argparse.Namespace) -> "CheckRequest":
     from orthonav.core.errors import CheckError
     from orthonav.core.geo.camera_files import read_camera_file
-    from orthonav.ground.check.request import CheckRequest
+    from orthonav.ground.check.records import CheckRequest
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.planning.spacing import DEFAULT_CAMERA
 
@@ -116,7 +115,6 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         speed_mps=options.speed_mps,
         relief_m=options.relief_m,
         effort=options.effort,
-        extras=not options.quick,
         workers=options.workers,
         tilt_std_deg=options.tilt_std_deg,
         other_sensor=options.other_sensor,
@@ -183,7 +181,7 @@ def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "Chec
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text, texts
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.check.outcome import CheckedInputs
+    from orthonav.ground.check.records import CheckedInputs
 
     manifest = open_map(options.map).manifest
     terms = (

@@ -90,7 +90,7 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
         _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
         flown = ("--route", "route.geojson", "--agl-m", HEIGHT_M)
         _say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
-        trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT, "--quick")
+        trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT)
         checked = _run(options, "check", "area.onav", *flown, *trials, "--out", "check")
         _say(
             options,

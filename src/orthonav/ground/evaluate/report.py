@@ -37,6 +37,7 @@ from orthonav.ground.evaluate.tables import (
     wrong_bound_text,
 )
 from orthonav.ground.evaluate.track import GnssMetrics, TrackMetrics
+from orthonav.ground.report import measure_text, percent_text, plain_text
 from orthonav.ground.report.drawing import (
     BACKING,
     GREY,
@@ -54,7 +55,6 @@ from orthonav.ground.report.drawing import (
     draw_map,
     map_size_in,
 )
-from orthonav.ground.report.numbers import measure_text, percent_text, plain_text
 from orthonav.ground.report.page import Figure, file_names, render, write_page
 
 if TYPE_CHECKING:

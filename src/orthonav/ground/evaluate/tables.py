@@ -19,8 +19,8 @@ from orthonav.ground.evaluate.statistics import (
     percentile,
 )
 from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
+from orthonav.ground.report import aligned, measure_text, percent_text, to_plain
 from orthonav.ground.report.drawing import Background
-from orthonav.ground.report.numbers import aligned, measure_text, percent_text, to_plain
 
 Plain = dict[str, Any]
 _COLUMNS = (
