@@ -20,6 +20,7 @@ from orthonav.ground.evaluate.calibration import (
     check_covariance,
     is_covariance,
     nees_bound,
+    nees_mean_bounds,
     normalized_squared,
 )
 from orthonav.ground.evaluate.figures import wilson
@@ -236,3 +237,9 @@ def test_the_command_evaluates_several_flights(tmp_path, run) -> None:
     flights = values["flights"]
     assert flights["two"]["calibration"]["ece"] is None
     assert flights["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [0.4, 1.0, 17.3, 5000.0])
+def test_the_interval_of_the_mean_nees_is_that_of_chi_square(n):
+    expected = chi2.ppf([0.025, 0.975], 2 * n) / n
+    assert nees_mean_bounds(n) == pytest.approx(tuple(expected), rel=1e-8)

@@ -11,6 +11,7 @@ from typing import Any
 
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.onboard.gnss.records import gnss_sample
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
@@ -29,7 +30,6 @@ from orthonav.onboard.telemetry import (
     ClockSync,
     TelemetryBuffer,
     VehicleState,
-    wxyz_of_angles,
 )
 
 log = logging.getLogger(__name__)
@@ -276,9 +276,9 @@ class AutopilotLink:
 
     def _attitude(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
-        angles = message.roll, message.pitch, message.yaw
+        angles = message.yaw, message.pitch, message.roll
         if all(map(math.isfinite, angles)):
-            self.buffer.add_attitude(time_ns, wxyz_of_angles(*angles).tolist())
+            self.buffer.add_attitude(time_ns, wxyz_of_angles(angles).tolist())
             self._attitude_ns = now_ns
 
     def _quaternion(self, message: Message, now_ns: int) -> None:

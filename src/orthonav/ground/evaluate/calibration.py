@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
-from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, share_of, wilson
+from orthonav.ground.evaluate.figures import FloatArray, frozen, mean, root, share_of, wilson
 
 N_BINS = 10
 NEES_LEVELS = (0.5, 0.9, 0.99)
@@ -176,11 +175,19 @@ def nees_bound(level: float) -> float:
 def nees_mean_bounds(n: float) -> tuple[float, float]:
     """The 95 % interval of the mean NEES of `n` independent views; NaN for none.
 
-    chi2.ppf(p, 2 n) / n, and chi2.ppf(p, k) is 2 gammaincinv(k / 2, p).
+    Its sum is chi-square distributed with 2 n degrees of freedom.
     """
     if not n > 0:
         return math.nan, math.nan
-    low, high = (float(2.0 * gammaincinv(n, p) / n) for p in (0.025, 0.975))
+    wide = 20 * math.sqrt(n) + 40  # the series has converged, and 97.5 % are below
+    logs = np.cumsum(np.log(n + np.arange(1, math.ceil(wide + wide) + math.ceil(n))))
+    powers = np.arange(len(logs) + 1)
+    logs = np.concatenate([[0.0], logs]) + math.lgamma(n + 1)
+
+    def share_below(half: float) -> float:  # the incomplete gamma function, by its series
+        return float(np.exp((n + powers) * math.log(half) - half - logs).sum())
+
+    low, high = (2 / n * root(share_below, p, n + wide) for p in (0.025, 0.975))
     return low, high
 
 

@@ -6,13 +6,12 @@ documentation, https://github.com/MichaelGrupp/evo/wiki/Metrics (translation par
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -69,7 +68,26 @@ def upper_bound(part: int, whole: int) -> float:
     """
     if not whole:
         return math.nan
-    return 1.0 if part == whole else float(betaincinv(part + 1, whole - part, 0.95))
+    if part == whole:
+        return 1.0
+    counts = np.arange(1, part + 1)
+    logs = np.concatenate([[0.0], np.cumsum(np.log((whole - counts + 1) / counts))])
+    ks = np.arange(part + 1)
+
+    def chance_of_more(rate: float) -> float:
+        return 1 - float(
+            np.exp(logs + ks * math.log(rate) + (whole - ks) * math.log1p(-rate)).sum()
+        )
+
+    return root(chance_of_more, 0.95, 1.0)
+
+
+def root(rising: Callable[[float], float], value: float, largest: float) -> float:
+    """Where a function that rises from 0 to `largest` takes a value, by bisection."""
+    low, high = 0.0, largest
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if rising(middle) < value else (low, middle)
+    return high
 
 
 def frozen(values: FloatArray | Sequence[float]) -> FloatArray:

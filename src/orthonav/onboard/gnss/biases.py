@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import cholesky, solve_triangular
 
 from orthonav.core.records import MAP_STD_M
 from orthonav.onboard.gnss.records import Array, Fault
@@ -332,14 +331,13 @@ class DifferenceWindow:
         biased = np.concatenate([each.design for each in values])
         off = np.concatenate([each.en_m for each in values]) - biased @ known.mean
         covariance = _covariance(values, self.model) + biased @ known.cov @ biased.T
-        lower = cholesky(covariance, lower=True, check_finite=False)
         columns = np.kron(signatures, np.eye(2))
-        stacked = np.column_stack([columns, off])
-        white = solve_triangular(lower, stacked, lower=True, check_finite=False)
-        seen, data = white[:, :-1].reshape(2 * count, -1, 2), white[:, -1]
-        information = np.einsum("nka,nkb->kab", seen, seen)
+        solved = np.linalg.solve(covariance, columns)
+        seen = columns.reshape(2 * count, -1, 2)
+        weights = solved.reshape(2 * count, -1, 2)
+        information = np.einsum("nka,nkb->kab", seen, weights)
         spread = np.linalg.inv(information)
-        sizes = np.einsum("kab,nkb,n->ka", spread, seen, data)
+        sizes = np.einsum("kab,nkb,n->ka", spread, weights, off)
         length = np.hypot(*sizes.T)
         along = np.einsum("ka,kab,kb->k", sizes, spread, sizes)
         std = np.sqrt(along) / np.maximum(length, 1e-9)

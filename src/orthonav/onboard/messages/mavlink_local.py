@@ -10,8 +10,8 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from orthonav.core.geo.attitude import matrices_of_wxyz, wxyz_of_angles
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
@@ -24,7 +24,6 @@ from orthonav.onboard.messages.mavlink import (
     microseconds,
     require_confident,
 )
-from orthonav.onboard.telemetry import wxyz_of_angles
 
 _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
 _ESTIMATOR_VISION = 2
@@ -100,7 +99,7 @@ def odometry(
     velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
     if autopilot is Autopilot.ARDUPILOT:
         roll, pitch, yaw = pose.attitude_rad
-        body_from_ned = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix().T
+        body_from_ned = matrices_of_wxyz(wxyz_of_angles([yaw, pitch, roll])).T
         frames = (_LOCAL_FRD, _BODY_FRD)
         velocity = body_from_ned @ velocity_ned
         velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
@@ -116,7 +115,7 @@ def odometry(
         x=float32(position[0]),
         y=float32(position[1]),
         z=float32(position[2]),
-        q=[float32(value) for value in wxyz_of_angles(*pose.attitude_rad).tolist()],
+        q=[float32(value) for value in wxyz_of_angles(pose.attitude_rad[::-1]).tolist()],
         vx=float32(velocity[0]),
         vy=float32(velocity[1]),
         vz=float32(velocity[2]),
