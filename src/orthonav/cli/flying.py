@@ -38,7 +38,7 @@ from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases, Resumed
-from orthonav.onboard.gnss.watch import GnssSource, GnssWatch, LiveSolutions, RecordedSolutions
+from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
@@ -428,13 +428,12 @@ def gnss_watch(
     if options.gnss == "correct" and options.state is None:
         raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
-    source: GnssSource
     if recorded:
-        source = RecordedSolutions(read_gnss(Path(options.source) / FILE))
+        source = recorded_solutions(read_gnss(Path(options.source) / FILE))
     elif queue is None:
         raise VariantError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
     else:
-        source = LiveSolutions(queue)
+        source = live_solutions(queue)
 
     known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(

@@ -9,9 +9,9 @@ from contextlib import ExitStack
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.graph import Graph, Rosout
+from orthonav.onboard.ros2.graph import Rosout
+from orthonav.onboard.ros2.node import joined_graph
 from orthonav.onboard.ros2.publisher import Ros2Publisher
-from orthonav.onboard.ros2.rcl import joined_graph
 from orthonav.onboard.ros2.reader import Ros2Reader
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
@@ -28,7 +28,9 @@ def joined(
     of the ROS map frame unless `--origin` is given."""
     node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
     stack.callback(node.close)
-    _log_as_asked(node, stack)
+    rosout, logger = Rosout(node), logging.getLogger("orthonav")
+    logger.addHandler(rosout)
+    stack.callback(logger.removeHandler, rosout)
     reader = Ros2Reader(
         node,
         TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
@@ -50,19 +52,3 @@ def joined(
         {"health": "FAILED", "reasons": ["no_camera"], "waiting": why}
     )
     return reader, publisher
-
-
-def _log_as_asked(node: Graph, stack: ExitStack) -> None:
-    own, arguments = logging.getLogger("orthonav"), node.arguments
-    level, propagates = own.level, own.propagate
-    handler = logging.NullHandler() if "rosout" in arguments.silenced else Rosout(node)
-    own.addHandler(handler)
-    own.setLevel(arguments.log_level or level)
-    own.propagate = propagates and "stdout" not in arguments.silenced
-
-    def restore() -> None:
-        own.removeHandler(handler)
-        own.setLevel(level)
-        own.propagate = propagates
-
-    stack.callback(restore)
