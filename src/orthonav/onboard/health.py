@@ -6,10 +6,9 @@ import os
 import socket
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,77 +65,73 @@ class Health:
         return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """Input of `judge`. Ages are in seconds, infinite for "never".
+def judge(
+    running_s: float,
+    counts: Mapping[str, int],
+    *,
+    image_age_s: float = 0.0,
+    telemetry_age_s: float = 0.0,
+    link_age_s: float = 0.0,
+    low_confidence_s: float = 0.0,
+    latency_s: float = 0.0,
+    state: str | None = "tracking",
+    synced: bool = True,
+    map_unchanged: bool = True,
+    map_intact: bool = True,
+    mismatch: tuple[float, float] = (0.0, 0.0),
+    start_off_m: float = 0.0,
+    gnss: Sequence[str] = (),
+    has_origin: bool = True,
+    latency: str | None = None,
+) -> Health:
+    """Ages are in seconds, infinite for "never".
 
     `counts`: events within the window by name; `slow_vision` and `incomplete` are seconds in which
     a local message came too late for PX4 or a message could not be built. `latency_s`: 95th
     percentile from exposure to message. `map_unchanged`: the file of the map's name is the one that
-    was opened; `map_intact`: the open file was not changed. `start_off_m`: distance by which the
-    ground contradicts the start. `gnss`, `latency`: reasons of the monitors. `has_origin`: of the
-    local frame, where messages need it.
+    was opened; `map_intact`: the open file was not changed. `mismatch`: see there. `start_off_m`:
+    distance by which the ground contradicts the start. `gnss`, `latency`: reasons of the monitors.
+    `has_origin`: of the local frame, where messages need it.
     """
-
-    running_s: float
-    counts: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
-    image_age_s: float = 0.0
-    telemetry_age_s: float = 0.0
-    link_age_s: float = 0.0
-    low_confidence_s: float = 0.0
-    latency_s: float = 0.0
-    state: str | None = "tracking"
-    synced: bool = True
-    map_unchanged: bool = True
-    map_intact: bool = True
-    heading_mismatch_deg: float = 0.0
-    log_scale_mismatch: float = 0.0
-    start_off_m: float = 0.0
-    gnss: tuple[str, ...] = ()
-    has_origin: bool = True
-    latency: str | None = None
-
-
-def judge(seen: Snapshot) -> Health:
-    count = Counter(seen.counts)
+    count = Counter(counts)
     many = SHARE * max(count["taken"], 1)
-    settled = seen.running_s > GRACE_S
+    settled = running_s > GRACE_S
     failed = {
-        "no_camera": settled and seen.image_age_s > IMAGE_AGE_S,
-        "link_down": settled and seen.link_age_s > LINK_AGE_S,
-        "no_telemetry": settled and seen.telemetry_age_s > TELEMETRY_AGE_S,
+        "no_camera": settled and image_age_s > IMAGE_AGE_S,
+        "link_down": settled and link_age_s > LINK_AGE_S,
+        "no_telemetry": settled and telemetry_age_s > TELEMETRY_AGE_S,
         "wrong_camera": count["wrong_camera"] > 0,
-        "map_file_changed": not seen.map_intact,
+        "map_file_changed": not map_intact,
         "internal_errors": count["internal_error"] > 0.5 * max(count["processed"], 1),
     }
     degraded = {
-        "heading_mismatch": abs(seen.heading_mismatch_deg) > HEADING_DEG,
-        "height_mismatch": abs(seen.log_scale_mismatch) > LOG_SCALE,
-        "start_mismatch": seen.start_off_m > 0,
-        "lost": seen.state == "lost",
-        "searching": seen.state == "searching",
-        "coasting": seen.state == "coasting" and seen.low_confidence_s > COASTING_S,
-        "low_confidence": seen.state not in ("lost", "searching", "coasting")
-        and seen.low_confidence_s > LOW_CONFIDENCE_S,
+        "heading_mismatch": abs(mismatch[0]) > HEADING_DEG,
+        "height_mismatch": abs(mismatch[1]) > LOG_SCALE,
+        "start_mismatch": start_off_m > 0,
+        "lost": state == "lost",
+        "searching": state == "searching",
+        "coasting": state == "coasting" and low_confidence_s > COASTING_S,
+        "low_confidence": state not in ("lost", "searching", "coasting")
+        and low_confidence_s > LOW_CONFIDENCE_S,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
-        "slow": seen.latency_s > LATENCY_S or count["late"] > many,
+        "slow": latency_s > LATENCY_S or count["late"] > many,
         "slow_vision": count["slow_vision"] > SHARE * WINDOW_S,
-        "no_origin": settled and not seen.has_origin,
-        "incomplete_message": count["incomplete"] > SHARE * WINDOW_S and seen.has_origin,
+        "no_origin": settled and not has_origin,
+        "incomplete_message": count["incomplete"] > SHARE * WINDOW_S and has_origin,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
-        "not_synchronized": settled and not seen.synced and not failed["link_down"],
-        "map_file_changed": not seen.map_unchanged and seen.map_intact,
+        "not_synchronized": settled and not synced and not failed["link_down"],
+        "map_file_changed": not map_unchanged and map_intact,
         "output_failed": count["output_failed"] > 0,
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
-        **dict.fromkeys(seen.gnss, True),
+        **dict.fromkeys(gnss, True),
     }
-    if seen.latency is not None:
-        degraded = {seen.latency: True, **degraded}  # the cause of others, so it comes first
+    if latency is not None:
+        degraded = {latency: True, **degraded}  # the cause of others, so it comes first
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK

@@ -210,16 +210,13 @@ class LatencyMonitor:
 
     def _compare_again(self) -> None:
         self._compared, self._first_ns = False, None
-        self._odometry.reset()
+        self._odometry = PictureOdometry()
         self._check.clear()
 
 
 class Compared(NamedTuple):
-    """Comparison of the last motion that images show with the reported one.
-
-    `share`: of the motion that is both seen and reported, `varying`: the same without steady turns;
-    NaN where little moved. `is_reported`: the aircraft moved by the report.
-    """
+    """`share`: of the motion that is both seen and reported, `varying`: the same without steady
+    turns; NaN where little moved. `is_reported`: the aircraft moved by the report."""
 
     share: float = math.nan
     varying: float = math.nan
@@ -245,15 +242,12 @@ class MotionCheck:
         while self._waiting and self._waiting[0].end_ns - self._delay_ns <= history.newest_ns:
             one = self._waiting.popleft()
             times = (np.array([each - self._delay_ns]) for each in (one.start_ns, one.end_ns))
-            moved = history.motion(*times)
-            velocity = moved.velocity_shift[0]
-            turn, tilt = moved.turn_rad[0], moved.tilt_shift[0]
+            turn, tilt, velocity = (each[0] for each in history.motion(*times))
             row = np.array([one.seconds, one.turn_rad, *one.shift, turn, *tilt, *velocity])
             if np.isfinite(row[:7]).all():
                 self._rows.append((one.end_ns, row))
 
     def compared(self) -> Compared:
-        """The motion of the last seconds beside the reported one."""
         while self._rows and self._rows[0][0] < self._rows[-1][0] - SECONDS * 1e9:
             self._rows.popleft()
         if not self.is_filled:
@@ -313,18 +307,13 @@ def _sound(pairs: Array) -> Array:
     return np.asarray(pairs[worst <= limit])
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A position (2,), metres east and north, and its standard deviation."""
-
-    exposed_ns: int
-    en_m: Array
-    std_m: float
+Place = tuple[int, Array, float]
+"""Time of exposure, metres east and north (2,), standard deviation (m)."""
 
 
 class PositionCheck:
     def __init__(self) -> None:
-        self._places: deque[_Place] = deque(maxlen=100)
+        self._places: deque[Place] = deque(maxlen=100)
 
     def jump_s(
         self, exposed_ns: int, en_m: Array, std_m: float, history: StateHistory
@@ -332,8 +321,8 @@ class PositionCheck:
         """Growth of the latency (s) by which the position jumped; None without a jump or where no
         latency explains it. One that jumped does not count later. `exposed_ns`: by the latency in
         use; `en_m` (2,): metres east and north."""
-        now = _Place(exposed_ns, en_m, std_m)
-        while len(self._places) > 1 and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
+        now = exposed_ns, en_m, std_m
+        while len(self._places) > 1 and self._places[0][0] < exposed_ns - KEEP_S * 1e9:
             self._places.popleft()
         if self._places:
             ago_s, path = _path(exposed_ns, history)
@@ -359,17 +348,17 @@ def _path(exposed_ns: int, history: StateHistory) -> tuple[Array, Array]:
     return np.asarray(ago_s, np.float64), np.concatenate([later, np.zeros((1, 2)), earlier])
 
 
-def _jump_s(before: _Place, now: _Place, ago_s: Array, path: Array) -> float | None:
+def _jump_s(before: Place, now: Place, ago_s: Array, path: Array) -> float | None:
     """Growth of the latency that explains a jump; None without a jump or an explanation."""
-    seconds = (now.exposed_ns - before.exposed_ns) / 1e9
+    seconds = (now[0] - before[0]) / 1e9
     if not 0 < seconds <= LONGEST_GAP_S:
         return None
     flown = -np.array([np.interp(seconds, ago_s, each) for each in path.T])
     if not np.isfinite(flown).all():
         return None
-    jump = now.en_m - before.en_m - flown
+    jump = now[1] - before[1] - flown
     speed_std = usual_velocity_std_mps(float(np.hypot(*flown)) / seconds)
-    std_m = math.hypot(before.std_m, now.std_m)
+    std_m = math.hypot(before[2], now[2])
     if not np.hypot(*jump) > SIGMAS * math.hypot(std_m, speed_std * seconds):
         return None
     usual = (np.abs(ago_s) >= LEAST_S) & (np.abs(ago_s) <= LONGEST_S)
