@@ -368,7 +368,7 @@ class Runner:
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")
         if self._start_check is not None:
-            self._start_check.confirmed(fix, self._confident_ns)
+            self._start_check.found(fix, self._confident_ns, self._confident_ns, confirmed=True)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -550,7 +550,7 @@ class Runner:
             return 0.0
         place = None if self._diagnosis is None else self._diagnosis.place
         if place is not None:
-            check.diagnosed(*place, now_ns)
+            check.found(*place, now_ns, confirmed=False)
         return check.off_m(now_ns)
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
@@ -274,11 +273,13 @@ def _in_a_thread(work: Callable[[], None]) -> None:
 
 
 class StartCheck:
+    """Whether the first place that is found contradicts the start."""
+
     def __init__(self, start: Prior, time_ns: int) -> None:
         self._start, self._time_ns = start, time_ns
         self._moved_en_m, self._free_m = np.zeros(2), 0.0
-        self._diagnosed: _Place | None = None
-        self._confirmed: _Place | None = None
+        self._off_m: float | None = None
+        self._seen_ns, self._is_confirmed = 0, False
 
     def moved(self, telemetry: Telemetry) -> None:
         seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
@@ -291,45 +292,20 @@ class StartCheck:
         self._moved_en_m += np.array(velocity) * seconds
         self._free_m += SIGMAS * std_mps * seconds
 
-    def diagnosed(self, fix: Fix, seen_ns: int, now_ns: int) -> None:
-        if self._diagnosed is None or self._diagnosed.fix is not fix:
-            self._diagnosed = self._place(fix, seen_ns, now_ns)
-
-    def confirmed(self, fix: Fix, now_ns: int) -> None:
-        # The first one decides.
-        if self._confirmed is None:
-            self._confirmed = self._place(fix, now_ns, now_ns)
+    def found(self, fix: Fix, seen_ns: int, now_ns: int, *, confirmed: bool) -> None:
+        """A place by the diagnosis, or, `confirmed`, by the track. The first one decides: later an
+        aircraft may have come to any place from the start."""
+        if self._is_confirmed:
+            return
+        self._seen_ns, self._is_confirmed = seen_ns, confirmed
+        if self._off_m is None:
+            plane = LocalFrame(fix.lat_deg, fix.lon_deg)
+            start_en_m = plane.en_from_latlon(self._start.lat_deg, self._start.lon_deg)
+            off_m = float(np.hypot(*(start_en_m + self._moved_en_m)))
+            std_m = math.hypot(self._start.std_m, fix.radius_m)
+            free_m = self._free_m + SPEED_MPS * (now_ns - seen_ns) / 1e9
+            self._off_m = off_m if off_m > SIGMAS * std_m + free_m else 0.0
 
     def off_m(self, now_ns: int) -> float:
-        """Distance by which the last place contradicts the start, m; 0 within the deviations."""
-        last = self._confirmed or self._diagnosed
-        return last.off_m if last is not None and now_ns - last.seen_ns < SHOWN_S * 1e9 else 0.0
-
-    def _place(self, fix: Fix, seen_ns: int, now_ns: int) -> "_Place":
-        """A place and what it says of the start. With time an aircraft may have come to any place
-        from the start: where it may have come from the last place, that one decides."""
-        off_m = float(np.hypot(*(_from(fix, self._start) + self._moved_en_m)))
-        std_m = math.hypot(self._start.std_m, fix.radius_m)
-        free_m = self._free_m + SPEED_MPS * (now_ns - seen_ns) / 1e9
-        if off_m <= SIGMAS * std_m + free_m:
-            before = self._diagnosed
-            off_m = before.off_m if before is not None and before.reaches(fix, seen_ns) else 0.0
-        return _Place(seen_ns, fix, off_m)
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A confident fix, and the distance by which it contradicts the start, 0 if it does not."""
-
-    seen_ns: int
-    fix: Fix
-    off_m: float
-
-    def reaches(self, fix: Fix, seen_ns: int) -> bool:
-        free_m = SPEED_MPS * (seen_ns - self.seen_ns) / 1e9
-        return float(np.hypot(*_from(fix, self.fix))) <= free_m + self.fix.radius_m + fix.radius_m
-
-
-def _from(fix: Fix, other: Fix | Prior) -> NDArray[np.float64]:
-    """Metres east and north (2,) of another place from a fix."""
-    return LocalFrame(fix.lat_deg, fix.lon_deg).en_from_latlon(other.lat_deg, other.lon_deg)
+        """Distance by which the place contradicts the start; 0 within the deviations."""
+        return self._off_m or 0.0 if now_ns - self._seen_ns < SHOWN_S * 1e9 else 0.0

@@ -184,7 +184,9 @@ class LatencyEstimator:
         reach_ns = round(-LEAST_S * 1e9)
         while self._waiting and self._waiting[0].end_ns + reach_ns <= history.newest_ns:
             one = self._waiting.popleft()
-            turn, tilt, velocity = history.motion(one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS)
+            turn, tilt, velocity = history.motion(
+                one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS
+            )
             if np.isfinite(turn).mean() < PAIR_SHARE:
                 continue
             self._pairs.append((one, np.column_stack([turn, tilt, velocity])))
