@@ -997,7 +997,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
         ((), 1, "--autopilot"),
         (("--autopilot", "udpin:0", "--signing-key", "KEY"), 1, "32 bytes"),
         (("--autopilot", "carrier-pigeon:1"), 1, "udpin"),
-        (("--autopilot", "udpin:0", "--nmea", "x:1"), 1, "tcp-listen"),
+        (("--autopilot", "udpin:0", "--nmea", "x:1"), 1, "udp:HOST:PORT"),
         (("--autopilot", "udpin:0", "--start", "1,2"), 2, "LAT,LON,STD_M"),
     ],
 )

@@ -18,8 +18,7 @@ from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.records import NoFix, ViewResult
 from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, messages_averaged
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.mavlink import Packer, Target
-from orthonav.onboard.messages.mavlink_local import Autopilot, Origin, north_east_m
+from orthonav.onboard.messages.mavlink import Autopilot, Origin, Packer, Target, north_east_m
 from orthonav.onboard.outputs import (
     KINDS,
     JsonOut,

@@ -44,8 +44,7 @@ from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
-from orthonav.onboard.messages.mavlink_local import Origin
+from orthonav.onboard.messages.mavlink import Origin, Signing, signing_timestamp
 from orthonav.onboard.messages.nmea import Quality
 from orthonav.onboard.outputs import (
     KINDS,

@@ -18,7 +18,7 @@ from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.onboard.cameras import NewestImage
 from orthonav.onboard.health import IMAGE_AGE_S, LINK_AGE_S, STATUSTEXT_INTERVAL_NS, Level
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.messages.mavlink_local import Autopilot
+from orthonav.onboard.messages.mavlink import Autopilot
 from orthonav.onboard.telemetry import Clocks
 
 TERMINAL_S, FILE_S = 5.0, 30.0

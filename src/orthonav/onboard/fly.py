@@ -483,8 +483,8 @@ class Runner:
         if self._link.target is not None:
             if self._reporter.due(health, now_ns):
                 self._send_text(health.level.severity, health.text())
-            for each in texts:
-                self._send_text(each.severity, each.text)
+            for severity, text in texts:
+                self._send_text(severity, text)
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:

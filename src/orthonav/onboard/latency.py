@@ -36,7 +36,7 @@ LARGEST_STD_S = 0.3
 STATED_STD_S = 0.03
 """Least standard deviation of a stated latency: one image at 30 Hz."""
 FIRST_NS = 5 * 10**9
-"""A latency is used after images agreed with it, or after this time without enough motion."""
+"""A latency is used after images agreed with it, or so long without enough motion."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back after a time without images;
 telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_NS`)."""
@@ -65,11 +65,8 @@ LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 
 @dataclass(frozen=True)
 class Latency:
-    """The latency to use for one image.
-
-    `arrived_ns`: by our clock. `delay_s`, `std_s`: exposure to arrival; 0 and NaN where not stated.
-    `reason`: why the latency must not be used. `detail`: one sentence about it.
-    """
+    """`arrived_ns`: of an image, by our clock. `delay_s`, `std_s`: from its exposure; 0 and NaN
+    where not stated. `reason`: why they must not be used. `detail`: one sentence about it."""
 
     arrived_ns: int
     delay_s: float
@@ -79,8 +76,6 @@ class Latency:
 
 
 class LatencyMonitor:
-    """Judges the stated latency of a live camera. Mutable; for one thread."""
-
     def __init__(
         self,
         stated_s: float | None = None,
@@ -115,7 +110,7 @@ class LatencyMonitor:
         return Latency(arrived_ns, self._delay_s, self._std_s, *self._doubt())
 
     def frozen(self, arrived_ns: int) -> None:
-        """Note an image that repeats the one before: the stream may be stalled."""
+        # The stream may be stalled.
         if self._frozen_ns is None:
             self._frozen_ns = arrived_ns
 
@@ -140,7 +135,7 @@ class LatencyMonitor:
         state_at: Callable[[int], VehicleState],
         covered_ns: int | None,
     ) -> None:
-        """Compare an image with the one before and the states reported, known to `covered_ns`."""
+        # States are known to `covered_ns`.
         if not self._is_stated:
             return
         self._frozen_ns = None  # this image is not frozen
@@ -163,11 +158,9 @@ class LatencyMonitor:
 
     @property
     def reason(self) -> str | None:
-        """Reason why the latency cannot be used; None where it can."""
         return self._doubt()[0]
 
     def plain(self) -> dict[str, float | str | None]:
-        """What is known, for logs; `latency` is "stated" or why it is not used."""
         reason, detail = self._doubt()
         return {
             "latency_ms": round(self._delay_s * 1e3, 1) if self._is_stated else None,
@@ -215,17 +208,15 @@ class LatencyMonitor:
 
 
 class Compared(NamedTuple):
-    """`share`: of the motion that is both seen and reported, `varying`: the same without steady
-    turns; NaN where little moved. `is_reported`: the aircraft moved by the report."""
+    """Share of the motion that is both seen and reported; the same without steady turns; NaN where
+    little moved."""
 
     share: float = math.nan
     varying: float = math.nan
-    is_reported: bool = False
+    is_reported: bool = False  # the aircraft moved by the report
 
 
 class MotionCheck:
-    """Whether the images of the last seconds move as the autopilot reports. Mutable."""
-
     def __init__(self, delay_s: float, *, heading_known: bool = True) -> None:
         self._delay_ns = round(delay_s * 1e9)
         self._heading_known = heading_known
@@ -287,7 +278,7 @@ class MotionCheck:
         return len(self._rows) >= LEAST_PAIRS
 
     def _contradicts(self, seen: Array, reported: Array) -> bool:
-        """Whether shifts per second (N, 2) by the velocity differ beyond errors of height."""
+        # Shifts per second (N, 2) by the velocity, beyond errors of height.
         seen, reported = np.median(seen, axis=0), np.median(reported, axis=0)
         size = float(np.hypot(*reported))
         if size < LEAST_PER_S:
@@ -319,17 +310,16 @@ class PositionCheck:
         self, exposed_ns: int, en_m: Array, std_m: float, history: StateHistory
     ) -> float | None:
         """Growth of the latency (s) by which the position jumped; None without a jump or where no
-        latency explains it. One that jumped does not count later. `exposed_ns`: by the latency in
-        use; `en_m` (2,): metres east and north."""
+        latency explains it. One that jumped does not count later."""
         now = exposed_ns, en_m, std_m
         while len(self._places) > 1 and self._places[0][0] < exposed_ns - KEEP_S * 1e9:
             self._places.popleft()
         if self._places:
             ago_s, path = _path(exposed_ns, history)
             jumps = (_jump_s(each, now, ago_s, path) for each in self._places)
-            found = next((each for each in jumps if each is not None), None)
-            if found is not None:
-                return found
+            for found in jumps:
+                if found is not None:
+                    return found
         self._places.append(now)
         return None
 
@@ -349,7 +339,6 @@ def _path(exposed_ns: int, history: StateHistory) -> tuple[Array, Array]:
 
 
 def _jump_s(before: Place, now: Place, ago_s: Array, path: Array) -> float | None:
-    """Growth of the latency that explains a jump; None without a jump or an explanation."""
     seconds = (now[0] - before[0]) / 1e9
     if not 0 < seconds <= LONGEST_GAP_S:
         return None

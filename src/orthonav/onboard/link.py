@@ -14,14 +14,15 @@ from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
+    Autopilot,
     Message,
+    Origin,
     Packer,
     Signing,
     Target,
     dialect,
     signing_timestamp,
 )
-from orthonav.onboard.messages.mavlink_local import Autopilot, Origin
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import (
     Aiding,

@@ -20,7 +20,7 @@ SIDE_PX = 240
 CORNERS, LEAST_CORNERS, LEAST_SHARE = 90, 20, 0.5
 """Corners that are sought; those that must be found again, by number and share."""
 RETURN_PX = 0.5
-"""A corner tracked forth and back must return within this distance (Kalal et al. 2010)."""
+"""A corner tracked forth and back must return within this distance (Kalal et al., 2010)."""
 RANSAC_PX = 1.0
 EVENED_PX, LEAST_CONTRAST = 41, 2.0
 """Brightness and contrast (grey levels) are evened within squares of this size: of an exposure that
@@ -47,12 +47,9 @@ _WINDOW = (17, 17)
 
 @dataclass(frozen=True, eq=False)
 class ImageMotion:
-    """Motion from one image to a later one.
-
-    `start_ns`, `end_ns`: times of arrival of both. `turn_rad`: rotation of the picture about the
-    optical axis, clockwise in the image. `shift` (2,): displacement of the centre, right and down,
-    in units of the focal length.
-    """
+    """Of images that arrived at `start_ns` and `end_ns`. `turn_rad`: rotation of the picture about
+    the optical axis, clockwise in the image. `shift` (2,): displacement of the centre, right and
+    down, in units of the focal length."""
 
     start_ns: int
     end_ns: int
@@ -65,8 +62,6 @@ class ImageMotion:
 
 
 class PictureOdometry:
-    """Compares every image with the one before. Mutable."""
-
     def __init__(self) -> None:
         self._before: Grey | None = None
         self._arrived_ns = 0
@@ -94,7 +89,6 @@ class PictureOdometry:
 
 
 def _evened(grey: Grey) -> Grey:
-    # Exposure, shadows and vignetting do not move.
     square = (EVENED_PX, EVENED_PX)
     varying = np.asarray(grey, np.float32)
     varying = varying - cv2.blur(varying, square)
@@ -146,8 +140,7 @@ def _plane(px: Corners, camera: Camera) -> Array:
 
 
 def centre_motion(homographies: Array) -> tuple[Array, Array]:
-    """Rotation (N,) and displacement (N, 2) of the centre by homographies (N, 3, 3) between
-    camera planes."""
+    """Rotation (N,) and displacement (N, 2) of the centre by homographies (N, 3, 3)."""
     below = homographies[:, 2, 2]
     shift = homographies[:, :2, 2] / below[:, None]
     jacobian = homographies[:, :2, :2] - shift[:, :, None] * homographies[:, 2:, :2]
@@ -200,8 +193,7 @@ class StateHistory:
         velocity_enu_mps: ArrayLike | None,
         height_m: float,
     ) -> None:
-        """Add a state: rotation (3, 3) from camera axes to east, north, up, velocity (3,), height
-        above ground. None and NaN: not known. A time that is not newer than the last is ignored."""
+        """Add a state; None and NaN: not known. A time that is not newer is ignored."""
         if time_ns <= self.newest_ns:
             return
         row = np.full(13, math.nan)

@@ -25,17 +25,15 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
+    Autopilot,
+    LocalPose,
     Message,
+    Origin,
     external_position_estimate,
     global_position_sensor,
     gps_input,
-    request_message,
-)
-from orthonav.onboard.messages.mavlink_local import (
-    Autopilot,
-    LocalPose,
-    Origin,
     odometry,
+    request_message,
     set_gps_global_origin,
     vision_position_estimate,
 )
@@ -227,7 +225,8 @@ Sink = Udp | SerialSink
 
 
 def open_sink(url: str) -> Sink:
-    """Output at `udp:HOST:PORT` or `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where it cannot be opened."""
+    """Output at `udp:HOST:PORT` or `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where
+    it cannot be opened."""
     kind, _, rest = url.partition(":")
     if kind == "udp":
         return Udp(None, host_port(rest, url))

@@ -8,7 +8,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -61,12 +61,8 @@ def recorded_solutions(samples: list[GnssSample]) -> Solutions:
     return take
 
 
-@dataclass(frozen=True)
-class GnssText:
-    """A message for the operator: at most 50 characters, and its MAV_SEVERITY."""
-
-    severity: int
-    text: str
+GnssText = tuple[int, str]
+"""MAV_SEVERITY and at most 50 characters, for the operator."""
 
 
 class GnssWatch:
@@ -298,13 +294,13 @@ def _change(
         before.state is not GnssState.ALARM or before.fault != now.fault
     ):
         kind = now.fault.value.removeprefix("gnss_") if now.fault else "fault"
-        return GnssText(ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}")
+        return ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}"
     if now.state is GnssState.GOOD and before.state in (
         GnssState.ALARM,
         GnssState.RETURNING,
     ):
         east, north = (np.array(now.difference_en_m) - correction_en_m).tolist()
-        return GnssText(RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}")
+        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}"
     return None
 
 
