@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from orthonav.core.flight.fixes import result_from_json, result_to_json
 from orthonav.core.geo.frames import LocalFrame
@@ -18,6 +19,7 @@ from orthonav.ground.evaluate.statistics import (
     calibrate,
     check_covariance,
     is_covariance,
+    nees_mean_bounds,
     normalized_squared,
     wilson,
 )
@@ -225,3 +227,9 @@ def test_the_command_evaluates_several_flights(tmp_path, run) -> None:
     flights = values["flights"]
     assert flights["two"]["calibration"]["ece"] is None
     assert flights["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [0.4, 1.0, 17.3, 5000.0])
+def test_the_interval_of_the_mean_nees_is_that_of_chi_square(n):
+    expected = chi2.ppf([0.025, 0.975], 2 * n) / n
+    assert nees_mean_bounds(n) == pytest.approx(tuple(expected), rel=1e-8)

@@ -37,7 +37,7 @@ LIMITS_M = {"views": 0.01, "any_heading": 0.01, "track": 0.05, "smoothed": 0.05}
 """By run. A track carries rounding on from view to view: a heading reported 0.00001 deg larger
 moves it by 3 cm on one and the same machine."""
 RUNS = tuple(LIMITS_M)
-PACKAGES = ("numpy", "scipy", "opencv-python-headless")
+PACKAGES = ("numpy", "opencv-python-headless")
 Places = dict[str, list[float] | str]
 """By frame: metres east and north of the map's centre, to 0.1 mm, or why there is no fix."""
 

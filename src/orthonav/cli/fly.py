@@ -83,7 +83,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add = group.add_argument
     text = "message to send to the autopilot (default global-position); can be repeated"
     add("--send", action="append", choices=SEND, help=text)
-    text = "NMEA to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD; can be repeated"
+    text = "NMEA to udp:HOST:PORT or serial:DEVICE:BAUD; can be repeated"
     add("--nmea", action="append", default=[], metavar="URL", help=text)
     text = "append one line of JSON per view to a file, or to stdout (-); can be repeated"
     add("--jsonl", action="append", default=[], metavar="FILE|-", help=text)

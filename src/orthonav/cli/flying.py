@@ -36,14 +36,13 @@ from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases, Resumed
-from orthonav.onboard.gnss.watch import GnssSource, GnssWatch, LiveSolutions, RecordedSolutions
+from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
-from orthonav.onboard.messages.mavlink_local import Origin
+from orthonav.onboard.messages.mavlink import Origin, Signing, signing_timestamp
 from orthonav.onboard.messages.nmea import Quality
 from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.run import Locator, MountCorrected, model_of
@@ -159,20 +158,15 @@ def _ros2(
     of the ROS map frame unless `--origin` is given."""
     from orthonav.onboard.ros2.arguments import ros_arguments
     from orthonav.onboard.ros2.graph import Rosout
+    from orthonav.onboard.ros2.node import joined_graph
     from orthonav.onboard.ros2.publisher import Ros2Publisher
-    from orthonav.onboard.ros2.rcl import joined_graph
     from orthonav.onboard.ros2.reader import Ros2Reader
 
     node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
     stack.callback(node.close)
-    own, arguments = logging.getLogger("orthonav"), node.arguments
-    stack.callback(own.setLevel, own.level)
-    stack.callback(setattr, own, "propagate", own.propagate)
-    handler = logging.NullHandler() if "rosout" in arguments.silenced else Rosout(node)
-    stack.callback(own.removeHandler, handler)
-    own.addHandler(handler)
-    own.setLevel(arguments.log_level or own.level)
-    own.propagate = own.propagate and "stdout" not in arguments.silenced
+    rosout, logger = Rosout(node), logging.getLogger("orthonav")
+    logger.addHandler(rosout)
+    stack.callback(logger.removeHandler, rosout)
     reader = Ros2Reader(
         node,
         TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
@@ -427,13 +421,13 @@ def gnss_watch(
     if options.gnss == "correct" and options.state is None:
         raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
-    source: GnssSource
     if recorded:
-        source = RecordedSolutions(read_gnss(Path(options.source) / FILE))
+        source = recorded_solutions(read_gnss(Path(options.source) / FILE))
     elif queue is None:
         raise VariantError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
     else:
-        source = LiveSolutions(queue)
+        source = live_solutions(queue)
+
     known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(
         frame,

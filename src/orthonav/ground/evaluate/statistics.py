@@ -11,13 +11,12 @@ number), at most the radius of the evaluation. Undefined figures are NaN.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv, gammaincinv
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -80,7 +79,26 @@ def upper_bound(part: int, whole: int) -> float:
     """
     if not whole:
         return math.nan
-    return 1.0 if part == whole else float(betaincinv(part + 1, whole - part, 0.95))
+    if part == whole:
+        return 1.0
+    counts = np.arange(1, part + 1)
+    logs = np.concatenate([[0.0], np.cumsum(np.log((whole - counts + 1) / counts))])
+    ks = np.arange(part + 1)
+
+    def chance_of_more(rate: float) -> float:
+        return 1 - float(
+            np.exp(logs + ks * math.log(rate) + (whole - ks) * math.log1p(-rate)).sum()
+        )
+
+    return root(chance_of_more, 0.95, 1.0)
+
+
+def root(rising: Callable[[float], float], value: float, largest: float) -> float:
+    """Where a function that rises from 0 to `largest` takes a value, by bisection."""
+    low, high = 0.0, largest
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if rising(middle) < value else (low, middle)
+    return high
 
 
 def frozen(values: FloatArray | Sequence[float]) -> FloatArray:
@@ -364,11 +382,19 @@ def nees_bound(level: float) -> float:
 def nees_mean_bounds(n: float) -> tuple[float, float]:
     """The 95 % interval of the mean NEES of `n` independent views; NaN for none.
 
-    chi2.ppf(p, 2 n) / n, and chi2.ppf(p, k) is 2 gammaincinv(k / 2, p).
+    Its sum is chi-square distributed with 2 n degrees of freedom.
     """
     if not n > 0:
         return math.nan, math.nan
-    low, high = (float(2.0 * gammaincinv(n, p) / n) for p in (0.025, 0.975))
+    wide = 20 * math.sqrt(n) + 40  # the series has converged, and 97.5 % are below
+    logs = np.cumsum(np.log(n + np.arange(1, math.ceil(wide + wide) + math.ceil(n))))
+    powers = np.arange(len(logs) + 1)
+    logs = np.concatenate([[0.0], logs]) + math.lgamma(n + 1)
+
+    def share_below(half: float) -> float:  # the incomplete gamma function, by its series
+        return float(np.exp((n + powers) * math.log(half) - half - logs).sum())
+
+    low, high = (2 / n * root(share_below, p, n + wide) for p in (0.025, 0.975))
     return low, high
 
 

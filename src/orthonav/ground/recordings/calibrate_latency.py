@@ -184,11 +184,12 @@ class LatencyEstimator:
         reach_ns = round(-LEAST_S * 1e9)
         while self._waiting and self._waiting[0].end_ns + reach_ns <= history.newest_ns:
             one = self._waiting.popleft()
-            moved = history.motion(one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS)
-            if np.isfinite(moved.turn_rad).mean() < PAIR_SHARE:
+            turn, tilt, velocity = history.motion(
+                one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS
+            )
+            if np.isfinite(turn).mean() < PAIR_SHARE:
                 continue
-            parts = moved.turn_rad[:, None], moved.tilt_shift, moved.velocity_shift
-            self._pairs.append((one, np.concatenate(parts, axis=1)))
+            self._pairs.append((one, np.column_stack([turn, tilt, velocity])))
             while self._pairs[0][0].start_ns < one.end_ns - WINDOW_S * 1e9:
                 self._pairs.popleft()
 

@@ -15,10 +15,10 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import VariantError
 from orthonav.core.files import write_text
+from orthonav.core.geo.attitude import wxyz_of_matrices
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import TerrainHeights
@@ -180,8 +180,8 @@ def _tum(positions: Sequence[CameraPosition]) -> str:
         east, north = plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()
         up = each.height_m if above_sea else each.fix.agl_m
         angles = np.nan_to_num([each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg])
-        rotation = Rotation.from_matrix(enu_from_camera(*angles.tolist()))
-        numbers = " ".join(f"{value:.9f}" for value in rotation.as_quat(canonical=True))
+        w, *xyz = wxyz_of_matrices(enu_from_camera(*angles.tolist())).tolist()
+        numbers = " ".join(f"{math.copysign(1, w) * value:.9f}" for value in (*xyz, w))
         lines.append(
             f"{Decimal(each.view.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
         )
