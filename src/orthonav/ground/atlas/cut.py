@@ -65,7 +65,6 @@ from orthonav.ground.build.sheet import (
     in_order,
     layer_parts,
     one_opencv_thread,
-    put_layer_parts,
     tiles_of,
 )
 from orthonav.ground.build.terrain import TerrainParts, terrain_parts
@@ -471,7 +470,7 @@ class _MapCutter:
         part = np.s_[: rows - block.row // spacing, : cols - block.col // spacing]
         self.cells.put(block.row, block.col, parts["means"][part], parts["share"][part])
         self.preview.put(block, parts["preview"])
-        put_layer_parts(self.layer, block, parts)
+        self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
 
 def _learnt(

@@ -290,15 +290,17 @@ def build_map(
         registration=request.registration,
         pictures=SheetPictures(grid, representation) if inputs.learns_network else None,
     )
-    with sheet.block_cache(request.out, request.work) as cache:
-        sheet.read(progress, request.workers, cache)
-        embedding = learn_embedding(inputs, sheet, progress)
-        calibration = calibrate_tiles(sheet, embedding, progress)
-        manifest, arrays = map_content(inputs, sheet, embedding, calibration)
-        if request.registration:
-            registration = registration_record(inputs, sheet, embedding, manifest, arrays, progress)
-            manifest = replace(manifest, registration=registration)
-        written = write_map(request.out, manifest, arrays)
+    cache = sheet.block_cache(request.out, request.work)
+    sheet.read(progress, request.workers, cache)
+    embedding = learn_embedding(inputs, sheet, progress)
+    calibration = calibrate_tiles(sheet, embedding, progress)
+    manifest, arrays = map_content(inputs, sheet, embedding, calibration)
+    if request.registration:
+        registration = registration_record(inputs, sheet, embedding, manifest, arrays, progress)
+        manifest = replace(manifest, registration=registration)
+    written = write_map(request.out, manifest, arrays)
+    if cache is not None:
+        cache.discard()
     return BuildResult(written, request.out.stat().st_size)
 
 

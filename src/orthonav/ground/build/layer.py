@@ -30,7 +30,6 @@ COARSER_QUALITIES = (50, 30)
 """For chunks of noise, so that the size of a map is bounded."""
 MAX_BYTES_PER_PX = 0.5
 _HEADER_BYTES = 512
-_BLOBS = ("jpeg", "mask")
 Parts = dict[str, NDArray[Any]]
 
 
@@ -90,25 +89,6 @@ class GreyLayerWriter:
         self._valid_px += int(np.count_nonzero(valid))
         self._add(0, row, col, grey, valid)
 
-    def add_block(self, row: int, col: int, parts: Parts) -> None:
-        """Add the result of `compressed_block`."""
-        number, ends = 0, [np.concatenate([[0], parts[f"{kind}_ends"]]) for kind in _BLOBS]
-        rows, cols = self._table.shapes[0]
-        small = parts["half_valid"].shape
-        for chunk_row in range(row // CHUNK_PX, _chunks(min(row + 2 * small[0], rows))):
-            for chunk_col in range(col // CHUNK_PX, _chunks(min(col + 2 * small[1], cols))):
-                jpeg, mask = (
-                    parts[kind][end[number] : end[number + 1]].tobytes()
-                    for kind, end in zip(_BLOBS, ends, strict=True)
-                )
-                if jpeg:
-                    place = self._table.number(0, chunk_row, chunk_col)
-                    self._encoded[place] = (jpeg, mask)
-                number += 1
-        self._valid_px += int(parts["valid_px"][0])
-        if self._levels > 1:
-            self._add(1, row // 2, col // 2, parts["half"], parts["half_valid"])
-
     def finish(self, sheet: int = 0) -> tuple[GreyInfo, dict[str, NDArray[np.uint8 | np.int64]]]:
         for level, pending in enumerate(self._pending):
             for place in sorted(pending):
@@ -157,26 +137,6 @@ class GreyLayerWriter:
             half = self._chunk_px // 2
             smaller = halved(chunk.grey, chunk.valid)
             self._add(level + 1, place[0] * half, place[1] * half, *smaller)
-
-
-def compressed_block(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Parts:
-    """The layer of a block of whole chunks: `jpeg`, `mask` (B,) by rows, and the next level."""
-    chunks = [
-        encode_chunk(grey[part], valid[part]) if valid[part].any() else (b"", b"")
-        for row in range(0, grey.shape[0], CHUNK_PX)
-        for col in range(0, grey.shape[1], CHUNK_PX)
-        for part in [np.s_[row : row + CHUNK_PX, col : col + CHUNK_PX]]
-    ]
-    parts: Parts = {"valid_px": np.array([np.count_nonzero(valid)])}
-    for kind, blobs in zip(_BLOBS, zip(*chunks, strict=True), strict=True):
-        parts[kind] = np.frombuffer(b"".join(blobs), dtype=np.uint8)
-        parts[f"{kind}_ends"] = np.cumsum([len(blob) for blob in blobs])
-    parts["half"], parts["half_valid"] = halved(grey, valid)
-    return parts
-
-
-def _chunks(size_px: int) -> int:
-    return -(-size_px // CHUNK_PX)
 
 
 def encode_chunk(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:

@@ -2,23 +2,21 @@
 
 Several threads read blocks, each with its own datasets; results are collected in the order of the
 blocks, so the map is the same for any number of threads. The result of a block is a dictionary of
-arrays, one file in a cache from which an interrupted build resumes; its name holds a digest of
-everything that determines it.
+arrays, one file in a cache from which an interrupted build resumes.
 """
 
-import contextlib
 import hashlib
-import itertools
 import json
 import logging
 import math
 import queue
-import re
 import shutil
 import threading
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +28,7 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.cores import usable_cores
-from orthonav.core.errors import AreaError, OutputError, VariantError
+from orthonav.core.errors import AreaError, VariantError
 from orthonav.core.files import Progress, no_progress, replacing
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.tiles import represent
@@ -39,7 +37,7 @@ from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.calibrate import CropSampler
-from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
+from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts
 from orthonav.ground.imagery.mosaic import GreyPixels, Mosaic, SheetRaster
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
@@ -48,13 +46,9 @@ from orthonav.research.tiles import SheetTiles
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 Worker = AbstractContextManager[Callable[[Item], Made]]
+_Jobs = queue.SimpleQueue[tuple[Future[Made], Item] | None]
 AHEAD = 2
 """Finished results that may wait for a slower one."""
-
-
-@dataclass(frozen=True)
-class _Failed:
-    error: BaseException
 
 
 def in_order(
@@ -70,48 +64,41 @@ def in_order(
         with opened() as work:
             yield from map(work, items)
         return
-    todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-    done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
-    stop = threading.Event()
-    shared = items, opened, todo, done, stop
-    threads = [threading.Thread(target=_serve, args=shared, daemon=True) for _ in range(workers)]
-    waiting = iter(range(len(items)))
+    todo: _Jobs[Made, Item] = queue.SimpleQueue()
+    threads = [
+        threading.Thread(target=_serve, args=(todo, opened), daemon=True) for _ in range(workers)
+    ]
+    waiting: deque[Future[Made]] = deque()
     try:
         for thread in threads:
             thread.start()
-        for index in itertools.islice(waiting, workers + AHEAD):
-            todo.put(index)
-        for place in done:
-            made = place.get()
-            if isinstance(made, _Failed):
-                raise made.error
-            for index in itertools.islice(waiting, 1):
-                todo.put(index)
-            yield made
+        for item in items:
+            waiting.append(Future())
+            todo.put((waiting[-1], item))
+            if len(waiting) >= workers + AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
     finally:
-        stop.set()
+        for result in waiting:
+            result.cancel()
         for _ in threads:
             todo.put(None)
         for thread in threads:
             thread.join()
 
 
-def _serve(
-    items: Sequence[Item],
-    opened: Callable[[], Worker[Item, Made]],
-    todo: "queue.SimpleQueue[int | None]",
-    done: "list[queue.SimpleQueue[Made | _Failed]]",
-    stop: threading.Event,
-) -> None:
-    at = slice(None)  # all waiting items, until one is started
-    try:
-        with opened() as work:
-            while (index := todo.get()) is not None and not stop.is_set():
-                at = slice(index, index + 1)
-                done[index].put(work(items[index]))
-    except BaseException as error:
-        for place in done[at]:
-            place.put(_Failed(error))
+def _serve(todo: _Jobs[Made, Item], opened: Callable[[], Worker[Item, Made]]) -> None:
+    with ExitStack() as stack:
+        work = None
+        while (job := todo.get()) is not None:
+            result, item = job
+            if result.set_running_or_notify_cancel():
+                try:
+                    work = work or stack.enter_context(opened())
+                    result.set_result(work(item))
+                except BaseException as error:
+                    result.set_exception(error)
 
 
 @dataclass(frozen=True)
@@ -354,13 +341,6 @@ PREVIEW_PX = 384
 """Limit of the map format."""
 MIN_CACHED_BLOCKS = 16
 """Smaller builds do not cache blocks by default: they are quickly rebuilt."""
-CACHED_BYTES_PER_PX = 1.6
-"""A corridor of the generated landscape at 1 m took 1.3."""
-
-
-FORMAT = 2
-"""Of the arrays of a block: increase it when they change."""
-_OURS = re.compile(r"\.?r\d+-c\d+-[0-9a-f]{24}\.npz(\..*\.tmp\.npz)?")
 
 
 def digest(values: Any) -> str:
@@ -369,89 +349,42 @@ def digest(values: Any) -> str:
 
 
 class BlockCache:
-    """Deletes its files when the build succeeds or fails with an `AreaError`, else keeps them.
+    """Finished blocks of one request, as files in a folder of their own.
 
     May be shared between threads.
     """
 
-    def __init__(self, folder: Path, request: str, needed_bytes: int) -> None:
-        """`request`: digest of the inputs common to all blocks."""
-        self._folder = folder
-        self._request = request
-        self._names: dict[Block, str] = {}
-        parent = next(each for each in [folder, *folder.absolute().parents] if each.exists())
-        room = shutil.disk_usage(parent).free + sum(path.stat().st_size for path in self._files())
-        if room < needed_bytes:
-            raise OutputError(
-                f"finished blocks need about {needed_bytes / 1e6:.0f} MB until the map is written, "
-                f"but only {room / 1e6:.0f} MB are free; free disk space or name another folder "
-                f"(--work): {folder}"
-            )
-        log.info("caching finished blocks in %s: about %.0f MB", folder, needed_bytes / 1e6)
+    def __init__(self, folder: Path, request: str) -> None:
+        """`request`: digest of everything that determines the blocks; removes other blocks."""
+        self._folder, self._request = folder, request
+        there = list(folder.glob("*.npz"))
+        found = [path for path in there if request in path.name]
+        for path in set(there) - set(found):
+            path.unlink()
+        if found:
+            log.warning("resuming: %d blocks are cached in %s", len(found), folder)
 
-    def __enter__(self) -> "BlockCache":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
-    ) -> None:
-        if error is None or isinstance(error, AreaError):
-            self.discard()
-        elif count := len(self._files()):
-            log.warning(
-                "%d finished blocks are cached; rerun the same build to resume: %s",
-                count,
-                self._folder,
-            )
-
-    def begin(self, blocks: Sequence[tuple["Block", Any]]) -> int:
-        """Remove the files of other blocks or inputs, and count those that are cached."""
-        self._names = {
-            block: f"r{block.row}-c{block.col}-{digest([FORMAT, self._request, own])[:24]}.npz"
-            for block, own in blocks
-        }
-        wanted = set(self._names.values())
-        there = 0
-        for path in self._files():
-            if path.name in wanted:
-                there += 1
-            else:
-                path.unlink(missing_ok=True)
-        return there
-
-    def load(self, block: "Block") -> dict[str, NDArray[Any]] | None:
+    def load(self, block: "Block") -> Parts | None:
         """None if it is not cached or damaged."""
-        path = self._folder / self._names[block]
+        path = self._path(block)
         try:
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
+                return dict(stored)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             log.warning("cached block is damaged (%s) and is recomputed: %s", error, path)
             return None
 
-    def store(self, block: "Block", parts: dict[str, NDArray[Any]]) -> None:
-        path = self._folder / self._names[block]
-        try:
-            with replacing(path) as temporary:
-                np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
-        except OutputError as error:
-            raise OutputError(
-                f"{error}; earlier blocks stay cached for a rerun of the same build; or name "
-                "another folder (--work)"
-            ) from error
+    def store(self, block: "Block", parts: Parts) -> None:
+        with replacing(self._path(block)) as temporary:
+            np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
 
     def discard(self) -> None:
-        for path in self._files():
-            path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # missing, or not empty
-            self._folder.rmdir()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _files(self) -> list[Path]:
-        if not self._folder.is_dir():
-            return []
-        return [path for path in self._folder.iterdir() if _OURS.fullmatch(path.name)]
+    def _path(self, block: "Block") -> Path:
+        return self._folder / f"r{block.row}-c{block.col}-{self._request}.npz"
 
 
 @dataclass(frozen=True)
@@ -511,22 +444,13 @@ class SheetReader:
                 "the area has no imagery: it lies outside the orthophotos or is all nodata"
             )
 
-    def block_cache(
-        self, out: Path, work: Path | None
-    ) -> AbstractContextManager[BlockCache | None]:
+    def block_cache(self, out: Path, work: Path | None) -> BlockCache | None:
         """Cache in `work`, or, if there are many blocks, beside the map; else None."""
-        pixels = sum(job.block.height * job.block.width for job in self._jobs)
-        worthwhile = work is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
-        needed_bytes = round(CACHED_BYTES_PER_PX * pixels) if worthwhile else 0
-        beside, name = out.with_name(f"{out.name}.work"), f"blocks-{out.name}"
-        cache = BlockCache(work / name if work else beside, self._request(), needed_bytes)
-        if not worthwhile:
-            cache.discard()  # left by an earlier request for the same map
-            return nullcontext()
-        found = cache.begin(self._depends_on())
-        if found:
-            log.warning("resuming: %d of %d blocks are cached", found, len(self._jobs))
-        return cache
+        if work is None and len(self._jobs) < MIN_CACHED_BLOCKS:
+            return None
+        name = f"blocks-{out.name}"
+        folder = out.with_name(f"{out.name}.work") if work is None else work / name
+        return BlockCache(folder, self._request())
 
     @property
     def _recipe(self) -> dict[str, Any]:
@@ -587,36 +511,23 @@ class SheetReader:
         outer = self._outer(block)
         self.sampler.take(parts["crops"], parts["crop_places"], outer.row, outer.col)
         if self.layer is not None:
-            put_layer_parts(self.layer, block, parts)
+            self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
     def _request(self) -> str:
-        """Digest of the inputs common to all blocks, including program versions."""
-        frame = self.area.frame
-        return digest(
-            {
-                "versions": [__version__, np.__version__, cv2.__version__, rasterio.__version__],
-                "gdal": rasterio.__gdal_version__,
-                "represent": self._recipe,
-                "frame": [frame.lat_deg, frame.lon_deg],
-                "grid": vars(self.grid),
-                "layout": [vars(self._layout), self._margin_px, PREVIEW_PX, CHUNK_PX],
-                "crop_px": self.sampler.size_px,
-                "layer": self.layer is not None,
-                "pictures": self.pictures is not None,
-                "imagery": self.mosaic.common_stamp,
-            }
-        )
-
-    def _depends_on(self) -> list[tuple[Block, Any]]:
-        """Inputs of each block alone: its imagery, crops, and distance from the route."""
-        found: list[tuple[Block, Any]] = []
-        with self.mosaic.grid_sheet(self.area.frame, self.grid) as raster:
-            for job in self._jobs:
-                block, outer = job.block, self._outer(job.block)
-                far = [not chunk.may_matter(self.area, self.grid) for chunk in block.cut(CHUNK_PX)]
-                stamps = raster.stamps(outer.col, outer.row, outer.width, outer.height)
-                found.append((block, [block.height, block.width, job.places, far, stamps]))
-        return found
+        """Digest of everything that determines the blocks, program versions included."""
+        everything = {
+            "versions": [__version__, np.__version__, cv2.__version__, rasterio.__version__],
+            "gdal": rasterio.__gdal_version__,
+            "represent": self._recipe,
+            "area": repr(self.area),
+            "grid": vars(self.grid),
+            "layout": [vars(self._layout), self._margin_px, PREVIEW_PX, CHUNK_PX],
+            "jobs": [[*vars(job.block).values(), job.places] for job in self._jobs],
+            "crop_px": self.sampler.size_px,
+            "parts": [self.layer is not None, self.pictures is not None],
+            "imagery": [source.stamp for source in self.mosaic.sources],
+        }
+        return digest(everything)[:24]
 
 
 @contextmanager
@@ -637,32 +548,13 @@ def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block
 def layer_parts(
     area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> Parts:
-    """Compressed if the chunks of the block do not extend into other blocks."""
+    """Copies of a block (H, W) without the chunks that are too far from the route."""
     grey, valid = grey.copy(), valid.copy()
     for chunk in block.cut(CHUNK_PX):
         if not chunk.may_matter(area, grid):
             where = chunk.within(block)
             grey[where], valid[where] = 0, False
-    if _whole_chunks(grid, block):
-        return compressed_block(grey, valid)
     return {"grey": grey, "valid": valid}
-
-
-def _whole_chunks(grid: TileGrid, block: Block) -> bool:
-    bottom, right = block.row + block.height, block.col + block.width
-    return (
-        block.row % CHUNK_PX == 0
-        and block.col % CHUNK_PX == 0
-        and (bottom % CHUNK_PX == 0 or bottom == grid.height_px)
-        and (right % CHUNK_PX == 0 or right == grid.width_px)
-    )
-
-
-def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
-    if "jpeg" in parts:
-        layer.add_block(block.row, block.col, parts)
-    else:
-        layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
 
 def _block_side_px(tile_px: int, micro_px: int) -> int:
