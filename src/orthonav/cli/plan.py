@@ -64,8 +64,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.errors import RouteError
     from orthonav.core.files import write_text
-    from orthonav.ground.planning.route import read_route
-    from orthonav.ground.planning.routes.geojson import to_geojson
+    from orthonav.ground.planning.route import read_route, to_geojson
     from orthonav.ground.planning.spacing import (
         default_band_m,
         rate_cautions,

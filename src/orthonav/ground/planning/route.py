@@ -1,19 +1,22 @@
 """A planned route: read from the file formats of ground stations or made from a preset, and its
 geometry.
 
-The file name suffix selects the format (`orthonav.ground.planning.routes`). Presets are the
+The file name suffix selects the format. Presets are the
 trajectories A to D of the paper, Di Piazza et al. (IGARSS 2024), Table 1, at any position. The
 paper states altitude, length, search band and overlap; it does not state the ground resolution:
 0.2 m is assumed for A, 1 m for B and D, 2 m for C, so that a tile of 256 px has about the size of a
 view from 40, 2000 and 4000 m. The paper does not draw the trajectories; they are straight here."""
 
 import csv
+import io
+import json
 import logging
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +24,31 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MissingFileError, RouteError, described, lfs_pointer
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.planning.routes.delimited import read_delimited
-from orthonav.ground.planning.routes.geojson import read_geojson, routes_of
-from orthonav.ground.planning.routes.markup import read_gpx, read_kml, read_kmz, read_wpml
-from orthonav.ground.planning.routes.mission import is_plan, is_wpl, plan_route, read_plan, read_wpl
-from orthonav.ground.planning.routes.record import Height, Route, json_object, left_out_text
+from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
+from orthonav.ground.planning.markup import read_gpx, read_kml, read_kmz, read_wpml
+from orthonav.ground.planning.mission import is_wpl, plan_route, read_wpl
+from orthonav.ground.planning.record import (
+    Height,
+    HeightFrame,
+    Route,
+    decoded,
+    json_object,
+    number,
+    number_or_none,
+    parsed,
+    require_few_waypoints,
+)
+
+__all__ = [
+    "Height",
+    "Route",
+    "along_polyline_en_m",
+    "beyond_bands_m",
+    "distance_to_polyline_m",
+    "leg_lengths_m",
+    "read_route",
+    "within_bands",
+]
 
 Array = NDArray[np.float64]
 PREFIX = "paper:"
@@ -82,17 +105,6 @@ def preset(text: str) -> Route:
     )
 
 
-__all__ = [
-    "Height",
-    "Route",
-    "along_polyline_en_m",
-    "beyond_bands_m",
-    "distance_to_polyline_m",
-    "leg_lengths_m",
-    "read_route",
-    "within_bands",
-]
-
 MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
 MAX_LISTED = 20
 _PAIRS_AT_ONCE = 2**18
@@ -104,24 +116,191 @@ _BROKEN = (
 
 log = logging.getLogger(__name__)
 
+"""Properties of a GeoJSON feature (RFC 7946): `name`; `band_m`, a number or a list with one per leg
+(null: the default); `height_frame`, above what the third coordinate is ("agl", "home", "amsl",
+"hae"; the RFC's ellipsoid is hardly ever meant, so without it that is taken as not said);
+`home_amsl_m`."""
+
+
+def _routes_of(plain: dict[str, Any]) -> list[Route]:
+    found: list[Route] = []
+    for geometry, properties in _geometries(plain):
+        kind = geometry.get("type")
+        if kind == "LineString":
+            found.append(_route(geometry["coordinates"], properties))
+        elif kind == "MultiLineString":
+            joined = [point for part in geometry["coordinates"] for point in part]
+            found.append(_route(joined, properties))
+    if not found:
+        raise RouteError("GeoJSON holds no LineString")
+    return found
+
+
+def to_geojson(routes: Sequence[Route]) -> str:
+    features = [_feature(route) for route in routes]
+    several = {"type": "FeatureCollection", "features": features}
+    plain = features[0] if len(features) == 1 else several
+    return json.dumps(plain, allow_nan=False) + "\n"
+
+
+def _feature(route: Route) -> dict[str, Any]:
+    coordinates = [[lon, lat] for lat, lon in route.waypoints]
+    properties: dict[str, Any] = {}
+    if route.name is not None:
+        properties["name"] = route.name
+    if route.leg_bands_m:
+        same = len(set(route.leg_bands_m)) == 1 and route.leg_bands_m[0] is not None
+        properties["band_m"] = route.leg_bands_m[0] if same else list(route.leg_bands_m)
+    heights = [height for height in route.heights if height is not None]
+    if heights and len(heights) == len(route.waypoints):
+        coordinates = [
+            [*point, height.height_m] for point, height in zip(coordinates, heights, strict=True)
+        ]
+        frames = [height.frame for height in heights]
+        if any(frames):
+            properties["height_frame"] = frames[0] if len(set(frames)) == 1 else frames
+    if route.home_amsl_m is not None:
+        properties["home_amsl_m"] = route.home_amsl_m
+    geometry = {"type": "LineString", "coordinates": coordinates}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def _route(coordinates: Any, properties: dict[str, Any]) -> Route:
+    require_few_waypoints(len(coordinates))
+    points = [_position(point) for point in coordinates]
+    frames = properties.get("height_frame")
+    if not isinstance(frames, list):
+        frames = [frames] * len(points)
+    if len(frames) != len(points):
+        raise RouteError(f"height_frame has {len(frames)} entries for {len(points)} waypoints")
+    heights = tuple(
+        None if height is None else Height(height, frame)
+        for (_, _, height), frame in zip(points, frames, strict=True)
+    )
+    name, bands = properties.get("name"), properties.get("band_m")
+    if not isinstance(bands, list):
+        bands = [] if bands is None else [bands] * max(1, len(points) - 1)
+    return Route(
+        tuple((lat, lon) for lat, lon, _ in points),
+        heights,
+        tuple(number_or_none(each, "band_m") for each in bands),
+        name if isinstance(name, str) else None,
+        number_or_none(properties.get("home_amsl_m"), "home_amsl_m"),
+    )
+
+
+def _position(point: Any) -> tuple[float, float, float | None]:
+    lon, lat, *rest = (number(value, "GeoJSON position") for value in point[:3])
+    return lat, lon, rest[0] if rest else None
+
+
+def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    stack: list[tuple[Any, dict[str, Any]]] = [(node, {})]
+    while stack:
+        item, properties = stack.pop()
+        if not isinstance(item, dict):
+            continue
+        if item.get("type") == "Feature":
+            own = item.get("properties")
+            properties = own if isinstance(own, dict) else {}
+            stack.append((item.get("geometry"), properties))
+        within = item.get("features") or item.get("geometries") or []
+        stack.extend((each, properties) for each in reversed(within))
+        yield item, properties
+
+
+_LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
+_LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
+_HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
+    ("agl", ("agl_m", "agl", "altitude_agl_m", "altitudeagl")),
+    ("home", ("home_m", "height_above_home_m")),
+    ("amsl", ("amsl_m", "amsl", "altitude_amsl_m", "altitudeamsl")),
+    ("hae", ("hae_m",)),
+    (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
+)
+_MODE = "altitudemode"  # column of Litchi
+_FRAME_OF_MODE: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
+_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
+_METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
+_Values = Callable[[str], list[float | None]]
+
+
+def _read_delimited(data: bytes) -> list[Route]:
+    """A table with comma, semicolon or tab, one waypoint a row."""
+    stream = io.StringIO(decoded(data), newline=None)
+    header = stream.readline(MAX_LINE_CHARS)
+    stream.seek(0)
+    delimiter = max(",;\t", key=header.count)
+    try:
+        table = TableRows(stream, delimiter=delimiter)
+        names = {_UNIT.sub("", name.strip().lower()): name for name in table.columns}
+        rows = []
+        for row in table:
+            rows.append(row)
+            require_few_waypoints(len(rows))
+    except TableError as error:
+        raise RouteError(f"route table cannot be read ({error})") from error
+    lat, lon = (next(filter(names.get, aliases), None) for aliases in (_LAT, _LON))
+    if lat is None or lon is None:
+        raise RouteError(
+            "route CSV needs the columns lat_deg,lon_deg (or lat,lon or latitude,longitude), got "
+            f"{','.join(names) or 'none'!s:.80}"
+        )
+
+    def values(name: str) -> list[float | None]:
+        found = []
+        for line, row in enumerate(rows, 2):
+            text = row.get(names[name]) or ""
+            if delimiter != "," and "." not in text:
+                text = text.replace(",", ".")
+            what = f"route table cannot be read: row {line}, {names[name]}"
+            found.append(parsed(text, what) if name in (lat, lon) or text.strip() else None)
+        return found
+
+    waypoints = tuple((a or 0.0, b or 0.0) for a, b in zip(values(lat), values(lon), strict=True))
+    bands = values("band_m") if "band_m" in names else []
+    return [Route(waypoints, _heights(names, values), tuple(bands[:-1] if bands[1:] else bands))]
+
+
+def _heights(names: dict[str, str], values: _Values) -> tuple[Height | None, ...]:
+    known = ((frame, name) for frame, aliases in _HEIGHTS for name in aliases if name in names)
+    frame, name = next(known, (None, None))
+    if name is None:
+        return ()
+    unit = _UNIT.search(names[name].strip().lower())
+    if unit is not None and unit[1] not in _METRES:
+        raise RouteError(f"heights must be in m or ft, got the column {names[name]!r:.60}")
+    factor = 1.0 if unit is None else _METRES[unit[1]]
+    heights = values(name)
+    frames = [frame] * len(heights)
+    if frame is None and _MODE in names:
+        modes = values(_MODE)
+        if not {None, 0, 1}.issuperset(modes):
+            raise RouteError(f"{names[_MODE]} must be 0 (above take-off) or 1 (above ground)")
+        frames = [_FRAME_OF_MODE.get(mode) for mode in modes]
+    return tuple(
+        None if height is None else Height(factor * height, each)
+        for height, each in zip(heights, frames, strict=True)
+    )
+
 
 def _read_json(data: bytes) -> list[Route]:
     plain = json_object(data)
-    return [plan_route(plain)] if is_plan(plain) else routes_of(plain)
+    return [plan_route(plain)] if plain.get("fileType") == "Plan" else _routes_of(plain)
 
 
 def _read_text(data: bytes) -> list[Route]:
-    return read_wpl(data) if is_wpl(data) else read_delimited(data)
+    return read_wpl(data) if is_wpl(data) else _read_delimited(data)
 
 
 _READERS: dict[str, Callable[[bytes], list[Route]]] = {
-    ".geojson": read_geojson,
+    ".geojson": lambda data: _routes_of(json_object(data)),
     ".json": _read_json,
     ".csv": _read_text,
     ".tsv": _read_text,
     ".txt": _read_text,
     ".waypoints": read_wpl,
-    ".plan": read_plan,
+    ".plan": lambda data: [plan_route(json_object(data))],
     ".kml": read_kml,
     ".kmz": read_kmz,
     ".wpml": read_wpml,
@@ -146,8 +325,6 @@ def read_route(path: Path) -> Route:
         raise RouteError(f"{error}: {path}") from error
     except _BROKEN as error:
         raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
-    if route.left_out:
-        log.warning("%s: %s", left_out_text(route.left_out), path)
     return route
 
 

@@ -2,8 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -18,15 +17,6 @@ HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
 MAX_HEIGHT_M = 100_000.0  # sanity limit: the edge of space
 MAX_BAND_M = 50_000.0  # width of the largest sheet
 MAX_WAYPOINTS = 100_000  # sanity limit against files that exhaust memory
-MAX_NAMED = 12
-
-
-def left_out_text(left_out: Sequence[str]) -> str:
-    more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
-    return (
-        "positions that are not part of the route, so the map may not cover them: "
-        f"{', '.join(left_out[:MAX_NAMED])}{more}"
-    )
 
 
 def require_few_waypoints(count: int) -> None:
@@ -64,15 +54,13 @@ class Route:
     lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360. `heights`: one per waypoint, None if
     unknown; empty if the file has none. `leg_bands_m`: full width of the search band per leg in
     metres, None for the default; empty if the file has none. `home_amsl_m`: height of the take-off
-    position above mean sea level, metres, None if unknown. `left_out`: what of the file has a
-    position and is not part of the route, by name."""
+    position above mean sea level, metres, None if unknown."""
 
     waypoints: tuple[tuple[float, float], ...]
     heights: tuple[Height | None, ...] = ()
     leg_bands_m: tuple[float | None, ...] = ()
     name: str | None = None  # name of the line in its file, None if it has none
     home_amsl_m: float | None = None
-    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.waypoints:
@@ -102,17 +90,6 @@ class Route:
             raise RouteError(
                 f"height of the take-off position must be finite, got {self.home_amsl_m}"
             )
-
-    def leaving_out(self, points: Sequence[tuple[str, Sequence[float]]]) -> "Route":
-        """The route with the names of those `points` (longitude, latitude, ..) that are none of its
-        waypoints in `left_out`."""
-        visited = {(round(lat, 6), round(lon, 6)) for lat, lon in self.waypoints}
-        lost = [
-            name
-            for name, place in points
-            if len(place) < 2 or (round(place[1], 6), round(place[0], 6)) not in visited
-        ]
-        return replace(self, left_out=tuple(lost))
 
     @property
     def legs(self) -> int:
@@ -162,15 +139,6 @@ def parsed(text: str, what: str) -> float:
     if not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {text!r:.80}")
     return value
-
-
-def numbers_in(text: str) -> list[float]:
-    """The numbers of a text with commas, such as longitude, latitude, height; none where it holds
-    something else."""
-    try:
-        return [float(each) for each in text.split(",")]
-    except ValueError:
-        return []
 
 
 def decoded(data: bytes) -> str:
