@@ -8,7 +8,7 @@ import pytest
 from orthonav.core.errors import VariantError
 from orthonav.core.localize.confidence import TILE_FEATURES, USUAL_TILES, LogisticConfidence
 from orthonav.core.localize.tiles import MAX_RATIO, lowe_ratio
-from orthonav.ground.build.fit import fit_few, fit_logistic
+from orthonav.ground.build.calibrate import fit_few, fit_logistic
 
 
 def scores(*values):

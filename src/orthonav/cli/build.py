@@ -157,7 +157,7 @@ def run(options: argparse.Namespace) -> int:
         **recipe_of(options),
     )
     with progress(options) as shown:
-        result = build_map(request, shown, reporter(options))
+        result = build_map(request, shown)
     plates = _plates(result.manifest) if options.epoch is None else []
     plain = summary(result.manifest, result.size_bytes, options.out)
     plain["build_s"] = round(time.perf_counter() - start, 3)

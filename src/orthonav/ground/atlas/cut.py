@@ -54,7 +54,13 @@ from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.warp import SheetSource, Warp, joined_cells, joined_grey, outline
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
-from orthonav.ground.build.layer import GreyLayerWriter, Parts, StoredCells
+from orthonav.ground.build.layer import (
+    GreyLayerWriter,
+    Parts,
+    StoredCells,
+    TerrainParts,
+    terrain_parts,
+)
 from orthonav.ground.build.sheet import (
     MIN_TILE_VALID_SHARE,
     PREVIEW_PX,
@@ -67,7 +73,6 @@ from orthonav.ground.build.sheet import (
     one_opencv_thread,
     tiles_of,
 )
-from orthonav.ground.build.terrain import TerrainParts, terrain_parts
 from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.sheets import WorldSheets, in_box
 

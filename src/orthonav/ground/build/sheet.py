@@ -37,7 +37,7 @@ from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.calibrate import CropSampler
-from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts
+from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, rounded_gsd_m
 from orthonav.ground.imagery.mosaic import GreyPixels, Mosaic, SheetRaster
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
@@ -209,15 +209,6 @@ def grid_of(
             "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, imagery_gsd_m
         )
     return grid
-
-
-def rounded_gsd_m(gsd_m: float) -> float:
-    """To few digits: 5.002 to 5, 0.2431 to 0.243."""
-    for digits in (1, 2, 3):
-        rounded = float(f"{gsd_m:.{digits}g}")
-        if abs(rounded / gsd_m - 1) < 0.005:
-            return rounded
-    return float(f"{gsd_m:.4g}")
 
 
 def _whole_cells(tile_px: int, overlap: float) -> float:
