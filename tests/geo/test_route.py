@@ -17,12 +17,10 @@ from orthonav.ground.planning.route import (
     Height,
     Route,
     along_polyline_en_m,
-    beyond_bands_m,
     distance_to_polyline_m,
     leg_lengths_m,
     read_route,
     to_geojson,
-    within_bands,
 )
 
 GEOD = Geod(ellps="WGS84")
@@ -256,27 +254,6 @@ def test_distances_are_those_of_shapely(line, points):
     geometry = shapely.LineString(line) if len(line) > 1 else shapely.Point(line[0])
     expected = shapely.distance(geometry, shapely.points(points))
     np.testing.assert_allclose(distance_to_polyline_m(points, line), expected, atol=1e-6)
-
-
-@given(polylines(least=2), arrays(float, (8, 2), elements=st.floats(-6000, 6000)), st.data())
-def test_bands_are_those_of_shapely(line, points, data):
-    bands = data.draw(arrays(float, len(line) - 1, elements=st.floats(1, 3000)))
-    legs = [shapely.LineString(line[leg : leg + 2]) for leg in range(len(line) - 1)]
-    each = [
-        shapely.distance(leg, shapely.points(points)) - b / 2
-        for leg, b in zip(legs, bands, strict=True)
-    ]
-    beyond = beyond_bands_m(points, line, bands)
-    np.testing.assert_allclose(beyond, np.min(each, axis=0), atol=1e-6)
-
-
-@given(polylines(), st.integers(0, 2**32 - 1), st.floats(-50, 300), st.sampled_from([3, 300]))
-def test_points_within_bands_are_those_that_are_not_beyond(line, seed, margin_m, count):
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-6000, 6000, (count, 2))
-    bands = rng.uniform(1, 3000, max(1, len(line) - 1))
-    expected = beyond_bands_m(points, line, bands) <= margin_m
-    assert np.array_equal(within_bands(points, line, bands, margin_m), expected)
 
 
 @pytest.mark.parametrize("reach_deg, tolerance", [(1, 5e-6), (25, 5e-3)])

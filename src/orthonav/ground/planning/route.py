@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MissingFileError, RouteError, described, lfs_pointer
+from orthonav.core.extras import needed
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
@@ -43,11 +44,9 @@ __all__ = [
     "Height",
     "Route",
     "along_polyline_en_m",
-    "beyond_bands_m",
     "distance_to_polyline_m",
     "leg_lengths_m",
     "read_route",
-    "within_bands",
 ]
 
 Array = NDArray[np.float64]
@@ -107,8 +106,6 @@ def preset(text: str) -> Route:
 
 MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
 MAX_LISTED = 20
-_PAIRS_AT_ONCE = 2**18
-_FEW_POINTS = 64
 _BROKEN = (
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError),
     csv.Error,
@@ -391,56 +388,9 @@ def leg_lengths_m(route: Route) -> Array:
 
 def distance_to_polyline_m(points_en_m: Array, line_en_m: Array) -> Array:
     """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
-    return beyond_bands_m(points_en_m, line_en_m, np.zeros(max(1, len(line_en_m) - 1)))
-
-
-def beyond_bands_m(points_en_m: Array, line_en_m: Array, bands_m: Array) -> Array:
-    """Distance in metres of `(N, 2)` points outside the bands (full widths of max(1, M - 1) legs)
-    of a polyline of `(M, 2)` vertices; negative inside."""
-    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
-    legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
-    length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)
-    best = np.full(len(points_en_m), np.inf)
-    at_once = max(1, _PAIRS_AT_ONCE // max(1, len(points_en_m)))
-    for first in range(0, len(legs), at_once):
-        some = slice(first, first + at_once)
-        east, north = (points_en_m[:, axis, None] - starts[some, axis] for axis in (0, 1))
-        along = (east * legs[some, 0] + north * legs[some, 1]) / length2[some]
-        np.clip(along, 0, 1, out=along)
-        east -= along * legs[some, 0]
-        north -= along * legs[some, 1]
-        beyond = np.hypot(east, north) - bands_m[some] / 2
-        np.minimum(best, beyond.min(axis=1), out=best)
-    return best
-
-
-def within_bands(
-    points_en_m: Array, line_en_m: Array, bands_m: Array, margin_m: float
-) -> NDArray[np.bool_]:
-    """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
-    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs."""
-    if len(points_en_m) <= _FEW_POINTS:
-        return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
-    order = np.argsort(points_en_m[:, 0], kind="stable")
-    x, y = points_en_m[order].T
-    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
-    ends = line_en_m[1:] if len(line_en_m) > 1 else line_en_m
-    reach = bands_m / 2 + margin_m
-    low, high = np.minimum(starts, ends) - reach[:, None], np.maximum(starts, ends) + reach[:, None]
-    first = np.searchsorted(x, low[:, 0], side="left").tolist()
-    last = np.searchsorted(x, high[:, 0], side="right").tolist()
-    inside = np.zeros(len(x), dtype=np.bool_)
-    for leg in np.flatnonzero(reach >= 0).tolist():
-        some = slice(first[leg], last[leg])
-        near = np.flatnonzero(~inside[some] & (y[some] >= low[leg, 1]) & (y[some] <= high[leg, 1]))
-        if len(near):
-            near += first[leg]
-            points = np.stack([x[near], y[near]], axis=1)
-            vertices = np.stack([starts[leg], ends[leg]])
-            inside[near] = beyond_bands_m(points, vertices, bands_m[leg : leg + 1]) <= margin_m
-    found = np.empty_like(inside)
-    found[order] = inside
-    return found
+    shapely = needed("shapely", "geo", "a route")
+    line = shapely.linestrings(np.concatenate([line_en_m, line_en_m[-1:]]))
+    return np.asarray(shapely.distance(line, shapely.points(points_en_m)))
 
 
 def along_polyline_en_m(line_en_m: Array, spacing_m: float) -> tuple[Array, Array]:

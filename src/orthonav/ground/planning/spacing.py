@@ -162,7 +162,6 @@ BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
 for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s for 4 million on a
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
-_PAIRS = 1_000_000_000  # limit on pairs of points and legs, which bounds the time of an estimate
 _MOST_POINTS = 200_000
 _LEAST_POINTS = 2_500  # points sampled: a standard error of the fraction of 0.1 % to 1 %
 
@@ -222,7 +221,6 @@ def _share(
     from the centres of `cells` (rows, columns), or of at most about `room`."""
     if area.route is None:
         return 1.0
-    room = min(room, max(_LEAST_POINTS, _PAIRS // area.route.legs))
     step = max(1.0, math.sqrt(math.prod(cells) / room))
     rows, cols = (math.ceil(count / step) for count in cells)
     width_m, height_m = (
