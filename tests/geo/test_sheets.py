@@ -11,7 +11,7 @@ from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.ground.planning import sheets as sheets_module
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Height, Route, leg_lengths_m, read_route
+from orthonav.ground.planning.route import Height, Route, leg_lengths_m
 from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
 
 
@@ -99,14 +99,15 @@ def test_parts_of_a_route_fit_and_follow_each_other(lat, lon, turns, data):
 
 
 def test_a_leg_longer_than_a_sheet_is_cut():
-    parts = sheets_of_route(read_route("paper:C@46.6,1.9"), None)
+    route = Route(((46.6, 1.574), (46.6, 2.227)), (Height(4000, "agl"),) * 2, (5000,))
+    parts = sheets_of_route(route, None)
     assert [part.name for part in parts] == ["sheet-1", "sheet-2"]
     assert [leg_lengths_m(part).sum() for part in parts] == pytest.approx(
         [25_000, 25_000], rel=1e-3
     )
     assert {height for part in parts for height in part.heights} == {Height(4000, "agl")}
-    whole = sheets_of_route(read_route("paper:C@46.6,1.9,45"), None)  # its corners are nearer
-    assert len(whole) == 1
+    diagonal = Route(((46.44, 1.67), (46.76, 2.13)), leg_bands_m=(5000,))
+    assert len(sheets_of_route(diagonal, None)) == 1  # its corners are nearer
 
 
 @pytest.mark.parametrize(

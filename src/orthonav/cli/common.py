@@ -19,8 +19,7 @@ MAX_THREADS = 64
 
 ROUTE_HELP = (
     "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan or a waypoint "
-    "file (FILE#NAME or FILE#NUMBER selects one of several), or a trajectory of the paper: "
-    "paper:B@46.6,1.9[,BEARING]"
+    "file (FILE#NAME or FILE#NUMBER selects one of several)"
 )
 
 

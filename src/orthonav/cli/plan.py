@@ -175,7 +175,7 @@ def _profile(
     from orthonav.cli.heights import dem_for_route
     from orthonav.ground.planning.spacing import profile
 
-    bands_m = route.bands_m(options.band_m) or ()
+    bands_m = route.bands_m(options.band_m or 0.0) or ()
     view_m = 0.0 if view is None else view.short_m
     agl_m = options.agl_m if view is None else view.agl_m
     ground = dem_for_route(options, route)
